@@ -1,0 +1,52 @@
+# Newcomers need two commands, `make demo` and `make test`; both first make the environments they use.
+SHELL := /bin/bash
+SETUP := bash requirements/setup.sh
+
+# One pytest run may take this many seconds: bpy 4.5 can hang when the interpreter ends. Needs GNU timeout.
+PYTEST_SECONDS ?= 2400
+LIMIT := $(if $(shell command -v timeout),timeout -k 30 $(PYTEST_SECONDS))
+PYTEST_OPTIONS ?=
+
+# Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
+STRICT ?=
+
+.PHONY: help demo test lint tables lock clean test-3.13 test-3.11
+.NOTPARALLEL:
+
+help:
+	@echo 'make demo    build the example scene, shade it, compare it with Cycles: out/demo/compare.png, report.json'
+	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
+	@echo 'make lint    ruff only'
+	@echo 'make tables  fit the lookup tables in tables/ again (long)'
+	@echo 'make lock    resolve requirements/*.in into the lock files; LOCK_OPTIONS=--upgrade takes newer versions'
+	@echo 'make clean   remove out/, build/ and caches (the environments in .venv stay)'
+
+demo:
+	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon demo -o out/demo $(DEMO_OPTIONS)
+
+test: lint test-3.13 test-3.11
+
+lint:
+	@python=$$($(SETUP) python newest) && "$$python" -m ruff check .
+
+test-3.13 test-3.11: test-%:
+	@status=0; python=$$($(SETUP) python $*) || status=$$?; \
+	if [ $$status -eq 0 ]; then \
+		$(LIMIT) "$$python" -m pytest $(PYTEST_OPTIONS) || status=$$?; \
+		[ $$status -ne 124 ] || echo "make: pytest on Python $* was stopped after $(PYTEST_SECONDS) seconds" >&2; \
+	elif [ $$status -eq 3 ]; then \
+		echo "*** NOT TESTED: Python $* was not found, so its Blender version was left out." >&2; \
+		echo "*** Install it (pyenv install $*, uv python install $*) or name it: LTSH_PYTHON_$(subst .,,$*)=..." >&2; \
+		status=$(if $(STRICT),1,0); \
+	fi; \
+	exit $$status
+
+tables:
+	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon tables fit
+
+lock:
+	@$(SETUP) lock $(LOCK_OPTIONS)
+
+clean:
+	rm -rf out build .pytest_cache .ruff_cache .hypothesis
+	find ltsh_addon tables tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,267 @@
+"""Samples, lights and reference of a .blend through a child process. Imports no bpy.
+
+The child opens the file, edits it in memory, renders with Cycles into a temporary folder and ends; the file on disk
+and the data of a running Blender stay untouched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..scene import AreaLight, Film, SurfaceSamples
+from . import gbuffer
+
+WORKER = Path(__file__).with_name("worker.py")
+Progress = Callable[[str, float], "bool | None"]
+OUTPUT_LINES_KEPT = 12
+TERMINATION_SECONDS = 5.0
+
+
+class SceneError(Exception):
+    """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
+
+
+class Cancelled(Exception):
+    """The progress callback asked to stop."""
+
+
+@dataclass(frozen=True)
+class ExtractOptions:
+    """What to take from which file. `cycles_samples` 0 means no Cycles reference; None means as in the file."""
+
+    scene: Path
+    width: int | None = None
+    height: int | None = None
+    sub_samples: int = 1
+    cycles_samples: int = 0
+    frame: int | None = None
+    camera: str | None = None
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """What the child found and rendered.
+
+    `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
+    W m^-2 sr^-1; `seconds` has "start", "samples" and "cycles".
+    """
+
+    lights: tuple[AreaLight, ...]
+    samples: SurfaceSamples
+    film: Film
+    warnings: tuple[str, ...]
+    reference: dict[str, np.ndarray] | None
+    blender_version: str
+    frame: int
+    camera: str
+    seconds: dict[str, float]
+
+
+def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
+    """Lights, samples and (if asked for) the Cycles reference of a .blend.
+
+    Raises SceneError when the scene or file is not fit, Cancelled when `progress(stage, fraction)` returned False.
+    """
+    if options.sub_samples < 1 or options.cycles_samples < 0:
+        raise ValueError(
+            f"sub_samples is {options.sub_samples} and cycles_samples {options.cycles_samples}, expected at least 1 and 0"
+        )
+    scene = Path(options.scene).absolute()
+    _check_readable(scene)
+    with _temporary_folder() as folder:
+        manifest = _run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
+        samples, film, warnings = _read_samples(manifest, folder)
+        return Extraction(
+            lights=tuple(AreaLight(**record) for record in manifest["lights"]),
+            samples=samples,
+            film=film,
+            warnings=tuple(manifest["warnings"] + warnings),
+            reference=_read_reference(manifest, folder),
+            blender_version=manifest["blender_version"],
+            frame=manifest["frame"],
+            camera=manifest["camera"],
+            seconds=manifest["seconds"],
+        )
+
+
+def build_demo(path: Path, *, progress: Progress | None = None) -> None:
+    """Build the example scene and save it as the .blend `path`, at once or not at all."""
+    path = Path(path).absolute()
+    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
+    try:
+        with _temporary_folder() as folder:
+            _run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
+        if not unfinished.is_file():
+            raise SceneError(f"{path}: Blender built the example scene but saved no file")
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _check_readable(scene: Path) -> None:
+    """Raise where a look at the file says enough, so that Blender need not start."""
+    if not scene.exists():
+        raise SceneError(f"{scene}: no such file, expected a .blend")
+    try:
+        with scene.open("rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        raise SceneError(f"{scene}: cannot be read: {error.strerror}") from None
+    if empty:
+        raise SceneError(f"{scene}: the file is empty, expected a .blend")
+
+
+@contextlib.contextmanager
+def _temporary_folder():
+    with _termination_as_exception(), tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
+        yield Path(name)
+
+
+@contextlib.contextmanager
+def _termination_as_exception():
+    """Turn SIGTERM into SystemExit meanwhile, so that child and folder are cleaned up; leaves other handlers alone."""
+
+    def stop(number, frame):
+        raise SystemExit(128 + number)
+
+    ours = (
+        threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    )
+    if ours:
+        signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def child_command(job: Path) -> list[str]:
+    """The command that runs worker.py on `job`: this Blender's own binary, or this Python with pip's bpy."""
+    bpy = sys.modules.get("bpy")
+    binary = bpy.app.binary_path if bpy is not None else ""
+    if binary:
+        return [
+            *(binary, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1"),
+            *("--python", str(WORKER), "--", str(job)),
+        ]
+    if bpy is None and importlib.util.find_spec("bpy") is None:
+        wanted = {(3, 11): "4.5.15", (3, 13): "5.2.3"}.get(sys.version_info[:2])
+        remedy = (
+            f"pip install bpy=={wanted}" if wanted else "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
+        )
+        raise SceneError(f"{sys.executable} has no module bpy, which opens .blend files: {remedy}")
+    return [sys.executable, str(WORKER), str(job)]
+
+
+def _run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
+    """Run worker.py on `job` in `folder`, report its progress; the manifest it wrote."""
+    job_path = folder / "job.json"
+    job_path.write_text(json.dumps({**job, "watch_parent": True}), encoding="utf-8")
+    child = subprocess.Popen(
+        child_command(job_path),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        cwd=folder,
+        # The user's preferences and start-up files have no say in the result.
+        env={**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user"), "PYTHONUNBUFFERED": "1"},
+        # Ctrl-C goes to the parent alone, which ends the child.
+        start_new_session=True,
+    )
+    last_lines: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
+    try:
+        for line in child.stdout:
+            if line.startswith("LTSH "):
+                report = json.loads(line[len("LTSH ") :])
+                if progress is not None and progress(report["stage"], report["fraction"]) is False:
+                    raise Cancelled(f"cancelled at {report['stage']}")
+            elif line.strip():
+                last_lines.append(line.strip())
+        child.wait()
+    finally:
+        _end(child)
+    return _read_manifest(folder / "manifest.json", child.returncode, last_lines)
+
+
+def _end(child: subprocess.Popen) -> None:
+    """Terminate and reap `child`, whatever state it is in."""
+    if child.poll() is None:
+        child.terminate()
+        try:
+            child.wait(TERMINATION_SECONDS)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+    child.stdin.close()
+    child.stdout.close()
+
+
+def _read_manifest(path: Path, returncode: int, last_lines) -> dict:
+    if not path.is_file():
+        output = " | ".join(last_lines) or "none"
+        raise SceneError(f"Blender ended with code {returncode} and no result; its last output: {output}")
+    manifest = json.loads(path.read_text(encoding="utf-8"))
+    if "error" in manifest:
+        raise SceneError(manifest["error"])
+    return manifest
+
+
+def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
+    """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
+    from ..imaging.exr import read_channels  # the child imports this module too, and has no use for imaging
+
+    width, height = manifest["width"], manifest["height"]
+    renders, unusable, unnamed = [], 0, 0
+    for index, name in enumerate(manifest["samples"]):
+        channels = read_channels(folder / name)
+        samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
+        renders.append((samples, pixel))
+        unusable += bad
+        if index == 0:
+            unnamed = gbuffer.surfaces_without_sample(channels) if len(manifest["samples"]) == 1 else 0
+    samples, film = gbuffer.join(renders, width, height)
+    warnings = []
+    if unusable:
+        warnings.append(f"{unusable} samples are not shaded: transparent surfaces in front of others, or not finite")
+    if unnamed:
+        warnings.append(f"{unnamed} pixels show a surface whose material could not be read: not shaded")
+    if len(samples) == 0:
+        warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
+    return samples, film, warnings
+
+
+def _read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
+    """The two halves, each the mean of its chunks weighted by their samples."""
+    from ..imaging.exr import read_channels
+
+    if manifest["reference"] is None:
+        return None
+    passes = manifest["passes"]
+    shape = (2, manifest["height"], manifest["width"], 3)
+    sums = {"specular": np.zeros(shape), "diffuse": np.zeros(shape)}
+    for half, chunks in enumerate(manifest["reference"]):
+        total = sum(count for _, count in chunks)
+        for name, count in chunks:
+            channels = read_channels(folder / name)
+            for lobe, image in sums.items():
+                light = gbuffer.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
+                image[half] += count / total * light * gbuffer.read_layer(channels, passes[f"{lobe}_color"], "RGB")
+    return {lobe: image.astype(np.float32) for lobe, image in sums.items()}

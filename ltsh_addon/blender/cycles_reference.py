@@ -1,0 +1,60 @@
+"""The fair reference: Cycles' direct light without occlusion, as two independent halves (runs in the child).
+
+"No shadows" means that no mesh is visible to any ray but the camera's; switching shadows off on the light would still let
+meshes block the half of the estimate that samples the BSDF, and lose up to 60 % of a highlight.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+
+from .inventory import SURFACE_TYPES
+from .render_settings import enable_passes, render_exr, set_pixel_filter
+
+SEEDS = {"A": 1, "B": 7919}
+FIRST_CHUNK = 16
+CHUNK_SECONDS = 4.0
+MAX_CHUNKS = 8
+
+
+def remove_occlusion() -> None:
+    """Make every surface, instances included, invisible to all rays but the camera's."""
+    for ob in bpy.data.objects:
+        if ob.type in SURFACE_TYPES:
+            ob.visible_shadow = ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = False
+
+
+def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
+    """For each half the list of [file name in `folder`, samples in it]; a half has cycles_samples / 2 samples.
+
+    A half is rendered in chunks of one sample sequence, because Cycles reports progress only about once a minute.
+    """
+    remove_occlusion()
+    enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
+    set_pixel_filter(scene, sub_samples)
+    return [
+        _render_half(scene, folder, half, seed, max(1, cycles_samples // 2), progress) for half, seed in SEEDS.items()
+    ]
+
+
+def _render_half(scene, folder: Path, half: str, seed: int, samples: int, progress) -> list[list]:
+    cycles = scene.cycles
+    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, samples, True
+    files, done, chunk = [], 0, min(FIRST_CHUNK, samples)
+    while done < samples:
+        progress(f"Cycles {half}", done / samples)
+        started = time.monotonic()
+        cycles.sample_offset, cycles.sample_subset_length = done, min(chunk, samples - done)
+        name = f"cycles_{half}_{len(files):04d}.exr"
+        render_exr(scene, folder / name)
+        files.append([name, cycles.sample_subset_length])
+        done += cycles.sample_subset_length
+        if len(files) == 1 and done < samples:
+            seconds_left = (time.monotonic() - started) * (samples - done) / done
+            chunks = min(MAX_CHUNKS, max(1, round(seconds_left / CHUNK_SECONDS)))
+            chunk = -(-(samples - done) // chunks)
+    cycles.use_sample_subset = False
+    return files

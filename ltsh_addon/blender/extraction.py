@@ -1,0 +1,112 @@
+"""The child's task: open a .blend, edit it in memory, render samples and reference, describe all in manifest.json."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+
+from . import render_settings
+from .child import SceneError
+from .cycles_reference import render_reference
+from .inventory import rendered_surfaces, with_render_depsgraph
+from .lights import LightInventory, collect_lights
+from .materials import (
+    MaterialReport,
+    give_default_material,
+    inject_aovs,
+    materials_in_use,
+    objects_without_material,
+)
+from .pixel_samples import render_pixel_samples
+
+
+def open_scene(path: Path, warnings: list[str]) -> None:
+    """Open the .blend `path` in memory; scripts in it do not run."""
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
+    except RuntimeError as error:
+        reason = " ".join(str(error).split()).removeprefix("Error: ")
+        raise SceneError(f"{path}: Blender {bpy.app.version_string} cannot open it: {reason}") from None
+    if tuple(bpy.data.version)[:2] > bpy.app.version[:2]:
+        saved = ".".join(str(part) for part in bpy.data.version[:2])
+        warnings.append(f"{path.name} was saved by Blender {saved}; {bpy.app.version_string} may miss parts of it")
+    if bpy.app.autoexec_fail:
+        warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
+
+
+def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
+    """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
+    render_settings.neutralize(scene, view_layer, camera, warnings)
+    render_settings.prepare_surfaces(warnings)
+
+    def visit(depsgraph):
+        surfaces = rendered_surfaces(depsgraph)
+        override = view_layer.material_override
+        bare = [] if override else objects_without_material(surfaces)
+        return collect_lights(depsgraph), materials_in_use(surfaces, override), bare
+
+    inventory, materials, bare = with_render_depsgraph(scene, visit)
+    warnings.extend(inventory.warnings)
+    if not inventory.lights:
+        raise SceneError(
+            f"scene {scene.name!r}: no area light that renders, found {_describe_lights(scene)}; add an area light"
+        )
+    default = give_default_material(bare)
+    report = MaterialReport()
+    inject_aovs(materials + ([default] if default else []), report)
+    warnings.extend(report.lines())
+    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    return inventory
+
+
+def _describe_lights(scene) -> str:
+    lights = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
+    return "lights " + ", ".join(lights) if lights else "no lights at all"
+
+
+def extract(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `child.extract`), write EXRs into `folder`; the manifest as a dictionary."""
+    started, warnings, seconds = time.monotonic(), [], {}
+    progress("open scene", 0.0)
+    open_scene(Path(job["scene"]), warnings)
+    scene = bpy.context.scene
+    if job["frame"] is not None:
+        scene.frame_set(job["frame"])
+    camera = render_settings.choose_camera(scene, job["camera"])
+    view_layer = render_settings.choose_view_layer(scene, warnings)
+    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    inventory = prepare_scene(scene, view_layer, camera, warnings)
+    seconds["start"] = time.monotonic() - started
+
+    started = time.monotonic()
+    samples = render_pixel_samples(scene, view_layer, folder, job["sub_samples"], progress)
+    seconds["samples"] = time.monotonic() - started
+
+    started, reference = time.monotonic(), None
+    if job["cycles_samples"] > 0:
+        reference = render_reference(
+            scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress
+        )
+    seconds["cycles"] = time.monotonic() - started
+    return {
+        "blender_version": bpy.app.version_string,
+        "frame": scene.frame_current,
+        "camera": camera.name,
+        "width": width,
+        "height": height,
+        "lights": [_light_record(light) for light in inventory.lights],
+        "warnings": warnings,
+        "samples": samples,
+        "reference": reference,
+        "passes": render_settings.pass_names(),
+        "seconds": seconds,
+    }
+
+
+def _light_record(light) -> dict:
+    record = dict(vars(light))
+    for name in ("center", "half_u", "half_v", "direction", "radiance"):
+        record[name] = record[name].tolist()
+    return record

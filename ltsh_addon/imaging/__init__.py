@@ -1,0 +1,39 @@
+"""Images and figures: multi-layer EXR, PNG, error metrics, false color, the comparison sheet, the report.
+
+numpy and OpenEXR only; nothing here knows Blender. Conventions: images are (H, W) or (H, W, C) with row 0 on top,
+scene-referred linear Rec.709 unless a name says sRGB; error = technique - reference, red too bright, blue too dark.
+"""
+
+from .exr import Layer, read_channels, read_layers, write_layers
+from .false_color import signed_error_colors
+from .metrics import (
+    ErrorStatistics,
+    error_statistics,
+    noisy_error_statistics,
+    reference_noise,
+    unbiased_relative_error,
+)
+from .png import write_png
+from .report import write_html, write_json
+from .sheet import Tile, comparison_sheet
+from .tone import exposure_factor, to_srgb8
+
+__all__ = [
+    "ErrorStatistics",
+    "Layer",
+    "Tile",
+    "comparison_sheet",
+    "error_statistics",
+    "exposure_factor",
+    "noisy_error_statistics",
+    "read_channels",
+    "read_layers",
+    "reference_noise",
+    "signed_error_colors",
+    "to_srgb8",
+    "unbiased_relative_error",
+    "write_html",
+    "write_json",
+    "write_layers",
+    "write_png",
+]

@@ -1,0 +1,158 @@
+"""Multi-layer OpenEXR files of 32-bit floats, read and written through the OpenEXR package."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .atomic import replacing
+
+_DEFAULT_CHANNELS = {1: "V", 3: "RGB", 4: "RGBA"}
+_CHANNEL_ORDERS = ("RGBA", "XYZW", "UVW")
+_LONGEST_NAME = 255  # bytes, OpenEXR's limit for channel and attribute names
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Pixels (H, W) or (H, W, C) and one letter per channel: ``Layer(position, "XYZ")``."""
+
+    pixels: np.ndarray
+    channels: str = ""  # "" means V, RGB or RGBA by the number of channels
+
+    def planes(self, name: str) -> dict[str, np.ndarray]:
+        """The contiguous float32 planes (H, W) by full channel name; raises ValueError for a wrong shape or type."""
+        pixels = np.asarray(self.pixels)
+        if pixels.ndim not in (2, 3) or 0 in pixels.shape or pixels.dtype.kind not in "fiub":
+            raise ValueError(
+                f"layer {name!r}: an array of shape {pixels.shape} and type {pixels.dtype} was given, expected real "
+                "numbers of shape (height, width) or (height, width, channels)"
+            )
+        pixels = pixels.reshape(*pixels.shape[:2], -1)
+        count = pixels.shape[2]
+        channels = self.channels or _DEFAULT_CHANNELS.get(count, "")
+        if len(channels) != count or len(set(channels)) != count or "." in channels:
+            raise ValueError(f"layer {name!r}: {count} channels need {count} different letters, found {channels!r}")
+        # The writer ignores strides and types other than its own: it would store wrong numbers or crash.
+        with np.errstate(over="ignore"):
+            return {
+                f"{name}.{letter}": np.ascontiguousarray(pixels[..., index], dtype=np.float32)
+                for index, letter in enumerate(channels)
+            }
+
+
+def write_layers(
+    path: str | os.PathLike, layers: Mapping[str, np.ndarray | Layer], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write `layers` as one single-part float32 scanline EXR with ZIP compression and channels ``<layer>.<letter>``.
+
+    Plain arrays of 1, 3 or 4 channels become V, RGB or RGBA. float32 values are kept bit for bit, NaN and Inf
+    included. `metadata` becomes string attributes of the header. The file appears complete or not at all.
+    Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
+    """
+    planes = _planes(layers)
+    OpenEXR = _openexr()
+    header = {str(key): str(value) for key, value in (metadata or {}).items()}
+    reserved = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version"}
+    if clash := reserved & header.keys():
+        raise ValueError(f"metadata {sorted(clash)[0]!r}: that name belongs to the EXR format itself, use another one")
+    header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with replacing(path) as temporary:
+        try:
+            with OpenEXR.File(header, planes) as file:
+                file.write(str(temporary))
+        except RuntimeError as error:
+            # "Cannot open image file "NAME". Reason." names the temporary file; only the reason is of use.
+            raise OSError(str(error).replace(f'"{temporary}"', "").strip()) from error
+
+
+def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All channels by full name, each (H, W) of the file's type, row 0 on top; of all parts of a multi-part file.
+
+    Blender 4.5 writes one part, Blender 5 one part per pass; both give names like ``ViewLayer.Position.X``. A channel
+    without a layer in a named part gets the part's name in front. Raises OSError when the file is missing or
+    unreadable, ValueError, naming the file, when it is damaged or no EXR.
+    """
+    with open(path, "rb") as stream:  # the system's own error for a missing or unreadable file
+        if stream.read(4) != b"\x76\x2f\x31\x01":
+            raise ValueError(f"{path}: is not an OpenEXR file, expected one")
+    channels = {}
+    parts = _read_parts(Path(path))
+    for part in parts:
+        for name, channel in part.channels.items():
+            if channel.pixels is None:
+                raise ValueError(f"{path}: is damaged, channel {name!r} has no pixels; render or write it again")
+            prefix = f"{part.name()}." if len(parts) > 1 and "." not in name and part.name() else ""
+            channels[prefix + name] = channel.pixels
+    return channels
+
+
+def read_layers(path: str | os.PathLike) -> dict[str, np.ndarray]:
+    """All layers by name: (H, W) for a single channel, else (H, W, C) in the order RGBA, XYZW or alphabetical.
+
+    The layer is the channel's name up to its last dot ("" without one). Raises as `read_channels` does.
+    """
+    grouped: dict[str, dict[str, np.ndarray]] = {}
+    for name, pixels in read_channels(path).items():
+        layer, _, letter = name.rpartition(".")
+        grouped.setdefault(layer, {})[letter] = pixels
+    layers = {}
+    for layer, planes in grouped.items():
+        ordered = [planes[letter] for letter in sorted(planes, key=_channel_rank)]
+        layers[layer] = ordered[0] if len(ordered) == 1 else np.stack(ordered, axis=-1)
+    return layers
+
+
+def _channel_rank(letter: str) -> tuple[int, str]:
+    ranks = [order.index(letter) for order in _CHANNEL_ORDERS if len(letter) == 1 and letter in order]
+    return (ranks[0] if ranks else 99, letter)
+
+
+def _planes(layers: Mapping[str, np.ndarray | Layer]) -> dict[str, np.ndarray]:
+    planes: dict[str, np.ndarray] = {}
+    for name, layer in layers.items():
+        if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME - 2:
+            raise ValueError(f"layer {name!r}: expected a name of 1 to {_LONGEST_NAME - 2} bytes without NUL")
+        planes |= (layer if isinstance(layer, Layer) else Layer(layer)).planes(name)
+    if not planes:
+        raise ValueError("no layers were given, an EXR file needs at least one")
+    first_name, first = next(iter(planes.items()))
+    for name, plane in planes.items():
+        if plane.shape != first.shape:
+            raise ValueError(
+                f"channel {name!r} is {plane.shape[1]}x{plane.shape[0]}, but {first_name!r} is "
+                f"{first.shape[1]}x{first.shape[0]}; all layers of a file need the same size"
+            )
+    return planes
+
+
+def _read_parts(path: Path) -> list:
+    OpenEXR = _openexr()
+    complaint = io.StringIO()
+    try:
+        # The package prints a warning to stdout and leaves a damaged part out, instead of raising.
+        with contextlib.redirect_stdout(complaint):
+            expected = len(OpenEXR.File(str(path), header_only=True).parts)
+            parts = OpenEXR.File(str(path), separate_channels=True).parts
+    except (RuntimeError, ValueError, OSError, MemoryError) as error:
+        raise ValueError(f"{path}: is damaged and cannot be read ({error}); render or write it again") from error
+    if len(parts) != expected or not parts:
+        reason = complaint.getvalue().strip().rpartition(" - ")[2] or f"{len(parts)} of {expected} parts readable"
+        raise ValueError(f"{path}: is damaged or incomplete ({reason}); render or write it again")
+    return parts
+
+
+def _openexr():
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise ImportError(
+            f"the Python package OpenEXR cannot be imported ({error}); it is needed to read and write EXR files: "
+            "install it with `pip install OpenEXR`"
+        ) from error
+    return OpenEXR

@@ -1,0 +1,146 @@
+"""The shared vocabulary: lights, surface samples and film, as frozen dataclasses of arrays.
+
+World space is Blender's: metres, right-handed, z up. Radiance is scene-referred linear RGB in W m^-2 sr^-1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+
+class Cancelled(Exception):
+    """A long computation was stopped on request."""
+
+
+AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")
+
+
+@dataclass(frozen=True)
+class AreaLight:
+    """A one-sided, uniformly emitting, flat area light.
+
+    The surface is ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE and
+    s^2 + t^2 <= 1 for DISK and ELLIPSE.
+    """
+
+    name: str
+    shape: str  # one of AREA_LIGHT_SHAPES
+    center: np.ndarray  # (3,) m
+    half_u: np.ndarray  # (3,) m
+    half_v: np.ndarray  # (3,) m
+    direction: np.ndarray  # (3,) unit, the side that emits
+    radiance: np.ndarray  # (3,) W m^-2 sr^-1
+    group: str = ""
+    affects_diffuse: bool = True
+    affects_specular: bool = True
+
+    def __post_init__(self):
+        if self.shape not in AREA_LIGHT_SHAPES:
+            raise ValueError(
+                f"light {self.name!r}: shape is {self.shape!r}, expected one of {', '.join(AREA_LIGHT_SHAPES)}"
+            )
+        for name in ("center", "half_u", "half_v", "direction", "radiance"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,) or not np.isfinite(value).all():
+                raise ValueError(f"light {self.name!r}: {name} is {value!r}, expected three finite numbers")
+            object.__setattr__(self, name, value)
+
+    @property
+    def is_round(self) -> bool:
+        """True for DISK and ELLIPSE."""
+        return self.shape in ("DISK", "ELLIPSE")
+
+    def polygon(self, round_vertices: int = 32) -> np.ndarray:
+        """Corners (V, 3) in m, counterclockwise as seen from the lit side.
+
+        A disk or ellipse becomes a regular polygon of `round_vertices` corners, stretched to the area of the ellipse.
+        """
+        if self.is_round:
+            angle = 2.0 * np.pi * np.arange(round_vertices) / round_vertices
+            step = 2.0 * np.pi / round_vertices
+            radius = np.sqrt(step / np.sin(step))
+            s, t = radius * np.cos(angle), radius * np.sin(angle)
+        else:
+            s, t = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
+        corners = self.center + s[:, None] * self.half_u + t[:, None] * self.half_v
+        mirrored = np.dot(np.cross(self.half_u, self.half_v), self.direction) < 0.0
+        return corners[::-1] if mirrored else corners
+
+
+@dataclass(frozen=True)
+class SurfaceSamples:
+    """P surface points with all that shading needs. Vectors are unit, in world space; last axis is space or color.
+
+    The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
+    ``f0 + (f90 - f0) (1 - c)^5  +  dielectric * F_d(c, ior)``, c = cosine of the half angle, F_d the exact unpolarized
+    reflectance of a dielectric. `diffuse_albedo` already includes what the specular layer takes away.
+    """
+
+    position: np.ndarray  # (P, 3) m
+    view: np.ndarray  # (P, 3) towards the camera
+    normal: np.ndarray  # (P, 3) shading normal of the specular lobe
+    diffuse_normal: np.ndarray  # (P, 3) shading normal of the diffuse lobe
+    roughness: np.ndarray  # (P,) in [0, 1]
+    specular_f0: np.ndarray  # (P, 3)
+    specular_f90: np.ndarray  # (P, 3)
+    dielectric: np.ndarray  # (P,) weight of the dielectric lobe
+    ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
+    diffuse_albedo: np.ndarray  # (P, 3)
+
+    def __post_init__(self):
+        count = np.shape(self.position)[0]
+        for field in fields(self):
+            value = np.asarray(getattr(self, field.name))
+            vector = field.name not in ("roughness", "dielectric", "ior")
+            expected = (count, 3) if vector else (count,)
+            if value.shape != expected:
+                raise ValueError(f"surface samples: {field.name} has shape {value.shape}, expected {expected}")
+            object.__setattr__(self, field.name, value)
+
+    def __len__(self) -> int:
+        return self.position.shape[0]
+
+    def take(self, index) -> SurfaceSamples:
+        """The samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
+        return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+    def save(self, path) -> None:
+        """Write a compressed .npz; `load` reads it back bit for bit."""
+        np.savez_compressed(Path(path), **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @classmethod
+    def load(cls, path) -> SurfaceSamples:
+        """Read what `save` wrote."""
+        with np.load(Path(path)) as data:
+            missing = [field.name for field in fields(cls) if field.name not in data]
+            if missing:
+                raise ValueError(f"{path}: no surface samples, {', '.join(missing)} missing")
+            return cls(**{field.name: data[field.name] for field in fields(cls)})
+
+
+@dataclass(frozen=True)
+class Film:
+    """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
+    `sub_samples` samples, of which those that hit nothing are absent."""
+
+    width: int
+    height: int
+    pixel: np.ndarray  # (P,) integers
+    sub_samples: int = 1
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        """Image (H, W) or (H, W, C), row 0 on top, of per-sample `values` (P,) or (P, C)."""
+        values = np.asarray(values, dtype=np.float64)
+        columns = values.reshape(values.shape[0], -1)
+        count = self.width * self.height
+        image = np.stack(
+            [np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1
+        )
+        return (image / self.sub_samples).reshape(self.height, self.width, *values.shape[1:])
+
+    def coverage(self) -> np.ndarray:
+        """Share (H, W) of each pixel's sub-samples that hit a surface."""
+        return self.image(np.ones(self.pixel.shape[0]))

@@ -1,0 +1,30 @@
+"""Shading by linearly transformed lobes: numpy only. The conventions of the whole package stand here.
+
+Local frame of a surface point: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o), so it has
+y = 0 and x >= 0. The BRDF is mirror-symmetric in y.
+Winding: a polygon's solid angle and signed integrals are positive where its corners run counterclockwise as seen from
+outside the unit sphere around the point.
+Spherical harmonics: order and sign as in `spherical_harmonics`.
+Roughness is Blender's: alpha = roughness^2 of GGX with height-correlated Smith masking-shadowing.
+Colors are linear RGB; radiance is in W m^-2 sr^-1.
+Letters: P samples, L lights, V polygon corners, K coefficients, F Fresnel curves; arrays of vectors in the public
+functions have space as the last axis, kernels work on (3, V, P).
+"""
+
+from .integrator import PASSES, REFERENCE, Shading, shade
+from .lobe_integrals import clamped_form_factor, evaluate_lobe, integrate_polygon
+from .lookup_table import SHIPPED_TABLES, LookupTable, TableError, load_table
+
+__all__ = [
+    "PASSES",
+    "REFERENCE",
+    "SHIPPED_TABLES",
+    "LookupTable",
+    "Shading",
+    "TableError",
+    "clamped_form_factor",
+    "evaluate_lobe",
+    "integrate_polygon",
+    "load_table",
+    "shade",
+]

@@ -1,0 +1,58 @@
+"""GGX microfacet reflection and Fresnel curves, in the local frame (see the package's conventions)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def ggx_brdf_cosine(cos_theta_o, alpha, directions):
+    """Single-scatter GGX BRDF times cosine with F = 1, in sr^-1; 0 below the horizon.
+
+    cos_theta_o (...), alpha = roughness^2 (...), directions (..., S, 3) unit -> (..., S). Height-correlated Smith
+    masking-shadowing (Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99; Walter et al. 2007, eq. 33).
+    Written with S(mu) = sqrt(mu^2 + alpha^2 (1 - mu^2)), so that nothing is divided by a vanishing cosine:
+    f cos = D(h) mu_i / (2 (mu_o S(mu_i) + mu_i S(mu_o))).
+    """
+    mu_o = np.asarray(cos_theta_o)[..., None]
+    alpha = np.asarray(alpha)[..., None]
+    alpha_squared = alpha * alpha
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    half_x = x + np.sqrt(np.maximum(1.0 - mu_o * mu_o, 0.0))
+    half_z = z + mu_o
+    horizontal = half_x * half_x + y * y
+    vertical = half_z * half_z
+    # D(h) with h unnormalized: alpha^2 |h|^4 / (pi (h_x^2 + h_y^2 + alpha^2 h_z^2)^2)
+    ratio = (horizontal + vertical) / np.maximum(horizontal + alpha_squared * vertical, 1e-300)
+    distribution = alpha_squared / np.pi * ratio * ratio
+    mu_i = np.maximum(z, 0.0)
+    masking = mu_o * _slope_length(mu_i, alpha_squared) + mu_i * _slope_length(mu_o, alpha_squared)
+    return distribution * mu_i / (2.0 * np.maximum(masking, 1e-300))
+
+
+def _slope_length(mu, alpha_squared):
+    return np.sqrt(mu * mu + alpha_squared * (1.0 - mu * mu))
+
+
+def half_angle_cosine(cos_theta_o, directions):
+    """Cosine (..., S) of the angle between the half vector and either direction; arguments as `ggx_brdf_cosine`."""
+    mu_o = np.asarray(cos_theta_o)[..., None]
+    sin_o = np.sqrt(np.maximum(1.0 - mu_o * mu_o, 0.0))
+    cosine = directions[..., 0] * sin_o + directions[..., 2] * mu_o
+    return np.sqrt(np.clip(0.5 * (1.0 + cosine), 0.0, 1.0))
+
+
+def schlick_curve(cosine):
+    """(1 - c)^5 (Schlick 1994): the reflectance is f0 + (f90 - f0) (1 - c)^5."""
+    complement = 1.0 - cosine
+    squared = complement * complement
+    return squared * squared * complement
+
+
+def dielectric_reflectance(cosine, ior):
+    """Exact unpolarized Fresnel reflectance of a dielectric seen from outside; `ior` >= 1 is relative; broadcasts."""
+    cosine = np.asarray(cosine)
+    g = np.sqrt(np.maximum(ior * ior - 1.0 + cosine * cosine, 0.0))
+    # At cosine 0 without refraction (ior 1) the quotient is 0 / 0; its limit along cosine -> 0 is 0.
+    perpendicular = (g - cosine) / np.maximum(g + cosine, 1e-30)
+    plus, minus = cosine * (g + cosine) - 1.0, cosine * (g - cosine) + 1.0
+    return 0.5 * perpendicular * perpendicular * (1.0 + (plus / minus) ** 2)

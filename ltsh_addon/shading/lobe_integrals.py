@@ -1,0 +1,107 @@
+"""Linearly transformed lobes: their values, and their integrals over polygons in closed form.
+
+LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and Peters 2021: both integrate the
+original distribution over the transformed polygon, which is clipped at the horizon first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import edge_integrals, spherical_harmonics
+from .lookup_table import Lobe, LookupTable
+from .polygon import project_to_sphere, solid_angle, split_at_horizon
+
+
+def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
+    """The lobe, approximating BRDF times cosine with F = 1, in sr^-1.
+
+    cos_theta_o (P,), roughness (P,), unit directions (P, S, 3) in the local frame -> (P, S); 0 below the horizon.
+    """
+    cosine, roughness, directions = _as_float(cos_theta_o, roughness, directions)
+    if directions.ndim != 3 or directions.shape[2] != 3 or directions.shape[0] != cosine.shape[0]:
+        raise ValueError(f"directions have shape {directions.shape}, expected ({cosine.shape[0]}, S, 3)")
+    lobe = table.lookup(cosine, roughness)
+    warped = lobe.to_original_domain(np.ascontiguousarray(directions.transpose(2, 1, 0)))
+    length = np.sqrt((warped * warped).sum(axis=0))
+    unit = warped / length
+    if lobe.tilt is None:
+        basis = spherical_harmonics.evaluate(table.degree, np.moveaxis(unit, 0, -1))
+        original = (basis * lobe.coefficients[0][:, None, :]).sum(axis=0)
+    else:
+        toward_axis = np.sin(lobe.tilt) * unit[0] + np.cos(lobe.tilt) * unit[2]
+        original = lobe.coefficients[0, 0] * np.maximum(toward_axis, 0.0) / np.pi
+    values = original * (lobe.xx * lobe.yy * lobe.zz) / length**3
+    return np.where(directions[..., 2] > 0.0, values.T, 0.0)
+
+
+def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, signed: bool = False) -> np.ndarray:
+    """Integral of `evaluate_lobe` over the part of a polygon above the horizon: reflected radiance per radiance.
+
+    cos_theta_o (P,), roughness (P,), vertices (P, V, 3) in the local frame in any length unit, either winding -> (P,).
+    The signed integral, positive for corners counterclockwise as seen from outside the unit sphere, is multiplied by
+    the sign of the polygon's solid angle and clamped at zero; `signed` returns it as it is.
+    """
+    cosine, roughness, vertices = _as_float(cos_theta_o, roughness, vertices)
+    if vertices.ndim != 3 or vertices.shape[2] != 3 or vertices.shape[1] < 3 or len(vertices) != len(cosine):
+        raise ValueError(f"vertices have shape {vertices.shape}, expected ({len(cosine)}, V >= 3, 3)")
+    lobe = table.lookup(cosine, roughness)
+    result = np.zeros(len(cosine), dtype=vertices.dtype)
+    for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
+        part = lobe.take(index)
+        integral = polygon_integrals(table, part, polygon, part.coefficients[:1])[0]
+        if not signed:
+            integral = np.maximum(np.sign(solid_angle(project_to_sphere(polygon))) * integral, 0.0)
+        result[index] = integral
+    return result
+
+
+def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Signed integrals (F, P) over polygons (3, V, P) in z >= 0, for coefficient vectors (F, K, P) under one warp."""
+    warped = lobe.to_original_domain(polygon)
+    if lobe.tilt is not None:
+        return coefficients[:, 0] * _tilted_cosine_integral(warped, lobe.tilt)
+    moments = edge_integrals.moments(project_to_sphere(warped), table.degree)
+    weights = table.ridge_weights.astype(moments.dtype)
+    # Plain loops over K: no BLAS, so that a result does not depend on how many points share a batch.
+    ridge_moments = np.stack([_weighted_sum(row, moments) for row in weights])
+    return np.stack([(vector * ridge_moments).sum(axis=0) for vector in coefficients])
+
+
+def _weighted_sum(weights, rows):
+    total = np.zeros_like(rows[0])
+    for weight, row in zip(weights, rows, strict=True):
+        if weight != 0.0:
+            total += weight * row
+    return total
+
+
+def _tilted_cosine_integral(warped, tilt):
+    """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt): clipped a second time."""
+    sine, cosine = np.sin(tilt), np.cos(tilt)
+    turned = np.stack([cosine * warped[0] - sine * warped[2], warped[1], sine * warped[0] + cosine * warped[2]])
+    result = np.zeros_like(tilt)
+    for index, polygon in split_at_horizon(turned):
+        result[index] = edge_integrals.clamped_cosine_integral(project_to_sphere(polygon)) / np.pi
+    return result
+
+
+def form_factor(polygon: np.ndarray) -> np.ndarray:
+    """Signed Lambertian form factor (P,) of polygons (3, V, P) in z >= 0: the integral of cosine / pi (Lambert 1760)."""
+    return edge_integrals.clamped_cosine_integral(project_to_sphere(polygon)) / np.pi
+
+
+def clamped_form_factor(vertices) -> np.ndarray:
+    """Form factor (P,) of the part above the horizon of polygons (P, V, 3), either winding."""
+    vertices = np.asarray(vertices)
+    result = np.zeros(len(vertices), dtype=vertices.dtype)
+    for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
+        result[index] = np.abs(form_factor(polygon))
+    return result
+
+
+def _as_float(cos_theta_o, roughness, vectors):
+    vectors = np.asarray(vectors)
+    dtype = np.float32 if vectors.dtype == np.float32 else np.float64
+    return np.asarray(cos_theta_o, dtype=dtype), np.asarray(roughness, dtype=dtype), vectors.astype(dtype, copy=False)
+

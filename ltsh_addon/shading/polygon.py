@@ -9,21 +9,22 @@ from __future__ import annotations
 import numpy as np
 
 
-def clip_to_horizon(vertices: np.ndarray) -> np.ndarray:
-    """The part with z >= 0 of polygons (3, V, P), as (3, W, P) with W <= 2 V (W <= V + 1 where all are convex).
+def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
+    """The part of polygons (C, V, P) with C coordinates where coordinate `axis` is positive, as (C, W, P).
 
-    Sutherland and Hodgman 1974. Each polygon needs a corner with z > 0. New corners have z = 0 exactly. A non-convex
-    polygon may get coincident edges on the horizon, which cancel in a signed integral.
+    Sutherland and Hodgman 1974; W <= V + 1 where all are convex, else W <= 2 V. Each polygon needs a corner above. New
+    corners have coordinate 0 exactly. A non-convex polygon may get coincident edges on the horizon, which cancel in a
+    signed integral.
     """
-    above = vertices[2] > 0.0
+    height = vertices[axis]
+    above = height > 0.0
     following = np.roll(vertices, -1, axis=1)
     crosses = above != np.roll(above, -1, axis=0)
-    height, following_height = vertices[2], following[2]
-    span = np.where(crosses, height - following_height, 1.0)
+    span = np.where(crosses, height - following[axis], 1.0)
     crossing = vertices + (height / span) * (following - vertices)
-    crossing[2] = 0.0
-    count = vertices.shape[1]
-    slots = np.stack([vertices, crossing], axis=2).reshape(3, 2 * count, -1)
+    crossing[axis] = 0.0
+    coordinates, count = vertices.shape[:2]
+    slots = np.stack([vertices, crossing], axis=2).reshape(coordinates, 2 * count, -1)
     used = np.stack([above, crosses], axis=1).reshape(2 * count, -1)
     return _compact(slots, used)
 
@@ -37,9 +38,10 @@ def _compact(slots: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.take_along_axis(slots, index[None], axis=1)
 
 
-def split_at_horizon(vertices: np.ndarray):
-    """Yield (index (Q,), polygons (3, W, Q)) for the points that see a part of their polygon (3, V, P) above z = 0."""
-    above = vertices[2] > 0.0
+def split_at_horizon(vertices: np.ndarray, axis: int = 2):
+    """Yield (index (Q,), polygons (C, W, Q)) for the points that see a part of their polygon (C, V, P) where coordinate
+    `axis` is positive: first those that see all of it, then those whose polygon is clipped."""
+    above = vertices[axis] > 0.0
     whole = above.all(axis=0)
     cut = above.any(axis=0) & ~whole
     if whole.any():
@@ -47,7 +49,7 @@ def split_at_horizon(vertices: np.ndarray):
         yield index, vertices if whole.all() else vertices[:, :, index]
     if cut.any():
         index = np.nonzero(cut)[0]
-        yield index, clip_to_horizon(vertices[:, :, index])
+        yield index, clip_to_horizon(vertices[:, :, index], axis)
 
 
 def project_to_sphere(vertices: np.ndarray) -> np.ndarray:
@@ -76,4 +78,7 @@ def solid_angle(unit: np.ndarray) -> np.ndarray:
         scale = np.abs(product_real) + np.abs(product_imaginary)
         scale = 1.0 / np.where(scale > 0.0, scale, 1.0)
         product_real, product_imaginary = product_real * scale, product_imaginary * scale
-    return 2.0 * np.arctan2(product_imaginary, product_real)
+    angle = 2.0 * np.arctan2(product_imaginary, product_real)
+    # Close to 2 pi rounding may cross the branch cut; the area projected on the horizon still has the right sign.
+    wrapped = (np.abs(angle) > 6.0) & (imaginary.sum(axis=0) * angle < 0.0)
+    return np.where(wrapped, -angle, angle)

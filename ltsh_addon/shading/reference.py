@@ -1,51 +1,147 @@
-"""Reference quadrature: the true GGX lobe integrated over a polygon, with an error estimate.
+"""Reference quadrature: the true GGX lobe integrated over a polygon or an ellipse, with an error estimate.
 
-The polygon is warped by W (see `lookup_table`) with A = B = C = 1, the limit of GGX for alpha -> 0, which flattens the
-lobe's peak; no fitted number enters. With an apex inside the warped spherical polygon,
+The light is warped by W (see `lookup_table`) with A = B = C = 1, the limit of GGX for alpha -> 0, which flattens the
+lobe's peak; no fitted number enters. With an apex p inside the warped light and its boundary w(t),
 
-    int f dw = sum_edges phi (X . apex) int_0^1 [ int_0^rho f J sin(r) dr / sin^2(rho) ] dt,   X = a x b,
+    int f dw = contour_integral (w x dw) . p  int_0^rho f J sin(r) dr / sin^2(rho),
 
-where t runs along the edge at constant speed, rho is the distance from the apex and J the Jacobian of the warp. Both
-integrands are analytic, so Gauss-Legendre rules converge fast; their order grows until two orders agree.
+where rho is the angle between p and w(t), the inner integral runs along the arc from p to w(t), and J is the Jacobian
+of the warp. The integrands are analytic on every piece of the boundary, so Gauss-Legendre rules converge fast; their
+order grows until two orders agree.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from . import brdf
 from .edge_integrals import arc_factors
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
-from .polygon import project_to_sphere, solid_angle
+from .polygon import project_to_sphere
 
-# Gauss-Legendre orders (along an edge, along a radius), tried in turn; polygons of many corners have short edges.
-_ORDERS_FEW_CORNERS = ((10, 12), (16, 18), (28, 30), (48, 50), (80, 80))
-_ORDERS_MANY_CORNERS = ((3, 10), (5, 16), (8, 24), (14, 40), (24, 64))
-_POINTS_AT_ONCE = 1_500_000
+# Gauss-Legendre orders along each piece of the boundary, and along a radius; tried in turn.
+_ORDERS = ((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72))
+_ELLIPSE_PIECES = 8
+# Evaluations per batch: the arrays of one batch stay in the cache.
+_BATCH = 60_000
 
 
-def lobe_integrals(polygon, cos_theta_o, alpha, ior, *, tolerance=1e-4):
-    """Integrals (3, P) of the GGX BRDF times cosine over polygons (3, V, P) in z >= 0, and error estimates (P,).
+@dataclass(frozen=True)
+class PolygonBoundary:
+    """Warped spherical polygons, corners `unit` (3, V, P)."""
 
-    The three rows have the Fresnel factor 1, (1 - c)^5 and that of a dielectric of relative `ior` (P,); the local frame,
-    cos_theta_o (P,) and alpha (P,) are those of `lookup_table`. The order grows until the first row of two successive
-    orders differs by less than `tolerance` of the value plus 1e-6; the estimate is the last difference. Convex polygons.
+    unit: np.ndarray
+
+    @classmethod
+    def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
+        return cls(project_to_sphere(warp.to_original_domain(polygon)))
+
+    pieces = property(lambda self: self.unit.shape[1])
+
+    def take(self, index) -> PolygonBoundary:
+        return PolygonBoundary(self.unit[:, :, index])
+
+    def apex(self) -> np.ndarray:
+        """Unit vectors (3, P) inside: the peak of the lobe, e_z, where it is inside, else the mean corner."""
+        following = np.roll(self.unit, -1, axis=1)
+        side = self.unit[0] * following[1] - self.unit[1] * following[0]
+        inside = (side >= 0.0).all(axis=0) | (side <= 0.0).all(axis=0)
+        return _peak_or_mean(inside, self.unit)
+
+    def nodes(self, order: int):
+        """Unit vectors (3, B, P) on the boundary and (w x dw) times the quadrature weight, (3, B, P)."""
+        fractions, weights = _unit_interval(order)
+        start, end = self.unit[:, :, None], np.roll(self.unit, -1, axis=1)[:, :, None]
+        cosine = (start * end).sum(axis=0)
+        normal = np.cross(start, end, axis=0)
+        theta = np.arctan2(np.sqrt((normal**2).sum(axis=0)), cosine)
+        points = _slerp(start, end, theta, fractions[:, None])
+        measure = normal * arc_factors(1.0 + cosine)[0] * weights[:, None]
+        count = self.unit.shape[2]
+        return points.reshape(3, -1, count), measure.reshape(3, -1, count)
+
+
+@dataclass(frozen=True)
+class EllipseBoundary:
+    """Warped ellipses center + cos(t) half_u + sin(t) half_v, each (3, P), seen above the horizon for |t - middle| <
+    reach; a chord along the horizon closes the rest."""
+
+    center: np.ndarray
+    half_u: np.ndarray
+    half_v: np.ndarray
+    middle: np.ndarray  # (P,)
+    reach: np.ndarray  # (P,), pi where all of the ellipse is above the horizon, 0 where none is
+
+    @classmethod
+    def warped(cls, warp: Lobe, center, half_u, half_v) -> EllipseBoundary:
+        center, half_u, half_v = (warp.to_original_domain(vector) for vector in (center, half_u, half_v))
+        swing = np.hypot(half_u[2], half_v[2])
+        ratio = np.divide(-center[2], swing, out=np.where(center[2] > 0.0, -1.0, 1.0), where=swing > 0.0)
+        return cls(center, half_u, half_v, np.arctan2(half_v[2], half_u[2]), np.arccos(np.clip(ratio, -1.0, 1.0)))
+
+    pieces = _ELLIPSE_PIECES + 1
+
+    def take(self, index) -> EllipseBoundary:
+        vectors = (self.center[:, index], self.half_u[:, index], self.half_v[:, index])
+        return EllipseBoundary(*vectors, self.middle[index], self.reach[index])
+
+    def apex(self) -> np.ndarray:
+        """As `PolygonBoundary.apex`; e_z is inside where the z axis meets the ellipse."""
+        normal = np.cross(self.half_u, self.half_v, axis=0)
+        height = _dot(normal, self.center) / np.where(normal[2] != 0.0, normal[2], 1.0)
+        offset = -self.center + height * np.array([0.0, 0.0, 1.0])[:, None]
+        scale = _dot(normal, normal)
+        u = _dot(np.cross(offset, self.half_v, axis=0), normal) / scale
+        v = _dot(np.cross(self.half_u, offset, axis=0), normal) / scale
+        inside = (normal[2] != 0.0) & (height > 0.0) & (u * u + v * v <= 1.0)
+        turns = (np.arange(16) + 0.5) / 8.0 - 1.0
+        return _peak_or_mean(inside, project_to_sphere(self._at(turns[:, None])))
+
+    def nodes(self, order: int):
+        """As `PolygonBoundary.nodes`."""
+        fractions, weights = _unit_interval(order)
+        turns = (2.0 * (np.arange(_ELLIPSE_PIECES)[:, None] + fractions) / _ELLIPSE_PIECES - 1.0).ravel()[:, None]
+        vectors = self._at(turns)
+        angle = self.middle + turns * self.reach
+        velocity = np.cos(angle) * self.half_v[:, None] - np.sin(angle) * self.half_u[:, None]
+        step = np.tile(weights, _ELLIPSE_PIECES)[:, None] * 2.0 / _ELLIPSE_PIECES * self.reach
+        measure = np.cross(vectors, velocity, axis=0) * step / _dot(vectors, vectors)
+        closing = PolygonBoundary(project_to_sphere(self._at(np.array([[1.0], [-1.0]]))))
+        points, closing_measure = closing.nodes(order)
+        # The polygon of two corners has two edges; only the first is the chord, and only of a clipped ellipse.
+        closing_measure = np.where(self.reach < np.pi, closing_measure[:, :order], 0.0)
+        return (
+            np.concatenate([project_to_sphere(vectors), points[:, :order]], axis=1),
+            np.concatenate([measure, closing_measure], axis=1),
+        )
+
+    def _at(self, turns):
+        angle = self.middle + turns * self.reach
+        return self.center[:, None] + np.cos(angle) * self.half_u[:, None] + np.sin(angle) * self.half_v[:, None]
+
+
+def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
+    """Integrals (3, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
+
+    `make_boundary(warp)` returns the boundary of the part with z >= 0 of each light in the local frame of cos_theta_o
+    (P,), warped. The three rows have the Fresnel factor 1, (1 - c)^5 and that of a dielectric of relative `ior` (P,). The
+    order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6; the estimate
+    is the last difference. Lights must be convex.
     """
     warp = _limit_warp(cos_theta_o, np.maximum(alpha, MIN_ALPHA))
-    unit = project_to_sphere(warp.to_original_domain(polygon))
-    orientation = np.sign(solid_angle(unit))
-    apex = _apex(unit, orientation)
-    orders = _ORDERS_FEW_CORNERS if unit.shape[1] <= 12 else _ORDERS_MANY_CORNERS
-    count = unit.shape[2]
+    boundary = make_boundary(warp)
+    apex = boundary.apex()
+    count = len(cos_theta_o)
     result, error = np.zeros((3, count)), np.full(count, np.inf)
     open_points = np.arange(count)
-    for level, order in enumerate(orders):
-        chunk = max(_POINTS_AT_ONCE // (unit.shape[1] * order[0] * order[1]), 1)
-        for start in range(0, len(open_points), chunk):
-            index = open_points[start : start + chunk]
-            value = orientation[index] * _fixed_order(
-                order, unit[:, :, index], apex[:, index], warp.take(index), cos_theta_o[index], alpha[index], ior[index]
-            )
+    for level, order in enumerate(_ORDERS):
+        batch = max(_BATCH // (boundary.pieces * order[0] * order[1]), 1)
+        for start in range(0, len(open_points), batch):
+            index = open_points[start : start + batch]
+            setting = (warp.take(index), cos_theta_o[index], np.maximum(alpha[index], MIN_ALPHA), ior[index])
+            value = _fixed_order(order, boundary.take(index), apex[:, index], *setting)
             if level > 0:
                 error[index] = np.abs(value - result[:, index]).max(axis=0)
             result[:, index] = value
@@ -61,33 +157,32 @@ def _limit_warp(cosine, alpha):
     return Lobe(squared, np.sqrt(squared) * sine, np.ones_like(alpha), 2.0 * alpha, None, np.empty((0, 0, len(alpha))))
 
 
-def _apex(unit, orientation):
-    """Unit vectors (3, P) in the polygons: the peak of the lobe, e_z, where it is inside, else the mean corner."""
-    following = np.roll(unit, -1, axis=1)
-    side = (unit[0] * following[1] - unit[1] * following[0]) * orientation
-    inside = (side >= 0.0).all(axis=0)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _peak_or_mean(inside, unit):
     mean = project_to_sphere(unit.sum(axis=1, keepdims=True))[:, 0]
     return np.where(inside, np.array([0.0, 0.0, 1.0])[:, None], mean)
 
 
-def _fixed_order(order, unit, apex, warp, cos_theta_o, alpha, ior):
-    """Signed integrals (3, P) with fixed Gauss-Legendre orders."""
-    along, along_weights = _unit_interval(order[0])
-    radial, radial_weights = _unit_interval(order[1])
-    following = np.roll(unit, -1, axis=1)
-    phi, _, _ = arc_factors((unit * following).sum(axis=0))
-    normal = np.cross(unit, following, axis=0)
-    theta = np.arctan2(np.sqrt((normal**2).sum(axis=0)), (unit * following).sum(axis=0))
-    edge_factor = phi * (normal * apex[:, None]).sum(axis=0)
-    boundary = _slerp(unit[..., None], following[..., None], theta[..., None], along)  # (3, V, P, n)
-    cosine = np.clip((boundary * apex[:, None, :, None]).sum(axis=0), -1.0, 1.0)
-    rho = np.maximum(np.arccos(cosine), 1e-7)
-    points = _slerp(apex[:, None, :, None, None], boundary[..., None], rho[..., None], radial)  # (3, V, P, n, m)
-    values = _warped_integrand(points, warp, cos_theta_o, alpha, ior)  # (3, V, P, n, m)
-    sine = np.sin(rho)
-    weight = rho[..., None] * np.sin(rho[..., None] * radial) * radial_weights / (sine * sine)[..., None]
-    weight = weight * (edge_factor[..., None] * along_weights)[..., None]
-    return (values * weight).sum(axis=(1, 3, 4))
+def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior):
+    """Integrals (3, P) with fixed Gauss-Legendre orders."""
+    points, measure = boundary.nodes(order[0])
+    wedge = _dot(measure, apex[:, None])  # (B, P)
+    wedge = wedge * np.sign(wedge.sum(axis=0))
+    rho = np.maximum(np.arccos(np.clip(_dot(points, apex[:, None]), -1.0, 1.0)), 1e-7)[:, None]
+    fractions, weights = _unit_interval(order[1])
+    fractions = fractions[:, None]
+    inner_sine, sine = np.sin(rho * fractions), np.sin(rho)
+    near, far = np.sin(rho * (1.0 - fractions)) / sine, inner_sine / sine  # (B, m, P)
+    weight = wedge[:, None] * weights[:, None] * rho / sine * far
+    warped = [near * apex[axis] + far * points[axis][:, None] for axis in range(3)]
+    values, half = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
+    values *= weight
+    schlick = (values * brdf.schlick_curve(half)).sum(axis=(0, 1))
+    dielectric = (values * brdf.dielectric_reflectance(half, np.maximum(ior, 1.0))).sum(axis=(0, 1))
+    return np.stack([values.sum(axis=(0, 1)), schlick, dielectric])
 
 
 def _unit_interval(count):
@@ -95,32 +190,24 @@ def _unit_interval(count):
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
-def _slerp(start, end, angle, parameter):
-    """Points at the fractions `parameter` of arcs of length `angle`; the ends coincide where the angle is zero."""
+def _slerp(start, end, angle, fraction):
+    """Points at `fraction` of arcs of length `angle`; the ends coincide where the angle is zero."""
     sine = np.sin(angle)
-    safe = np.where(sine > 1e-9, sine, 1.0)
-    near = np.where(sine > 1e-9, np.sin((1.0 - parameter) * angle) / safe, 1.0 - parameter)
-    far = np.where(sine > 1e-9, np.sin(parameter * angle) / safe, parameter)
+    curved = sine > 1e-9
+    safe = np.where(curved, sine, 1.0)
+    near = np.where(curved, np.sin((1.0 - fraction) * angle) / safe, 1.0 - fraction)
+    far = np.where(curved, np.sin(fraction * angle) / safe, fraction)
     return near * start + far * end
 
 
-def _warped_integrand(points, warp, cos_theta_o, alpha, ior):
-    """BRDF times cosine times Jacobian of the warp for the three Fresnel factors, at points of the warped sphere."""
-    shape = (slice(None), None, None)
-    z = points[2] / warp.zz[shape]
-    x = (points[0] - warp.xz[shape] * z) / warp.xx[shape]
-    y = points[1] / warp.yy[shape]
+def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
+    """BRDF times cosine times Jacobian, and the cosine of the half angle, at warped unit vectors [x, y, z]."""
+    z = warped[2] / warp.zz
+    x = (warped[0] - warp.xz * z) / warp.xx
+    y = warped[1] / warp.yy
     length = np.sqrt(x * x + y * y + z * z)
-    directions = np.stack([x, y, z], axis=-1) / length[..., None]
-    flat = np.moveaxis(directions, 1, 0).reshape(len(alpha), -1, 3)
-    values = brdf.ggx_brdf_cosine(cos_theta_o, alpha, flat)
-    half = brdf.half_angle_cosine(cos_theta_o, flat)
-    factors = np.stack([values, values * brdf.schlick_curve(half), values * _dielectric(half, ior)])
-    corners, count = points.shape[1], points.shape[2]
-    factors = np.moveaxis(factors.reshape(3, count, corners, *points.shape[3:]), 1, 2)
-    jacobian = 1.0 / ((warp.xx * warp.yy * warp.zz)[shape] * length**3)
-    return factors * jacobian
-
-
-def _dielectric(half, ior):
-    return brdf.dielectric_reflectance(half, np.maximum(ior, 1.0)[:, None])
+    direction = np.stack([x / length, y / length, z / length], axis=-1)
+    # Axes (B, m, P): the kernels of `brdf` broadcast over leading axes and end with the sample axis.
+    values = brdf.ggx_brdf_cosine(cos_theta_o, alpha, direction[..., None, :])[..., 0]
+    half = brdf.half_angle_cosine(cos_theta_o, direction[..., None, :])[..., 0]
+    return values / ((warp.xx * warp.yy * warp.zz) * length**3), half

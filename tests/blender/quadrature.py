@@ -1,7 +1,7 @@
 """An oracle for shading: the light's surface cut into small patches of equal area, the BRDF written out.
 
-Shares nothing with the package but its data classes. With 64 x 64 patches and a light that stays above every horizon the
-error is below 1e-4 for roughness of 0.3 and more.
+Shares nothing with the package but its data classes. With 64 x 64 patches and a light that stays above every horizon
+the error is below 1e-4 for roughness of 0.3 and more.
 """
 
 from __future__ import annotations

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from ltsh_addon.blender import cycles_reference, extraction, gbuffer, pixel_samples, render_settings
+from ltsh_addon.blender import child, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
 from ltsh_addon.imaging.exr import read_channels
 
 SIZE = (24, 16)
@@ -30,7 +29,7 @@ def link(ob, location=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0), scale=(1.0, 1.0
     return ob
 
 
-def add_camera(location=(0.0, -3.0, 2.0), rotation=(math.radians(55.0), 0.0, 0.0), name="Camera"):
+def add_camera(location=(0.0, -3.0, 2.0), rotation=(0.96, 0.0, 0.0), name="Camera"):
     """A perspective camera, made the active one."""
     camera = link(bpy.data.objects.new(name, bpy.data.cameras.new(name)), location, rotation)
     bpy.context.scene.camera = camera
@@ -44,7 +43,9 @@ def add_top_camera(width=6.0):
     return camera
 
 
-def add_area_light(name="Light", location=(0.3, 0.2, 1.5), rotation=(0.2, -0.3, 0.4), scale=(1.0, 1.0, 1.0), **settings):
+def add_area_light(
+    name="Light", location=(0.3, 0.2, 1.5), rotation=(0.2, -0.3, 0.4), scale=(1.0, 1.0, 1.0), **settings
+):
     """An area light of 1.2 x 0.7 m and 100 W, changed by `settings`."""
     light = bpy.data.lights.new(name, "AREA")
     light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 1.2, 0.7, 100.0
@@ -72,9 +73,9 @@ def add_plane(material=None, size=6.0, name="Plane", **placement):
     return ob
 
 
-def add_sphere(material=None, radius=0.8, name="Sphere", smooth=True, **placement):
-    """A UV sphere of 32 x 16 faces."""
-    bpy.ops.mesh.primitive_uv_sphere_add(segments=32, ring_count=16, radius=radius)
+def add_sphere(material=None, radius=0.8, name="Sphere", smooth=True, segments=32, **placement):
+    """A UV sphere of `segments` x `segments` / 2 faces."""
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius)
     ob = bpy.context.object
     ob.name = name
     for key, value in placement.items():
@@ -149,14 +150,10 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
 def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
     """The Cycles reference: {"specular", "diffuse"} -> (2, H, W, 3)."""
     scene, layer = prepared[:2]
-    halves = cycles_reference.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent)
-    names = render_settings.pass_names()
-    shape = (2, scene.render.resolution_y, scene.render.resolution_x, 3)
-    sums = {"specular": np.zeros(shape), "diffuse": np.zeros(shape)}
-    for half, chunks in enumerate(halves):
-        for name, count in chunks:
-            channels = read_channels(folder / name)
-            for lobe, image in sums.items():
-                light, color = (gbuffer.read_layer(channels, names[f"{lobe}_{part}"], "RGB") for part in ("light", "color"))
-                image[half] += light.astype(np.float64) * color * count / max(1, cycles_samples // 2)
-    return sums
+    manifest = {
+        "reference": cycles_reference.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),
+        "passes": render_settings.pass_names(),
+        "width": scene.render.resolution_x,
+        "height": scene.render.resolution_y,
+    }
+    return child.read_reference(manifest, folder)

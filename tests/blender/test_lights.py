@@ -35,7 +35,7 @@ def plane_under(folder, samples=128, **light):
 
 def rendered(folder, samples=128):
     prepared = scene_parts.prepare()
-    (surface, pixel, unusable), = scene_parts.sample(folder, prepared)[0]
+    ((surface, pixel, unusable),) = scene_parts.sample(folder, prepared)[0]
     assert unusable == 0
     halves = scene_parts.reference(folder, prepared, samples)["diffuse"].reshape(2, -1, 3)[:, pixel]
     return prepared[2], prepared[3], surface, halves
@@ -158,7 +158,8 @@ def test_what_is_not_shaded_of_an_area_light_is_named():
     tree.links.new(tree.nodes.new("ShaderNodeTexNoise").outputs[0], emission.inputs["Strength"])
     _, _, inventory, warnings = scene_parts.prepare()
     assert len(inventory.lights) == 4 and len(inventory.warnings) == 4
-    for name, word in (("Narrow", "spread 60"), ("Sheared", "sheared"), ("Linked", "Receivers"), ("Textured", "texture")):
+    expected = {"Narrow": "spread 60", "Sheared": "sheared", "Linked": "Receivers", "Textured": "texture"}
+    for name, word in expected.items():
         assert any(f"light {name!r}" in line and word in line for line in warnings), warnings
 
 
@@ -193,4 +194,5 @@ def test_the_oracle_reproduces_the_form_factor_of_a_parallel_disk():
     zero = np.zeros((1, 3))
     point = SurfaceSamples(zero, up, up, up, one, zero, zero, one, one, np.pi * np.ones((1, 3)))
     disk = AreaLight("d", "DISK", [0, 0, 2.0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, -1.0], [1.0, 1.0, 1.0])
-    assert quadrature.radiance(point, [disk], quadrature.lambert)[0, 0] == pytest.approx(math.pi * 0.25 / 4.25, rel=1e-4)
+    found = quadrature.radiance(point, [disk], quadrature.lambert)[0, 0]
+    assert found == pytest.approx(math.pi * 0.25 / 4.25, rel=1e-4)

@@ -1,0 +1,221 @@
+"""The command line, the same for `python -m ltsh_addon` and `blender --command ltsh`.
+
+Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the arguments are; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+from . import __version__
+from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, known_technique, shade_scene
+from .progress_bar import ProgressBar
+from .scene import Cancelled
+from .shading import PASSES, TableError
+
+EXAMPLES = """examples:
+  %(prog)s demo -o out/demo
+  %(prog)s compare room.blend -o out/room --resolution 960x540 --cycles-samples 1024
+  %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
+"""
+DEMO_RESOLUTION = (480, 270)
+
+
+class _Misuse(Exception):
+    """The arguments do not make sense together."""
+
+
+def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None) -> int:
+    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code."""
+    try:
+        options = _parser(program).parse_args(arguments)
+    except SystemExit as stop:  # argparse has printed help (0) or the mistake (2)
+        return int(stop.code or 0)
+    bar = ProgressBar(sys.stderr, quiet=options.quiet)
+    try:
+        return options.run(options, bar, open_file)
+    except _Misuse as error:
+        return _fail(program, bar, error, 2)
+    except (TableError, OSError, ValueError, ImportError, Cancelled, MemoryError) as error:
+        return _fail(program, bar, error, 1)
+    except KeyboardInterrupt:
+        return _fail(program, bar, "interrupted", 130)
+    except Exception as error:
+        from .blender.child import SceneError
+
+        if isinstance(error, SceneError):
+            return _fail(program, bar, error, 1)
+        bar.finish()
+        logging.getLogger(__name__).exception("unexpected error")
+        return 1
+
+
+def _fail(program, bar, error, code) -> int:
+    bar.finish()
+    print(f"{program}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+    return code
+
+
+def _parser(program: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=program,
+        description="Shade scenes under area lights with linearly transformed lobes and compare with Cycles.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    demo = commands.add_parser("demo", help="build the example scene and run compare on it")
+    _add_common(demo, cycles=True)
+    demo.set_defaults(run=_demo)
+    compare = commands.add_parser("compare", help="techniques beside Cycles: EXR layers, sheet, report")
+    _add_scene(compare)
+    _add_common(compare, cycles=True)
+    compare.set_defaults(run=_compare)
+    shade = commands.add_parser("shade", help="shade per pixel of the camera")
+    _add_scene(shade)
+    _add_common(shade, cycles=False)
+    shade.set_defaults(run=_shade)
+    tables = commands.add_parser("tables", help="fit or validate the lookup tables (needs the source checkout and scipy)")
+    tables.add_argument("action", choices=("fit", "validate"))
+    tables.add_argument("names", nargs="*", metavar="TABLE", help="default: all shipped tables")
+    tables.set_defaults(run=_tables, quiet=False)
+    return parser
+
+
+def _add_scene(parser):
+    parser.add_argument("scene", nargs="?", metavar="SCENE.blend", help="left out when Blender has a file open")
+
+
+def _add_common(parser, *, cycles):
+    parser.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the results")
+    names = ",".join(DEFAULT_TECHNIQUES)
+    parser.add_argument("--techniques", type=_techniques, default=DEFAULT_TECHNIQUES, help=f"default: {names}")
+    parser.add_argument("--passes", type=_passes, default=PASSES, help=f"default: {','.join(PASSES)}")
+    parser.add_argument("--resolution", type=_resolution, metavar="WxH", help="default: as in the file")
+    parser.add_argument("--aa", type=_positive, default=1, metavar="N", help="sub-samples per pixel; 1: pixel centers")
+    parser.add_argument("--frame", type=int, metavar="F", help="default: the file's current frame")
+    parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
+    parser.add_argument(
+        "--reference-samples",
+        type=_positive,
+        default=Options.reference_samples,
+        metavar="N",
+        help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
+    )
+    if cycles:
+        parser.add_argument(
+            "--cycles-samples", type=_cycles_samples, default=Options.cycles_samples, metavar="N",
+            help="of both halves of the Cycles reference together (default: %(default)s)",
+        )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the report on stdout as one JSON document")
+    parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+
+
+def _techniques(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name for name in text.split(",") if name))
+    unknown = [name for name in names if not known_technique(name)]
+    if unknown or not names:
+        raise argparse.ArgumentTypeError(
+            f"technique {(unknown or [text])[0]!r} is unknown, expected some of {', '.join(DEFAULT_TECHNIQUES)} "
+            "or the path of a table (.npz)"
+        )
+    return names
+
+
+def _passes(text: str) -> tuple[str, ...]:
+    names = tuple(dict.fromkeys(name for name in text.split(",") if name))
+    if not names or any(name not in PASSES for name in names):
+        raise argparse.ArgumentTypeError(f"passes are {text!r}, expected some of {', '.join(PASSES)}")
+    return names
+
+
+def _resolution(text: str) -> tuple[int, int]:
+    width, separator, height = text.partition("x")
+    if separator and width.isdecimal() and height.isdecimal() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536:
+        return int(width), int(height)
+    raise argparse.ArgumentTypeError(f"resolution is {text!r}, expected WIDTHxHEIGHT such as 960x540")
+
+
+def _positive(text: str) -> int:
+    if text.isdecimal() and int(text) > 0:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} was given, expected a whole number above 0")
+
+
+def _cycles_samples(text: str) -> int:
+    value = _positive(text)
+    if value < 2:
+        raise argparse.ArgumentTypeError("1 was given, expected at least 2: one for each half")
+    return value
+
+
+def _options(arguments, scene: Path, output: Path, resolution=None) -> Options:
+    width, height = arguments.resolution or resolution or (None, None)
+    return Options(
+        scene=scene,
+        output=output,
+        techniques=arguments.techniques,
+        passes=arguments.passes,
+        width=width,
+        height=height,
+        sub_samples=arguments.aa,
+        frame=arguments.frame,
+        camera=arguments.camera,
+        cycles_samples=getattr(arguments, "cycles_samples", 0),
+        reference_samples=arguments.reference_samples,
+    )
+
+
+def _scene(arguments, open_file) -> Path:
+    if arguments.scene and open_file:
+        raise _Misuse(f"SCENE is {arguments.scene!r}, but Blender has {open_file!r} open already; give one of them")
+    if not (arguments.scene or open_file):
+        raise _Misuse("SCENE.blend is missing: name a file (or open one in Blender first)")
+    return Path(arguments.scene or open_file)
+
+
+def _demo(arguments, bar, open_file) -> int:
+    from .blender import child
+
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    scene = arguments.output / "demo.blend"
+    child.build_demo(scene, progress=bar)
+    options = _options(arguments, scene, arguments.output, DEMO_RESOLUTION)
+    return _finish(arguments, bar, compare_scene(options, bar))
+
+
+def _compare(arguments, bar, open_file) -> int:
+    options = _options(arguments, _scene(arguments, open_file), arguments.output)
+    return _finish(arguments, bar, compare_scene(options, bar))
+
+
+def _shade(arguments, bar, open_file) -> int:
+    options = _options(arguments, _scene(arguments, open_file), arguments.output)
+    return _finish(arguments, bar, shade_scene(options, bar))
+
+
+def _finish(arguments, bar, report) -> int:
+    from .comparison_output import summary
+    from .imaging import report as report_files
+
+    bar.finish()
+    if arguments.json:
+        print(report_files.json_text(report))
+        return 0
+    for warning in report["warnings"]:
+        print(f"warning: {warning}", file=sys.stderr)
+    print(summary(report, arguments.output))
+    return 0
+
+
+def _tables(arguments, bar, open_file) -> int:
+    root = Path(__file__).resolve().parents[1]
+    if not (root / "tables" / "fit.py").is_file():
+        raise _Misuse("tables fit and validate need the source checkout, which has tables/fit.py; this is a package only")
+    command = [sys.executable, "-m", "tables", arguments.action, *arguments.names]
+    return subprocess.run(command, cwd=root, check=False).returncode

@@ -1,0 +1,244 @@
+"""What a comparison writes: images by layer, statistics, the sheet, the report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from . import compare, imaging, shading
+from .scene import Cancelled, Film
+
+if TYPE_CHECKING:
+    from .blender.child import Extraction
+
+# Layers of the G-buffer: field of SurfaceSamples and its channel letters.
+SAMPLE_LAYERS = {
+    "position": "XYZ",
+    "view": "XYZ",
+    "normal": "XYZ",
+    "diffuse_normal": "XYZ",
+    "geometric_normal": "XYZ",
+    "roughness": "V",
+    "specular_f0": "RGB",
+    "specular_f90": "RGB",
+    "dielectric": "V",
+    "ior": "V",
+    "diffuse_albedo": "RGB",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of one scene, ready to be measured and written."""
+
+    options: compare.Options
+    extraction: Extraction
+    results: dict[str, compare.Result]
+
+    @property
+    def film(self) -> Film:
+        return self.extraction.film
+
+    @property
+    def cycles(self) -> dict[str, np.ndarray]:
+        """Halves (2, H, W, 3) per pass; empty without a Cycles reference."""
+        return self.extraction.reference or {}
+
+    @cached_property
+    def images(self) -> dict[tuple[str, str], np.ndarray]:
+        """Image (H, W, 3) per technique and pass, summed over light groups."""
+        return {
+            (name, pass_name): self._image(result, self._radiance(result, pass_name).sum(axis=0))
+            for name, result in self.results.items()
+            for pass_name in self.options.passes
+        }
+
+    def _radiance(self, result, pass_name) -> np.ndarray:
+        return getattr(result.shading, pass_name)
+
+    def _image(self, result, values) -> np.ndarray:
+        return self._film_of(result).image(values)
+
+    def _film_of(self, result) -> Film:
+        if result.subset is None:
+            return self.film
+        return Film(self.film.width, self.film.height, self.film.pixel[result.subset], self.film.sub_samples)
+
+    def _mask(self, result) -> np.ndarray:
+        """Pixels (H, W) that see a surface and, for a subset, were evaluated."""
+        return self._film_of(result).coverage() > 0.0
+
+    # -- figures ------------------------------------------------------------------------------------------------------
+
+    def report(self) -> dict:
+        """The report as a JSON-able document."""
+        extraction, options = self.extraction, self.options
+        return {
+            "scene": str(options.scene),
+            "camera": extraction.camera,
+            "frame": extraction.frame,
+            "resolution": [self.film.width, self.film.height],
+            "sub_samples": self.film.sub_samples,
+            "surface_samples": len(extraction.samples),
+            "cycles_samples": options.cycles_samples if self.cycles else 0,
+            "lights": [
+                {"name": light.name, "shape": light.shape, "group": light.group, "radiance": light.radiance.tolist()}
+                for light in extraction.lights
+            ],
+            "versions": compare.versions(extraction.blender_version),
+            "reference": self._reference_facts(),
+            "passes": {name: self._pass_report(name) for name in options.passes},
+            "seconds": {
+                **extraction.seconds,
+                "techniques": {name: result.seconds for name, result in self.results.items()},
+            },
+            "warnings": list(extraction.warnings),
+        }
+
+    def _reference_facts(self) -> dict | None:
+        result = self.results.get(shading.REFERENCE)
+        if result is None:
+            return None
+        count = len(self.extraction.samples) if result.subset is None else len(result.subset)
+        error = result.shading.quadrature_error
+        return {
+            "samples": count,
+            "of": len(self.extraction.samples),
+            "seed": None if result.subset is None else compare.REFERENCE_SEED,
+            "largest_error_estimate": None if error is None or not len(error) else float(error.max()),
+        }
+
+    def _pass_report(self, pass_name: str) -> dict:
+        report = {}
+        if self.cycles:
+            halves = self.cycles[pass_name]
+            report["noise"] = imaging.reference_noise(halves[0], halves[1], self.film.coverage() > 0.0)
+        report["techniques"] = {name: self._technique_report(name, pass_name) for name in self.results}
+        return report
+
+    def _technique_report(self, name: str, pass_name: str) -> dict:
+        report = {}
+        result = self.results[name]
+        if self.cycles:
+            halves = self.cycles[pass_name]
+            statistics = imaging.noisy_error_statistics(
+                self.images[name, pass_name], halves[0], halves[1], self._mask(result)
+            )
+            report["against_cycles"] = statistics.to_dict()
+        reference = self.results.get(shading.REFERENCE)
+        if reference is not None and name != shading.REFERENCE:
+            report["against_reference"] = self._against_reference(result, reference, pass_name)
+        return report
+
+    def _against_reference(self, result, reference, pass_name) -> dict:
+        """Statistics per sample, over all samples and over those of each class of material."""
+        index = slice(None) if reference.subset is None else reference.subset
+        values = self._radiance(result, pass_name).sum(axis=0)[index]
+        truth = self._radiance(reference, pass_name).sum(axis=0)
+        report = imaging.error_statistics(values, truth).to_dict()
+        for label, mask in compare.material_classes(self.extraction.samples.take(index)).items():
+            report[label] = imaging.error_statistics(values, truth, mask).to_dict()
+        return report
+
+    # -- files --------------------------------------------------------------------------------------------------------
+
+    def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> None:
+        """Write all files into the folder `output`."""
+        if progress is not None and progress("write", 0.0) is False:
+            raise Cancelled("stopped before the files were written")
+        name = "compare" if with_cycles else "shade"
+        metadata = {
+            "ltsh:scene": Path(self.options.scene).name,
+            "ltsh:frame": str(self.extraction.frame),
+            "ltsh:camera": self.extraction.camera,
+            "ltsh:version": document["versions"]["ltsh"],
+        }
+        imaging.write_layers(output / f"{name}.exr", self.layers(), metadata)
+        if with_cycles:
+            imaging.write_png(output / "compare.png", self.sheet())
+            imaging.write_json(output / "report.json", document)
+            imaging.write_html(output / "report.html", document)
+        if progress is not None:
+            progress("write", 1.0)
+
+    def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
+        """All layers of the EXR by name."""
+        layers = {}
+        for (name, pass_name), image in self.images.items():
+            layers[f"{name}.{pass_name}"] = image
+            result = self.results[name]
+            groups = result.shading.groups
+            if len(groups) > 1:
+                for group, values in zip(groups, self._radiance(result, pass_name), strict=True):
+                    layers[f"{name}.{pass_name}@{group or 'ungrouped'}"] = self._image(result, values)
+        for pass_name, halves in self.cycles.items():
+            if pass_name not in self.options.passes:
+                continue
+            mean = halves.mean(axis=0)
+            layers[f"cycles.{pass_name}"] = mean
+            for half, pixels in zip("AB", halves, strict=True):
+                layers[f"cycles_{half}.{pass_name}"] = pixels
+            for name, result in self.results.items():
+                error = self.images[name, pass_name] - mean
+                layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
+        for field, letters in SAMPLE_LAYERS.items():
+            layers[f"samples.{field}"] = imaging.Layer(self.film.image(getattr(self.extraction.samples, field)), letters)
+        layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
+        return layers
+
+    def sheet(self) -> np.ndarray:
+        """The comparison sheet (H, W, 3), 8 bit: the specular pass where there is one."""
+        pass_name = self.options.passes[0]
+        halves = self.cycles[pass_name]
+        mean = halves.mean(axis=0)
+        hit = self.film.coverage() > 0.0
+        noise = imaging.reference_noise(halves[0], halves[1], hit)
+        tiles = []
+        for name, result in self.results.items():
+            report = self._technique_report(name, pass_name)
+            error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
+            label = compare.LABELS.get(name, Path(name).stem)
+            tiles.append(imaging.Tile(label, self.images[name, pass_name], error, _caption(report, result)))
+        title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
+        notes = (
+            f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
+            f"noise of the Cycles reference {_percent(noise)}",
+        )
+        return imaging.comparison_sheet(title, ("Cycles", mean), tiles, notes=notes)
+
+
+def _percent(value) -> str:
+    return "-" if value is None else f"{100.0 * value:.2f} %"
+
+
+def _caption(report: dict, result) -> list[str]:
+    lines = [f"against Cycles {_percent(report['against_cycles']['unbiased_relative_error'])}"]
+    if "against_reference" in report:
+        lines.append(f"against reference {_percent(report['against_reference']['relative_l2'])}")
+    lines.append(f"{result.seconds:.2f} s")
+    return lines
+
+
+def summary(report: dict, output: Path) -> str:
+    """A table for the terminal: errors per pass and technique."""
+    lines = []
+    for pass_name, figures in report["passes"].items():
+        noise = f", noise of Cycles {_percent(figures['noise'])}" if "noise" in figures else ""
+        lines.append(f"{pass_name}{noise}")
+        lines.append(f"  {'technique':<12}{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}")
+        for name, row in figures["techniques"].items():
+            cycles = row.get("against_cycles", {}).get("unbiased_relative_error")
+            reference = row.get("against_reference", {})
+            classes = [_percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
+            seconds = report["seconds"]["techniques"][name]
+            lines.append(
+                f"  {Path(name).stem:<12}{_percent(cycles):>12}{_percent(reference.get('relative_l2')):>14}"
+                f"{classes[0]:>10}{classes[1]:>13}{seconds:>8.2f}"
+            )
+    lines.append(f"written to {output}")
+    return "\n".join(lines)

@@ -1,0 +1,226 @@
+"""Samples lie where Cycles' camera rays end, with the normals Cycles shades with."""
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+import quadrature
+import scene_parts
+from scene_parts import add_bump, add_plane, add_sphere, bsdf_material, principled
+
+from ltsh_addon.blender import gbuffer
+
+
+def test_one_sample_per_pixel_is_at_the_center(tmp_path):
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera(width=6.0)
+    scene_parts.add_area_light()
+    add_plane(principled()[0], size=12.0)
+    ((surface, pixel, _),), _ = scene_parts.sample(tmp_path, scene_parts.prepare())
+    width, height = scene_parts.SIZE
+    row, column = np.divmod(pixel, width)
+    expected = np.stack([(column + 0.5 - width / 2.0), (height / 2.0 - row - 0.5)], axis=-1) * 6.0 / width
+    # The narrowest filter moves samples by less than 1e-3 of a pixel of 0.25 m.
+    assert np.abs(surface.position[:, :2] - expected).max() < 2.5e-4
+    assert np.array_equal(np.sort(pixel), np.arange(width * height))
+    assert np.allclose(surface.view, (0.0, 0.0, 1.0), atol=1e-6)
+
+
+def test_sub_samples_fill_the_pixel_evenly_and_differ(tmp_path):
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera(width=6.0)
+    scene_parts.add_area_light()
+    material, node = principled()
+    coordinates = material.node_tree.nodes.new("ShaderNodeTexCoord")
+    material.node_tree.links.new(coordinates.outputs["UV"], node.inputs["Base Color"])
+    node.inputs["Metallic"].default_value = 1.0
+    add_plane(material, size=6.0)
+    count = 6
+    renders, _ = scene_parts.sample(tmp_path, scene_parts.prepare(), sub_samples=count)
+    width, height = scene_parts.SIZE
+    offsets = []
+    for surface, pixel, unusable in renders:
+        row, column = np.divmod(pixel, width)
+        x = surface.position[:, 0] * width / 6.0 - (column - width / 2.0)
+        y = -surface.position[:, 1] * width / 6.0 - (row - height / 2.0)
+        offsets.append(np.stack([x, y], axis=-1))
+        # Everything in one render belongs to the same hit.
+        assert np.abs(surface.specular_f0[:, :2] - (surface.position[:, :2] / 6.0 + 0.5)).max() < 2e-6 and unusable == 0
+    offsets = np.array(offsets)
+    assert offsets.min() > -1e-4 and offsets.max() < 1.0 + 1e-4
+    # Uniform in a pixel: mean 1/2, standard deviation 0.2887; 2304 points give errors of about 0.006 and 0.004.
+    assert np.abs(offsets.mean(axis=(0, 1)) - 0.5).max() < 0.03
+    assert np.abs(offsets.std(axis=(0, 1)) - math.sqrt(1.0 / 12.0)).max() < 0.02
+    spread = np.abs(offsets[:, None] - offsets[None, :]).max(axis=(-2, -1)) + np.eye(count)
+    assert spread.min() > 0.1
+    joined, film = gbuffer.join([(surface, pixel) for surface, pixel, _ in renders], width, height)
+    assert film.sub_samples == count and len(joined) == count * width * height and np.all(film.coverage() == 1.0)
+
+
+@pytest.mark.parametrize("correction", [True, False])
+def test_specular_normals_are_those_cycles_shades_with(tmp_path, correction):
+    """On a metal the Normal pass is the normal of the one closure, after Cycles has bent it."""
+    scene_parts.empty_scene(64, 36)
+    scene_parts.add_camera()
+    scene_parts.add_area_light()
+    material, node = principled(Metallic=1.0, Roughness=0.3)
+    add_bump(material.node_tree, node, scale=5.0, distance=1.0)
+    material.cycles.use_bump_map_correction = correction
+    add_plane(material)
+    add_sphere(material, location=(0.0, 0.0, 0.8))
+    ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, scene_parts.prepare(), extra_passes=("normal",))
+    cycles = gbuffer.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
+    difference = np.abs(surface.normal - cycles).max(axis=-1)
+    bent = np.abs(surface.diffuse_normal - cycles).max(axis=-1) > 1e-3
+    assert np.count_nonzero(bent) > 500 if correction else not bent.any()
+    # Cycles bends in float32, which costs up to 1e-4 where the threshold cancels.
+    assert difference.max() < 3e-4 and np.quantile(difference, 0.99) < 1e-5
+
+
+@pytest.mark.parametrize("correction", [True, False])
+def test_smooth_normals_of_coarse_meshes_are_bent_as_well(tmp_path, correction):
+    """No bump map: on a coarse sphere the smooth normal alone makes reflections enter the surface."""
+    scene_parts.empty_scene(64, 36)
+    scene_parts.add_camera((0.0, -3.0, 1.0), (1.45, 0.0, 0.0))
+    scene_parts.add_area_light()
+    material, _ = principled(Metallic=1.0, Roughness=0.3)
+    material.cycles.use_bump_map_correction = correction
+    add_sphere(material, radius=1.0, location=(0.0, 0.0, 0.6), segments=10)
+    ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, scene_parts.prepare(), extra_passes=("normal",))
+    cycles = gbuffer.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
+    bent = np.abs(surface.diffuse_normal - cycles).max(axis=-1) > 1e-2
+    assert np.count_nonzero(bent) > 20 if correction else not bent.any()
+    assert np.abs(surface.normal - cycles).max() < 1e-5
+
+
+def test_every_ray_of_the_reference_hits_what_the_sample_hits(tmp_path):
+    """A color edge runs 0.001 pixel beside a column of pixel centers."""
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera(width=6.0)
+    scene_parts.add_area_light(location=(0.0, 0.0, 3.0), rotation=(0.0, 0.0, 0.0))
+    material, node = bsdf_material("ShaderNodeBsdfDiffuse")
+    tree = material.node_tree
+    geometry, above = tree.nodes.new("ShaderNodeNewGeometry"), tree.nodes.new("ShaderNodeMath")
+    separate = tree.nodes.new("ShaderNodeSeparateXYZ")
+    tree.links.new(geometry.outputs["Position"], separate.inputs[0])
+    tree.links.new(separate.outputs[0], above.inputs[0])
+    above.operation = "GREATER_THAN"
+    # An edge 0.001 pixel (of 0.25 m) right of a column of pixel centers.
+    above.inputs[1].default_value = 0.125 + 0.25 * 0.001
+    tree.links.new(above.outputs[0], node.inputs["Color"])
+    add_plane(material, size=12.0)
+    prepared = scene_parts.prepare()
+    ((surface, _, _),), _ = scene_parts.sample(tmp_path, prepared)
+    column = surface.diffuse_albedo[:, 0].reshape(16, 24)[:, 12]
+    halves = scene_parts.reference(tmp_path, prepared, 512)["diffuse"]
+    lit = halves[:, :, 13, 0].mean()
+    assert not column.any() and lit > 0.0
+    # 1 ray in 1000 strays, and to the left; with Blender's narrowest filter a third would cross the edge.
+    assert halves[:, :, 12].max() < 0.01 * lit
+
+
+@pytest.mark.parametrize("shape", ["plane", "sphere"])
+def test_bump_mapped_lobes_are_shadowed_as_in_cycles(tmp_path, shape):
+    """Both lobes end at the horizon of the smooth normal; the diffuse one is shadowed by `bump_alpha2` as well."""
+    images = {}
+    for lobe in ("diffuse", "specular"):
+        scene_parts.empty_scene(24, 14)
+        scene_parts.add_camera()
+        scene_parts.add_area_light(location=(2.5, 0.0, 1.0), rotation=(0.0, 1.2, 0.0))
+        if lobe == "diffuse":
+            material, node = bsdf_material("ShaderNodeBsdfDiffuse", Color=(1.0, 1.0, 1.0, 1.0))
+        else:
+            material, node = bsdf_material("ShaderNodeBsdfAnisotropic", Color=(1.0, 1.0, 1.0, 1.0), Roughness=0.6)
+        add_bump(material.node_tree, node, scale=4.0, distance=0.15)
+        add_plane(material) if shape == "plane" else add_sphere(material, radius=1.3)
+        prepared = scene_parts.prepare()
+        ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, prepared)
+        smooth = gbuffer.read_aov(channels, "smooth_normal").reshape(-1, 3)[pixel].astype(np.float64)
+        alpha2 = gbuffer.bump_alpha2(surface.diffuse_normal, smooth)[:, None] if lobe == "diffuse" else 0.0
+
+        def shadowing(directions, smooth=smooth, alpha2=alpha2):
+            cosine = np.einsum("psk,pk->ps", directions, smooth)
+            tangent2 = 1.0 / np.maximum(cosine, 1e-6) ** 2 - 1.0
+            return np.where(cosine > 0.0, 2.0 / (1.0 + np.sqrt(1.0 + alpha2 * tangent2)), 0.0)
+
+        brdf = quadrature.lambert if lobe == "diffuse" else quadrature.ggx
+        halves = scene_parts.reference(tmp_path, prepared, 512)[lobe].reshape(2, -1, 3)[:, pixel]
+        with_it = quadrature.radiance(surface, prepared[2].lights, brdf, weight=shadowing)
+        without = quadrature.radiance(surface, prepared[2].lights, brdf)
+        images[lobe] = [quadrature.relative_l2(image, halves) for image in (with_it, without)]
+        assert abs(quadrature.bias(with_it, halves)) < 3e-3
+    # Rays of the reference wander by 0.01 pixel over the bumps; the sphere's silhouette adds the rest.
+    assert images["diffuse"][0] < 6e-3 < 2e-2 < images["diffuse"][1]
+    assert images["specular"][0] < 6e-3
+
+
+def test_back_faces_show_their_normal_to_the_camera(tmp_path):
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera()
+    scene_parts.add_area_light()
+    add_plane(principled()[0], rotation=(math.pi, 0.0, 0.0))
+    ((surface, _, _),), _ = scene_parts.sample(tmp_path, scene_parts.prepare())
+    assert np.allclose(surface.normal, (0.0, 0.0, 1.0), atol=1e-6)
+    assert np.allclose(surface.geometric_normal, (0.0, 0.0, 1.0), atol=1e-6)
+
+
+def test_instances_are_sampled_with_their_own_materials(tmp_path):
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera()
+    scene_parts.add_area_light()
+    plane = add_plane(principled(Roughness=0.21)[0], size=1.5)
+    collection = bpy.data.collections.new("Tiles")
+    bpy.context.scene.collection.objects.unlink(plane)
+    collection.objects.link(plane)
+    for x in (-2.0, 2.0):
+        empty = scene_parts.link(bpy.data.objects.new("Empty", None), location=(x, 0.0, 0.5))
+        empty.instance_type, empty.instance_collection = "COLLECTION", collection
+    prepared = scene_parts.prepare()
+    ((surface, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
+    assert 0 < len(surface) < 24 * 16 and np.allclose(surface.roughness, 0.21)
+    assert np.allclose(np.abs(surface.position[:, 0]), 2.0, atol=0.75) and np.allclose(surface.position[:, 2], 0.5)
+    halves = scene_parts.reference(tmp_path, prepared, 64)["diffuse"].reshape(2, -1, 3)
+    outside = np.setdiff1d(np.arange(24 * 16), pixel)
+    assert not halves[:, outside].any() and halves[:, pixel].min() > 0.0
+
+
+def test_an_object_without_faces_is_no_obstacle(tmp_path):
+    scene_parts.empty_scene()
+    scene_parts.add_top_camera()
+    scene_parts.add_area_light()
+    scene_parts.add_mesh("No faces", [(0, 0, 0), (1, 0, 0)], [])
+    scene_parts.add_mesh("Nothing", [], [])
+    ((surface, pixel, unusable),), _ = scene_parts.sample(tmp_path, scene_parts.prepare())
+    assert len(surface) == len(pixel) == unusable == 0
+
+
+def test_reflections_of_valid_normals_leave_the_surface():
+    """Independent of Cycles: the mirrored view ends exactly at the threshold, and good normals stay."""
+    generator = np.random.default_rng(7)
+    true_normal, view, normal = (gbuffer.unit(generator.normal(size=(4000, 3))) for _ in range(3))
+    facing = np.sum(view * true_normal, axis=-1) > 0.02
+    true_normal, view, normal = true_normal[facing], view[facing], normal[facing]
+    valid = gbuffer.valid_specular_normal(normal, true_normal, view)
+    assert np.allclose(np.linalg.norm(valid, axis=-1), 1.0, atol=1e-12)
+
+    def elevation(axis):
+        mirrored = 2.0 * np.sum(axis * view, axis=-1, keepdims=True) * axis - view
+        return np.sum(mirrored * true_normal, axis=-1)
+
+    threshold = np.minimum(0.9 * np.sum(view * true_normal, axis=-1), 0.01)
+    good = elevation(normal) >= threshold
+    assert np.array_equal(valid[good], normal[good]) and good.any() and not good.all()
+    assert np.abs(elevation(valid) - threshold)[~good].max() < 1e-12
+    # Bent in the plane of both normals, towards the true one.
+    volume = np.linalg.det(np.stack([valid, normal, true_normal], axis=-2)[~good])
+    assert np.abs(volume).max() < 1e-12
+    assert np.all(np.sum(valid * true_normal, axis=-1)[~good] >= np.sum(normal * true_normal, axis=-1)[~good])
+
+
+def test_bump_alpha_is_an_eighth_of_the_squared_tangent():
+    angle = np.radians([0.0, 30.0, 60.0, 75.0, 90.0])
+    up = np.tile([0.0, 0.0, 1.0], (5, 1))
+    tilted = np.stack([np.sin(angle), np.zeros(5), np.cos(angle)], axis=-1)
+    expected = [0.0, 1.0 / 24.0, 3.0 / 8.0, 1.0, 1.0]
+    assert np.allclose(gbuffer.bump_alpha2(tilted, up), expected, atol=1e-12)

@@ -1,0 +1,210 @@
+"""Lobes and their integrals over polygons agree with each other, for every shipped table."""
+
+import numpy as np
+import polygon_quadrature
+import pytest
+import textbook
+
+from ltsh_addon import shading
+from ltsh_addon.shading import spherical_harmonics
+from ltsh_addon.shading.lobe_integrals import polygon_integrals
+from ltsh_addon.shading.lookup_table import Lobe
+
+TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
+FAR_RING = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+
+# At grazing angles and low roughness the warp stretches a polygon up to 1e5 times: 1e5 * eps * a few edges and coefficients
+ROUNDING = 1e-9
+table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+
+
+def random_rectangles(generator, count, crossing):
+    """Rectangles (P, 4, 3) above the horizon, or crossing it."""
+    found = []
+    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    while len(found) < count:
+        center = generator.normal(size=3) + np.array([-0.5, 0.0, 0.5])
+        u = generator.normal(size=3)
+        v = np.cross(u, generator.normal(size=3))
+        rectangle = center + signs[:, :1] * u + signs[:, 1:] * v
+        above = (rectangle[:, 2] > 0.0).sum()
+        if (0 < above < 4) if crossing else above == 4:
+            found.append(rectangle)
+    return np.array(found)
+
+
+def random_cases(seed, count=200, crossing=False, lowest=0.0):
+    generator = np.random.default_rng(seed)
+    cosine, roughness = generator.random(count), lowest + (1.0 - lowest) * generator.random(count)
+    return cosine, roughness, random_rectangles(generator, count, crossing)
+
+
+def clipped(polygon):
+    """Part above the horizon of one convex polygon (V, 3), by cutting its edges one by one."""
+    corners = []
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if a[2] > 0.0:
+            corners.append(a)
+        if (a[2] > 0.0) != (b[2] > 0.0):
+            cut = a + a[2] / (a[2] - b[2]) * (b - a)
+            corners.append(cut * np.array([1.0, 1.0, 0.0]))
+    return np.array(corners)
+
+
+def lobe_quadrature(table, cosine, roughness, polygon):
+    """Signed integral of `evaluate_lobe` over one polygon above the horizon, and an error bound.
+
+    The clamped cosine of "ltc" has a kink, of which two orders of a rule may both miss a piece: a finer start and an
+    allowance for that.
+    """
+    smooth = table.family == "ltsh"
+
+    def lobe(directions):
+        flat = directions.reshape(1, -1, 3)
+        values = shading.evaluate_lobe(table, np.array([cosine]), np.array([roughness]), flat)
+        return values.reshape(directions.shape[:-1])
+
+    apex = textbook.mirror_direction(max(cosine, 0.05))
+    value, bound = polygon_quadrature.adaptive_integral(polygon, lobe, apex, 1e-8, 2 if smooth else 4)
+    return value, bound + (1e-9 if smooth else 3e-7)
+
+
+@table_names
+@pytest.mark.parametrize("crossing", [False, True], ids=["above", "crossing"])
+def test_integral_is_that_of_the_lobe(name, crossing):
+    cosine, roughness, rectangles = random_cases(11, 16, crossing, lowest=0.05)
+    found = shading.integrate_polygon(TABLES[name], cosine, roughness, rectangles, signed=True)
+    for n, rectangle in enumerate(rectangles):
+        expected, bound = lobe_quadrature(TABLES[name], cosine[n], roughness[n], clipped(rectangle))
+        assert bound < 1e-5
+        assert abs(found[n] - expected) < bound, (cosine[n], roughness[n], rectangle.tolist())
+
+
+@table_names
+def test_integral_over_a_non_convex_polygon_is_that_of_the_lobe(name):
+    star = np.array([[np.cos(a) * r, 1.0 + np.sin(a) * r, 0.4 + 0.9 * np.cos(a) * r] for a, r in STAR])
+    for turn, (cosine, roughness) in enumerate([(0.3, 0.4), (0.8, 0.7), (0.6, 0.2)]):
+        angle = 1.5 + turn
+        rotation = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        polygon = star @ rotation
+        found = shading.integrate_polygon(TABLES[name], [cosine], [roughness], polygon[None], signed=True)[0]
+        expected, bound = lobe_quadrature(TABLES[name], cosine, roughness, clipped(polygon))
+        assert abs(found - expected) < bound
+        assert abs(expected) > 1e-3
+
+
+STAR = [(2.0 * np.pi * k / 10, (1.2, 0.4)[k % 2]) for k in range(10)]
+
+
+@table_names
+def test_a_polygon_over_the_whole_hemisphere_gives_the_directional_albedo(name):
+    """Height 1e-9 of the radius hides a band of 1e-9; a lobe's value there is below 1e3 for these roughnesses."""
+    table = TABLES[name]
+    generator = np.random.default_rng(12)
+    cosine, roughness = generator.random(50), 0.2 + 0.8 * generator.random(50)
+    ring = np.stack([np.cos(FAR_RING), np.sin(FAR_RING), np.full(64, 1e-9)], axis=1)
+    found = shading.integrate_polygon(table, cosine, roughness, np.broadcast_to(ring, (50, 64, 3)))
+    lobe = table.lookup(cosine, roughness)
+    if table.family == "ltc":
+        albedo = lobe.coefficients[0, 0] * 0.5 * (1.0 + np.cos(lobe.tilt))
+    else:
+        albedo = spherical_harmonics.hemisphere_integrals(table.degree) @ lobe.coefficients[0]
+    assert np.abs(found - albedo).max() < 1e-6
+    assert albedo.max() < 1.05
+
+
+def test_identity_lobe_is_the_lambert_form_factor():
+    """Both families: a clamped cosine without tilt, and z / pi as a spherical harmonics expansion."""
+    generator = np.random.default_rng(13)
+    polygons = random_rectangles(generator, 60, crossing=False)
+    kernel = np.ascontiguousarray(polygons.transpose(2, 1, 0))
+    one, zero = np.ones(60), np.zeros(60)
+    expected = np.array([textbook.lambert_form_factor(polygon) for polygon in polygons])
+    for name, table in TABLES.items():
+        coefficients = np.zeros((1, spherical_harmonics.coefficient_count(table.degree), 60))
+        coefficients[0, 1] = 1.0 / (np.pi * spherical_harmonics.normalization(1, 0))
+        if name == "ltc":
+            coefficients = np.ones((1, 1, 60))
+        lobe = Lobe(one, zero, one, one, zero if name == "ltc" else None, coefficients)
+        found = polygon_integrals(table, lobe, kernel, coefficients)[0]
+        # arccos of the oracle loses half the digits at short edges
+        assert np.abs(found - expected).max() < 1e-9, name
+
+
+def test_clamped_form_factor_is_lambert_for_either_winding():
+    generator = np.random.default_rng(14)
+    polygons = random_rectangles(generator, 60, crossing=True)
+    expected = np.abs([textbook.lambert_form_factor(clipped(polygon)) for polygon in polygons])
+    assert np.abs(shading.clamped_form_factor(polygons) - expected).max() < 1e-9
+    assert np.abs(shading.clamped_form_factor(polygons[:, ::-1]) - expected).max() < 1e-9
+
+
+@table_names
+def test_scaling_all_vertices_changes_nothing(name):
+    """Powers of two: not one bit."""
+    cosine, roughness, rectangles = random_cases(15, crossing=True)
+    expected = shading.integrate_polygon(TABLES[name], cosine, roughness, rectangles)
+    for factor in (2.0**-40, 2.0**30):
+        found = shading.integrate_polygon(TABLES[name], cosine, roughness, rectangles * factor)
+        assert np.array_equal(found, expected)
+
+
+@table_names
+def test_mirroring_in_y_and_reversing_change_only_the_sign(name):
+    cosine, roughness, rectangles = random_cases(16, crossing=True)
+    table = TABLES[name]
+    signed = shading.integrate_polygon(table, cosine, roughness, rectangles, signed=True)
+    mirrored = rectangles * np.array([1.0, -1.0, 1.0])
+    for changed in (mirrored, rectangles[:, ::-1]):
+        found = shading.integrate_polygon(table, cosine, roughness, changed, signed=True)
+        assert np.abs(found + signed).max() < ROUNDING
+        either = shading.integrate_polygon(table, cosine, roughness, changed)
+        assert np.abs(either - shading.integrate_polygon(table, cosine, roughness, rectangles)).max() < ROUNDING
+
+
+@table_names
+def test_splitting_a_polygon_adds_up(name):
+    cosine, roughness, rectangles = random_cases(17, crossing=True)
+    parts = [
+        shading.integrate_polygon(TABLES[name], cosine, roughness, rectangles[:, corners], signed=True)
+        for corners in ([0, 1, 2], [0, 2, 3])
+    ]
+    whole = shading.integrate_polygon(TABLES[name], cosine, roughness, rectangles, signed=True)
+    assert np.abs(parts[0] + parts[1] - whole).max() < ROUNDING
+
+
+@table_names
+def test_below_the_horizon_there_is_exactly_nothing(name):
+    cosine, roughness, rectangles = random_cases(18)
+    below = rectangles * np.array([1.0, 1.0, -1.0])
+    assert np.array_equal(shading.integrate_polygon(TABLES[name], cosine, roughness, below), np.zeros(200))
+    flat = rectangles * np.array([1.0, 1.0, 0.0])
+    assert np.array_equal(shading.integrate_polygon(TABLES[name], cosine, roughness, flat), np.zeros(200))
+    directions = below / np.linalg.norm(below, axis=2, keepdims=True)
+    assert np.array_equal(shading.evaluate_lobe(TABLES[name], cosine, roughness, directions), np.zeros((200, 4)))
+
+
+@table_names
+def test_lobe_is_even_in_y(name):
+    cosine, roughness, rectangles = random_cases(19)
+    directions = rectangles / np.linalg.norm(rectangles, axis=2, keepdims=True)
+    values = shading.evaluate_lobe(TABLES[name], cosine, roughness, directions)
+    mirrored = shading.evaluate_lobe(TABLES[name], cosine, roughness, directions * np.array([1.0, -1.0, 1.0]))
+    assert np.array_equal(values, mirrored)
+
+
+@table_names
+def test_wrong_shapes_are_refused(name):
+    with pytest.raises(ValueError, match=r"vertices have shape \(2, 2, 3\), expected \(2, V >= 3, 3\)"):
+        shading.integrate_polygon(TABLES[name], [0.5, 0.5], [0.5, 0.5], np.ones((2, 2, 3)))
+    with pytest.raises(ValueError, match=r"vertices have shape \(3, 4, 3\)"):
+        shading.integrate_polygon(TABLES[name], [0.5, 0.5], [0.5, 0.5], np.ones((3, 4, 3)))
+    with pytest.raises(ValueError, match=r"directions have shape \(2, 3\), expected \(2, S, 3\)"):
+        shading.evaluate_lobe(TABLES[name], [0.5, 0.5], [0.5, 0.5], np.ones((2, 3)))
+
+
+@table_names
+def test_no_points_give_no_values(name):
+    empty = np.zeros(0)
+    assert shading.integrate_polygon(TABLES[name], empty, empty, np.zeros((0, 4, 3))).shape == (0,)
+    assert shading.evaluate_lobe(TABLES[name], empty, empty, np.zeros((0, 5, 3))).shape == (0, 5)

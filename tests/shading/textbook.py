@@ -1,0 +1,75 @@
+"""Formulas as they stand in the literature, written for clarity: the oracles of the shading tests."""
+
+import numpy as np
+
+
+def ggx_distribution(cosine, alpha):
+    """D(h) of GGX, Walter et al. 2007, eq. 33, without clamping: alpha^2 / (pi cos^4 (alpha^2 + tan^2)^2)."""
+    tangent_squared = 1.0 / cosine**2 - 1.0
+    return alpha**2 / (np.pi * cosine**4 * (alpha**2 + tangent_squared) ** 2)
+
+
+def smith_lambda(cosine, alpha):
+    """Lambda of GGX, Heitz 2014, eq. 72."""
+    tangent_squared = 1.0 / cosine**2 - 1.0
+    return 0.5 * (np.sqrt(1.0 + alpha**2 * tangent_squared) - 1.0)
+
+
+def ggx_brdf(view, light, alpha):
+    """D G2 / (4 cos_o cos_i) with the height-correlated G2 = 1 / (1 + Lambda_o + Lambda_i), Heitz 2014, eq. 99."""
+    half = view + light
+    half = half / np.linalg.norm(half, axis=-1, keepdims=True)
+    masking = 1.0 / (1.0 + smith_lambda(view[..., 2], alpha) + smith_lambda(light[..., 2], alpha))
+    return ggx_distribution(half[..., 2], alpha) * masking / (4.0 * view[..., 2] * light[..., 2])
+
+
+def fresnel_amplitudes(cosine, ior):
+    """(r_s^2, r_p^2) by Snell's law and the Fresnel equations."""
+    transmitted = np.sqrt(1.0 - (1.0 - cosine**2) / ior**2)
+    s = (cosine - ior * transmitted) / (cosine + ior * transmitted)
+    p = (ior * cosine - transmitted) / (ior * cosine + transmitted)
+    return s**2, p**2
+
+
+def lhuilier(a, b, c):
+    """Area of a spherical triangle of unit corners (..., 3), by L'Huilier's theorem; never negative."""
+    sides = [np.arctan2(np.linalg.norm(np.cross(p, q), axis=-1), (p * q).sum(axis=-1)) for p, q in [(b, c), (c, a), (a, b)]]
+    half = 0.5 * sum(sides)
+    product = np.tan(0.5 * half)
+    for side in sides:
+        product = product * np.tan(0.5 * (half - side))
+    return 4.0 * np.arctan(np.sqrt(np.maximum(product, 0.0)))
+
+
+def lambert_form_factor(polygon):
+    """Form factor of a polygon (V, 3) above z = 0: sum over edges of angle times the z of the edge's unit normal."""
+    total = 0.0
+    for start, end in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        cosine = start @ end / np.linalg.norm(start) / np.linalg.norm(end)
+        normal = np.cross(start, end)
+        total += np.arccos(cosine) * normal[2] / np.linalg.norm(normal)
+    return total / (2.0 * np.pi)
+
+
+def parallel_rectangle_form_factor(width, depth, height):
+    """Form factor from a point to a parallel rectangle with one corner straight above it (Howell's catalog, B-4)."""
+    a, b = width / height, depth / height
+    first = a / np.sqrt(1.0 + a * a) * np.arctan(b / np.sqrt(1.0 + a * a))
+    second = b / np.sqrt(1.0 + b * b) * np.arctan(a / np.sqrt(1.0 + b * b))
+    return (first + second) / (2.0 * np.pi)
+
+
+def coaxial_disk_form_factor(radius, height):
+    """Form factor from a point to a parallel disk straight above it."""
+    return radius**2 / (radius**2 + height**2)
+
+
+def view_direction(cos_theta_o):
+    """(sin theta_o, 0, cos theta_o) as (..., 3)."""
+    mu = np.asarray(cos_theta_o, dtype=float)
+    return np.stack([np.sqrt(1.0 - mu * mu), np.zeros_like(mu), mu], axis=-1)
+
+
+def mirror_direction(cos_theta_o):
+    """The mirror image of `view_direction`."""
+    return view_direction(cos_theta_o) * np.array([-1.0, 1.0, 1.0])

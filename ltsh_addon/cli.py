@@ -80,7 +80,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     _add_scene(shade)
     _add_common(shade, cycles=False)
     shade.set_defaults(run=_shade)
-    tables = commands.add_parser("tables", help="fit or validate the lookup tables (needs the source checkout and scipy)")
+    tables = commands.add_parser("tables", help="fit or validate the lookup tables (needs the source checkout)")
     tables.add_argument("action", choices=("fit", "validate"))
     tables.add_argument("names", nargs="*", metavar="TABLE", help="default: all shipped tables")
     tables.set_defaults(run=_tables, quiet=False)
@@ -216,6 +216,6 @@ def _finish(arguments, bar, report) -> int:
 def _tables(arguments, bar, open_file) -> int:
     root = Path(__file__).resolve().parents[1]
     if not (root / "tables" / "fit.py").is_file():
-        raise _Misuse("tables fit and validate need the source checkout, which has tables/fit.py; this is a package only")
+        raise _Misuse("tables fit and validate need the source checkout with tables/fit.py, which is not here")
     command = [sys.executable, "-m", "tables", arguments.action, *arguments.names]
     return subprocess.run(command, cwd=root, check=False).returncode

@@ -50,7 +50,10 @@ class Result:
 
 
 def shade_scene(options: Options, progress: Progress | None = None) -> dict:
-    """Shade a scene per pixel, write shade.exr, return the report. Raises SceneError, TableError, OSError, Cancelled."""
+    """Shade a scene per pixel, write shade.exr, return the report.
+
+    Raises SceneError, TableError, OSError, Cancelled.
+    """
     return _run(options, False, progress)
 
 

@@ -187,7 +187,8 @@ class Comparison:
                 error = self.images[name, pass_name] - mean
                 layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
         for field, letters in SAMPLE_LAYERS.items():
-            layers[f"samples.{field}"] = imaging.Layer(self.film.image(getattr(self.extraction.samples, field)), letters)
+            values = getattr(self.extraction.samples, field)
+            layers[f"samples.{field}"] = imaging.Layer(self.film.image(values), letters)
         layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
         return layers
 
@@ -230,7 +231,8 @@ def summary(report: dict, output: Path) -> str:
     for pass_name, figures in report["passes"].items():
         noise = f", noise of Cycles {_percent(figures['noise'])}" if "noise" in figures else ""
         lines.append(f"{pass_name}{noise}")
-        lines.append(f"  {'technique':<12}{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}")
+        heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
+        lines.append(f"  {'technique':<12}{heads}")
         for name, row in figures["techniques"].items():
             cycles = row.get("against_cycles", {}).get("unbiased_relative_error")
             reference = row.get("against_reference", {})

@@ -138,7 +138,7 @@ class Film:
     def image(self, values: np.ndarray) -> np.ndarray:
         """Image (H, W) or (H, W, C), row 0 on top, of per-sample `values` (P,) or (P, C)."""
         values = np.asarray(values, dtype=np.float64)
-        columns = values.reshape(values.shape[0], -1)
+        columns = values.reshape(values.shape[0], int(np.prod(values.shape[1:])))
         count = self.width * self.height
         image = np.stack(
             [np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1

@@ -177,13 +177,13 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 
 
 def _table_integrals(table, lobe, polygon):
-    """Integrals (3, P), never negative; a polygon's corners run counterclockwise as seen from the point (`AreaLight`)."""
+    """Integrals (3, P), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
     signed = polygon_integrals(table, lobe, polygon, lobe.coefficients)
     return np.maximum(-signed, 0.0)
 
 
 def _frame(normal, view):
-    """Local frames (3, 3, P): rows tangent, bitangent, normal; the view lies in the tangent-normal half plane x >= 0."""
+    """Local frames (3, 3, P): rows tangent, bitangent, normal; the view has y = 0 and x >= 0."""
     cosine = (normal * view).sum(axis=1, keepdims=True)
     tangent = view - cosine * normal
     length = np.sqrt((tangent * tangent).sum(axis=1, keepdims=True))
@@ -220,7 +220,8 @@ def _visible_parts(samples, frame, light, corners, candidates, *, geometric_hori
     if geometric_horizon:
         height = (offset * samples.geometric_normal[index].T[:, None, :]).sum(axis=0)
         if not (height > 0.0).all():
-            parts = ((part, clipped[:3]) for part, clipped in split_at_horizon(np.concatenate([local, height[None]]), 3))
+            with_height = np.concatenate([local, height[None]])
+            parts = ((part, clipped[:3]) for part, clipped in split_at_horizon(with_height, axis=3))
     for outer, polygon in parts:
         for inner, clipped in split_at_horizon(polygon):
             yield index[outer][inner], clipped

@@ -1,7 +1,7 @@
 """The lookup table of a fitted BRDF: axes, stored quantities, bilinear lookup.
 
-The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1), where the warp W = M^-1, known up
-to a factor, is upper triangular: it leaves the horizon in place.
+The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1), where the warp W = M^-1,
+known up to a factor, is upper triangular: it leaves the horizon in place.
 
     W = [[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 alpha]],   g^2 = cos^2(theta_o) + alpha^2 / 4
 
@@ -156,12 +156,19 @@ def load_table(name_or_path: str | Path) -> LookupTable:
     if not path.is_file():
         raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
     try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in _ARRAYS}
-            metadata = json.loads(str(data["metadata"]))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise TableError(f"lookup table {path}: cannot be read ({error}); fit it again or reinstall") from error
+        with zipfile.ZipFile(path) as archive:
+            arrays = {key: _member(archive, key) for key in _ARRAYS}
+            metadata = json.loads(str(_member(archive, "metadata")))
+    # A damaged file can raise almost anything: BadZipFile, zlib.error, KeyError, NotImplementedError, MemoryError ...
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise TableError(f"lookup table {path}: cannot be read ({reason}); fit it again or reinstall") from error
     return _validated(path, arrays, metadata)
+
+
+def _member(archive, key):
+    with archive.open(f"{key}.npy") as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _validated(path, arrays, metadata) -> LookupTable:
@@ -170,13 +177,26 @@ def _validated(path, arrays, metadata) -> LookupTable:
         raise TableError(f"lookup table {path}: format version is {found!r}, expected {FORMAT_VERSION}; fit it again")
     family, degree = metadata.get("family"), metadata.get("degree")
     if family not in ("ltc", "ltsh") or not isinstance(degree, int) or not 1 <= degree <= MAX_DEGREE:
-        raise TableError(f"lookup table {path}: family {family!r} of degree {degree!r} is unknown")
-    count = 1 if family == "ltc" else coefficient_count(degree)
-    warp, coefficients = arrays["warp"], arrays["coefficients"]
-    curves = arrays["fresnel_curves"].shape[0]
-    if warp.shape[2:] != (4 if family == "ltc" else 3,) or coefficients.shape != (*warp.shape[:2], curves, count):
-        raise TableError(f"lookup table {path}: arrays {warp.shape} and {coefficients.shape} do not fit together")
+        raise TableError(f"lookup table {path}: family {family!r} of degree {degree!r} is unknown; fit it again")
+    dimensions = {"warp": 3, "coefficients": 4, "fresnel_curves": 2, "fresnel_ior": 1, "fresnel_weights": 2}
     for key, value in arrays.items():
+        if value.dtype.kind != "f" or value.ndim != dimensions[key]:
+            found, expected = f"{value.ndim} axes of {value.dtype}", f"{dimensions[key]} of floats"
+            raise TableError(f"lookup table {path}: {key} has {found}, expected {expected}; fit it again")
         if not np.isfinite(value).all():
             raise TableError(f"lookup table {path}: {key} holds NaN or infinity, expected finite numbers; fit it again")
+    rows, columns = arrays["warp"].shape[:2]
+    curves, cosines = arrays["fresnel_curves"].shape
+    indices = arrays["fresnel_ior"].shape[0]
+    shapes = {
+        "warp": (rows, columns, 4 if family == "ltc" else 3),
+        "coefficients": (rows, columns, curves, 1 if family == "ltc" else coefficient_count(degree)),
+        "fresnel_weights": (indices, curves),
+    }
+    for key, shape in shapes.items():
+        found = arrays[key].shape
+        if found != shape or min(rows, columns, curves, cosines) < 2 or indices < 1:
+            raise TableError(f"lookup table {path}: {key} has shape {found}, expected {shape}; fit it again")
+    if (np.diff(arrays["fresnel_ior"]) <= 0.0).any():
+        raise TableError(f"lookup table {path}: fresnel_ior does not increase; fit it again")
     return LookupTable(name=metadata.get("name", path.stem), family=family, degree=degree, metadata=metadata, **arrays)

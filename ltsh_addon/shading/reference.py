@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import brdf
-from .edge_integrals import arc_factors
+from .edge_integrals import arc_factors, one_plus_cosine
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
 from .polygon import project_to_sphere
 
@@ -58,7 +58,7 @@ class PolygonBoundary:
         normal = np.cross(start, end, axis=0)
         theta = np.arctan2(np.sqrt((normal**2).sum(axis=0)), cosine)
         points = _slerp(start, end, theta, fractions[:, None])
-        measure = normal * arc_factors(1.0 + cosine)[0] * weights[:, None]
+        measure = normal * arc_factors(one_plus_cosine(start, end))[0] * weights[:, None]
         count = self.unit.shape[2]
         return points.reshape(3, -1, count), measure.reshape(3, -1, count)
 
@@ -125,10 +125,10 @@ class EllipseBoundary:
 def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
     """Integrals (3, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
-    `make_boundary(warp)` returns the boundary of the part with z >= 0 of each light in the local frame of cos_theta_o
-    (P,), warped. The three rows have the Fresnel factor 1, (1 - c)^5 and that of a dielectric of relative `ior` (P,). The
-    order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6; the estimate
-    is the last difference. Lights must be convex.
+    `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
+    cos_theta_o (P,). The three rows have the Fresnel factor 1, (1 - c)^5 and that of a dielectric of relative `ior`
+    (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6; the
+    estimate is the last difference. Lights must be convex.
     """
     warp = _limit_warp(cos_theta_o, np.maximum(alpha, MIN_ALPHA))
     boundary = make_boundary(warp)

@@ -46,7 +46,7 @@ def evaluate(degree: int, directions: np.ndarray) -> np.ndarray:
 
 
 def hemisphere_integrals(degree: int) -> np.ndarray:
-    """Integrals (K,) of the basis functions over the hemisphere z >= 0: the directional albedo of a unit coefficient."""
+    """Integrals (K,) of the basis functions over the hemisphere z >= 0: the albedo of a unit coefficient."""
     nodes, weights = np.polynomial.legendre.leggauss(degree + 1)
     z, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     directions = np.stack([np.sqrt(1.0 - z * z), np.zeros_like(z), z], axis=-1)

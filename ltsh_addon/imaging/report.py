@@ -1,0 +1,98 @@
+"""The report of a comparison: JSON for machines, one self-contained HTML page for people."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+from collections.abc import Mapping
+
+from .atomic import write_bytes
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
+h1 { font-size: 1.5rem; margin-bottom: 0.2rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
+img { max-width: 100%; border: 1px solid #ddd; } p.facts { color: #666; margin-top: 0; }
+table { border-collapse: collapse; }
+td, th { padding: 0.25rem 0.8rem; text-align: right; border-bottom: 1px solid #ddd; }
+td:first-child, th:first-child { text-align: left; } li { margin: 0.2rem 0; }
+"""
+_COLUMNS = (
+    ("against_cycles", "unbiased_relative_error", "vs Cycles"),
+    ("against_cycles", "bias", "bias"),
+    ("against_reference", "relative_l2", "vs reference"),
+    ("against_reference", "median_relative_error", "median"),
+    ("against_reference", "percentile_95_relative_error", "95 %"),
+)
+
+
+def json_text(document) -> str:
+    """`document` as JSON text: NaN and Inf become null, numpy scalars and arrays plain numbers and lists."""
+    return json.dumps(_plain(document), indent=2, ensure_ascii=False, allow_nan=False)
+
+
+def write_json(path: str | os.PathLike, document) -> None:
+    """Write `json_text(document)`, complete or not at all."""
+    write_bytes(path, (json_text(document) + "\n").encode())
+
+
+def _plain(value):
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy scalars and arrays
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def write_html(path: str | os.PathLike, report: Mapping) -> None:
+    """Write the page of a comparison's `report`, beside compare.png and compare.exr; complete or not at all."""
+    facts = (
+        f"camera {report['camera']}, frame {report['frame']}, "
+        f"{report['resolution'][0]} x {report['resolution'][1]} pixels, {report['sub_samples']} sub-samples, {report['cycles_samples']} Cycles samples; "
+        + ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    )
+    body = [
+        f"<h1>{_text(report['scene'])}</h1>",
+        f'<p class="facts">{_text(facts)}</p>',
+        '<p><a href="compare.png"><img src="compare.png" alt="Cycles and the techniques, with signed errors"></a></p>',
+        *(_pass_table(name, figures) for name, figures in report["passes"].items()),
+        _warnings(report["warnings"]),
+        '<p>All layers: <a href="compare.exr">compare.exr</a>. All figures: <a href="report.json">report.json</a>.</p>',
+    ]
+    page = (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f"<title>{_text(report['scene'])}: comparison</title><style>{_STYLE}</style></head>"
+        f"<body>{''.join(body)}</body></html>\n"
+    )
+    write_bytes(path, page.encode())
+
+
+def _pass_table(name: str, figures: Mapping) -> str:
+    head = "".join(f"<th>{_text(label)}</th>" for _, _, label in _COLUMNS)
+    rows = [
+        f"<tr><td>{_text(technique)}</td>"
+        + "".join(f"<td>{_percent(row.get(part, {}).get(key))}</td>" for part, key, _ in _COLUMNS)
+        + "</tr>"
+        for technique, row in figures["techniques"].items()
+    ]
+    noise = f", noise of the Cycles reference {_percent(figures['noise'])}" if "noise" in figures else ""
+    return f"<h2>{_text(name)}{noise}</h2><table><tr><th>technique</th>{head}</tr>{''.join(rows)}</table>"
+
+
+def _warnings(warnings) -> str:
+    if not warnings:
+        return "<h2>Warnings</h2><p>None: everything in the scene was shaded.</p>"
+    return f"<h2>Warnings</h2><ul>{''.join(f'<li>{_text(warning)}</li>' for warning in warnings)}</ul>"
+
+
+def _percent(value) -> str:
+    return "–" if value is None else f"{100.0 * value:.3f} %"
+
+
+def _text(value) -> str:
+    return html.escape(str(value))

@@ -1,0 +1,163 @@
+"""The comparison sheet, after Figure 1 of Allmenroeder and Peters 2021: renderings on top, signed errors below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .false_color import color_bar, signed_error_colors
+from .font import draw_text, shorten, text_size, wrap
+from .tone import exposure_factor, luminance, to_srgb8
+
+COLUMNS = 5
+TILE_WIDTHS = (240, 480)  # tiny images are enlarged to the first, large ones reduced to the second
+_PAPER, _INK, _FAINT, _FRAME = (250, 250, 249), (28, 28, 30), (106, 106, 112), (198, 198, 202)
+_MARGIN, _GUTTER = 28, 16
+_TITLE, _LABEL, _TEXT = 26.0, 18.0, 14.0
+_SCALE_PERCENTILE = 99.5
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One technique: linear image (H, W, 3), signed error (H, W, 3), lines of text."""
+
+    label: str
+    image: np.ndarray
+    error: np.ndarray
+    caption: Sequence[str] = field(default=())
+
+
+def comparison_sheet(
+    title: str,
+    reference: tuple[str, np.ndarray],
+    techniques: Sequence[Tile],
+    *,
+    notes: Sequence[str] = (),
+    error_scale: float | None = None,
+) -> np.ndarray:
+    """The sheet (H, W, 3), 8-bit sRGB.
+
+    `reference` is a label and a linear image (H, W, 3); all images have its size. One exposure and one error scale (a
+    radiance; left out: the 99.5th percentile of all absolute errors) serve all tiles; both are printed.
+    """
+    label, image = reference
+    for tile in techniques:
+        for part in (tile.image, tile.error):
+            if part.shape != image.shape:
+                raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
+    exposure = exposure_factor(image)
+    scale = error_scale or _common_scale([tile.error for tile in techniques], image)
+    pictures = [to_srgb8(exposure * _resized(part)) for part in (image, *(tile.image for tile in techniques))]
+    errors = [_to_8bit(signed_error_colors(_resized(tile.error), scale)) for tile in techniques]
+    height, width = pictures[0].shape[:2]
+    sheet = _Sheet(title, width, height, count=len(pictures), caption_lines=max(map(_lines, techniques), default=0))
+    legend = [*notes, f"exposure {np.log2(exposure):+.1f} EV"]
+    sheet.place(0, label, pictures[0], None, ())
+    sheet.legend(legend, scale)
+    for index, (tile, picture, error) in enumerate(zip(techniques, pictures[1:], errors, strict=True), start=1):
+        sheet.place(index, tile.label, picture, error, tile.caption)
+    return sheet.pixels
+
+
+def _lines(tile: Tile) -> int:
+    return len(tile.caption)
+
+
+def _common_scale(errors, image) -> float:
+    """A round number near the 99.5th percentile of the luminance of all errors."""
+    values = [np.abs(luminance(error[np.isfinite(error).all(axis=-1)])) for error in errors]
+    values = np.concatenate([part[part > 0.0] for part in values]) if values else np.empty(0)
+    if not values.size:
+        return max(float(np.nanmax(np.where(np.isfinite(image), image, 0.0), initial=0.0)), 1.0)
+    value = float(np.percentile(values, _SCALE_PERCENTILE))
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(min((step * power for step in (1.0, 2.0, 5.0, 10.0)), key=lambda step: abs(np.log(step / value))))
+
+
+def _resized(image: np.ndarray) -> np.ndarray:
+    """Enlarged by whole factors (nearest), or reduced by box filtering, to a width between TILE_WIDTHS."""
+    smallest, largest = TILE_WIDTHS
+    height, width = image.shape[:2]
+    if width < smallest:
+        factor = -(-smallest // width)
+        return np.repeat(np.repeat(image, factor, axis=0), factor, axis=1)
+    if width <= largest:
+        return image
+    new_width = largest
+    new_height = max(round(height * new_width / width), 1)
+    return _box_filtered(_box_filtered(image, new_height).swapaxes(0, 1), new_width).swapaxes(0, 1)
+
+
+def _box_filtered(image: np.ndarray, rows: int) -> np.ndarray:
+    """Rows averaged over equal intervals, pixels on a border shared by their overlap."""
+    sums = np.concatenate([np.zeros_like(image[:1], dtype=np.float64), np.cumsum(image, axis=0, dtype=np.float64)])
+    borders = np.linspace(0.0, image.shape[0], rows + 1)
+    whole = np.minimum(borders.astype(int), image.shape[0] - 1)
+    at_border = sums[whole] + (borders - whole)[:, None, None] * image[whole]
+    return np.diff(at_border, axis=0) * (rows / image.shape[0])
+
+
+def _to_8bit(colors: np.ndarray) -> np.ndarray:
+    return np.rint(255.0 * colors).astype(np.uint8)
+
+
+class _Sheet:
+    """The paper and where things go on it."""
+
+    def __init__(self, title: str, width: int, height: int, *, count: int, caption_lines: int):
+        self.width, self.height = width, height
+        self.columns = min(count, COLUMNS)
+        self.rows = -(-count // self.columns)
+        self.line = text_size("Ag", _TEXT)[1] + 4
+        self.label_height = text_size("Ag", _LABEL, bold=True)[1] + 8
+        self.caption_height = caption_lines * self.line + 10
+        self.row_height = self.label_height + 2 * height + 10 + self.caption_height + 18
+        title_height = text_size("Ag", _TITLE, bold=True)[1] + 18
+        self.top = _MARGIN + title_height
+        page_width = 2 * _MARGIN + self.columns * width + (self.columns - 1) * _GUTTER
+        page_height = self.top + self.rows * self.row_height + _MARGIN - 18
+        self.pixels = np.full((page_height, page_width, 3), _PAPER, dtype=np.uint8)
+        fitting = shorten(title, page_width - 2 * _MARGIN, _TITLE, bold=True)
+        draw_text(self.pixels, _MARGIN, _MARGIN, fitting, _INK, _TITLE, bold=True)
+
+    def _corner(self, index: int) -> tuple[int, int]:
+        row, column = divmod(index, self.columns)
+        return _MARGIN + column * (self.width + _GUTTER), self.top + row * self.row_height
+
+    def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
+        """Put label, picture, error and caption into cell `index`."""
+        x, y = self._corner(index)
+        draw_text(self.pixels, x, y, shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)
+        y += self.label_height
+        self._picture(x, y, picture)
+        y += self.height + 10
+        if error is not None:
+            self._picture(x, y, error)
+        y += self.height + 8
+        for line in caption:
+            draw_text(self.pixels, x, y, shorten(line, self.width, _TEXT), _FAINT, _TEXT)
+            y += self.line
+
+    def _picture(self, x: int, y: int, picture: np.ndarray) -> None:
+        height, width = picture.shape[:2]
+        self.pixels[y - 1 : y + height + 1, x - 1 : x + width + 1] = _FRAME
+        self.pixels[y : y + height, x : x + width] = picture
+
+    def legend(self, notes: Sequence[str], scale: float) -> None:
+        """Below the reference: the color bar with numbers, what the colors mean, the notes."""
+        x, y = self._corner(0)
+        y += self.label_height + self.height + 10
+        bar_height = 18
+        self._picture(x, y + 1, _to_8bit(color_bar(self.width, bar_height)))
+        y += bar_height + 6
+        for text, align in ((f"\u2212{scale:g}", 0.0), ("0", 0.5), (f"+{scale:g}", 1.0)):
+            width = text_size(text, _TEXT)[0]
+            draw_text(self.pixels, x + round(align * (self.width - width)), y, text, _INK, _TEXT)
+        y += self.line + 6
+        meaning = "signed error: technique \u2212 Cycles, in radiance; red is too bright, blue too dark"
+        for text in (meaning, *notes):
+            for line in wrap(text, self.width, _TEXT):
+                draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
+                y += self.line

@@ -1,0 +1,95 @@
+"""Surface samples and area lights for the tests of shading."""
+
+import numpy as np
+
+from ltsh_addon.scene import AreaLight, SurfaceSamples
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def random_samples(count, seed=0, lowest_roughness=0.05):
+    """Points in a cube of 2 m around the origin, seen from the side of their normals; metals, dielectrics and both."""
+    generator = np.random.default_rng(seed)
+    normal = unit(generator.normal(size=(count, 3)))
+    view = unit(normal + unit(generator.normal(size=(count, 3))) * generator.uniform(0.2, 0.95, size=(count, 1)))
+    bumped = unit(normal + 0.1 * generator.normal(size=(count, 3)))
+    metal = (generator.random(count) < 0.5).astype(float)
+    f0 = generator.random((count, 3)) * metal[:, None]
+    return SurfaceSamples(
+        position=generator.uniform(-1.0, 1.0, size=(count, 3)),
+        view=view,
+        normal=normal,
+        diffuse_normal=bumped,
+        roughness=lowest_roughness + (1.0 - lowest_roughness) * generator.random(count),
+        specular_f0=f0,
+        specular_f90=np.broadcast_to(metal[:, None], (count, 3)).copy(),
+        dielectric=1.0 - metal,
+        ior=1.1 + 1.4 * generator.random(count),
+        diffuse_albedo=generator.random((count, 3)) * (1.0 - metal)[:, None],
+    )
+
+
+def area_light(name="Lamp", shape="RECTANGLE", center=(0, 0, 3), half_u=(1, 0, 0), half_v=(0, -0.6, 0), **options):
+    """An area light that shines along cross(half_u, half_v), by default down."""
+    if "direction" not in options:
+        options["direction"] = unit(np.cross(np.asarray(half_u, dtype=float), np.asarray(half_v, dtype=float)))
+    return AreaLight(name, shape, center, half_u, half_v, **{"radiance": (5.0, 3.0, 1.0), **options})
+
+
+def four_lights():
+    """One of each shape around the cube of `random_samples`, facing it, in three groups."""
+    return (
+        area_light("Key", "RECTANGLE", (0.3, 0.2, 3.0), (1.2, 0.1, 0.0), (0.05, -0.6, 0.0), group="Key"),
+        area_light("Fill", "SQUARE", (-3.0, 0.5, 0.4), (0.0, 0.7, 0.0), (0.0, 0.0, 0.7), group="Fill"),
+        area_light("Rim", "DISK", (2.6, 1.0, 1.0), (0.0, 0.5, 0.0), (0.0, 0.0, -0.5), group="Key"),
+        area_light("Kick", "ELLIPSE", (0.4, -2.8, 0.2), (-0.9, 0.0, 0.0), (0.0, 0.0, 0.3), radiance=(0.5, 2.0, 9.0)),
+    )
+
+
+def single_sample(position=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), view=(0.0, 0.0, 1.0), **fields):
+    """One point; white Lambertian, no specular lobe unless told otherwise."""
+    row = {
+        "position": position,
+        "view": unit(np.asarray(view, dtype=float)),
+        "normal": unit(np.asarray(normal, dtype=float)),
+        "diffuse_normal": unit(np.asarray(normal, dtype=float)),
+        "roughness": 0.5,
+        "specular_f0": (0.0, 0.0, 0.0),
+        "specular_f90": (0.0, 0.0, 0.0),
+        "dielectric": 0.0,
+        "ior": 1.5,
+        "diffuse_albedo": (1.0, 1.0, 1.0),
+        **fields,
+    }
+    return SurfaceSamples(**{name: np.asarray(value, dtype=float)[None] for name, value in row.items()})
+
+
+def moved(samples, lights, rotation=None, shift=(0.0, 0.0, 0.0)):
+    """Samples and lights under one rigid motion."""
+    rotation = np.eye(3) if rotation is None else rotation
+    vectors = ("view", "normal", "diffuse_normal", "geometric_normal")
+    fields = {name: getattr(samples, name) for name in samples.__dataclass_fields__}
+    fields.update({name: fields[name] @ rotation.T for name in vectors})
+    fields["position"] = samples.position @ rotation.T + np.asarray(shift)
+    turned = [
+        AreaLight(
+            light.name,
+            light.shape,
+            rotation @ light.center + np.asarray(shift),
+            rotation @ light.half_u,
+            rotation @ light.half_v,
+            rotation @ light.direction,
+            light.radiance,
+            light.group,
+            light.affects_diffuse,
+            light.affects_specular,
+        )
+        for light in lights
+    ]
+    return SurfaceSamples(**fields), turned
+
+
+def random_rotation(seed):
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]

@@ -1,0 +1,241 @@
+"""Lookup tables: interpolation, clamping, Fresnel weights, and what a damaged file leads to."""
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+import textbook
+
+from ltsh_addon import shading
+from ltsh_addon.shading import lookup_table
+
+TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
+table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+ARRAYS = ("warp", "coefficients", "fresnel_curves", "fresnel_ior", "fresnel_weights")
+
+
+def stored(table, lobe, cosine, roughness):
+    """A, B, C (and tilt) of looked-up lobes, by undoing the formula of the module's docstring: (channels, P)."""
+    alpha = np.maximum(roughness**2, lookup_table.MIN_ALPHA)
+    g_squared = cosine**2 + alpha**2 / 4.0
+    a = lobe.xx / g_squared
+    sine = np.sqrt(1.0 - cosine**2)
+    b = np.divide(lobe.xz, a * np.sqrt(g_squared) * sine, out=np.full_like(a, np.nan), where=sine > 1e-6)
+    rows = [a, b, lobe.yy] + ([] if lobe.tilt is None else [lobe.tilt])
+    assert np.array_equal(lobe.zz, 2.0 * alpha)
+    return np.stack(rows)
+
+
+@table_names
+def test_nodes_are_reproduced(name):
+    """To rounding: theta_o of a node passes through cos and arccos, whose condition is worst at normal incidence."""
+    table = TABLES[name]
+    rows, columns = table.warp.shape[:2]
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
+    cosine = np.cos(lookup_table.theta_nodes(columns))[j].clip(0.0, 1.0)
+    roughness = lookup_table.roughness_nodes(rows)[i]
+    lobe = table.lookup(cosine, roughness)
+    expected = table.warp[i, j].T.astype(float)
+    found = stored(table, lobe, cosine, roughness)
+    known = np.isfinite(found)
+    assert known[[0, 2]].all() and known[1].sum() == rows * (columns - 1)
+    scale = np.abs(table.warp).max()
+    assert np.abs(found - expected)[known].max() < 1e-9 * scale
+    assert np.abs(lobe.coefficients - np.moveaxis(table.coefficients[i, j], 0, -1)).max() < 1e-9 * np.abs(
+        table.coefficients
+    ).max()
+
+
+@table_names
+def test_between_nodes_the_table_is_bilinear(name):
+    table = TABLES[name]
+    rows, columns = table.warp.shape[:2]
+    generator = np.random.default_rng(1)
+    u, v = generator.random(200) * (rows - 1), generator.random(200) * (columns - 1)
+    i, j = u.astype(int), v.astype(int)
+    s, t = u - i, v - j
+    theta = 0.5 * np.pi * (1.0 - (1.0 - v / (columns - 1)) ** 2)
+    lobe = table.lookup(np.cos(theta), u / (rows - 1))
+    for found, nodes in [(lobe.yy, table.warp[..., 2]), (lobe.coefficients[1, 0], table.coefficients[..., 1, 0])]:
+        nodes = nodes.astype(float)
+        expected = (1 - s) * ((1 - t) * nodes[i, j] + t * nodes[i, j + 1]) + s * (
+            (1 - t) * nodes[i + 1, j] + t * nodes[i + 1, j + 1]
+        )
+        assert np.abs(found - expected).max() < 1e-9 * np.abs(nodes).max()
+
+
+@table_names
+def test_outside_the_axes_the_border_holds(name):
+    table = TABLES[name]
+    outside = table.lookup(np.array([-0.3, 1.2, 0.5, 0.5]), np.array([0.5, 0.5, -1.0, 7.0]))
+    inside = table.lookup(np.array([0.0, 1.0, 0.5, 0.5]), np.array([0.5, 0.5, 0.0, 1.0]))
+    for field in ("xx", "xz", "yy", "zz", "coefficients"):
+        assert np.array_equal(getattr(outside, field), getattr(inside, field)), field
+
+
+@table_names
+def test_float32_lookups_stay_float32(name):
+    lobe = TABLES[name].lookup(np.array([0.3, 1.0], dtype=np.float32), np.array([0.0, 0.7], dtype=np.float32))
+    for field in ("xx", "xz", "yy", "zz", "coefficients"):
+        assert getattr(lobe, field).dtype == np.float32, field
+
+
+@table_names
+def test_dielectric_weights_reproduce_the_fresnel_equations(name):
+    """Within 1 % of the reflectance at every angle for IOR 1.1 to 3, also between the tabulated ones."""
+    table = TABLES[name]
+    ior = np.linspace(1.1, 3.0, 381)
+    cosine = np.linspace(0.0, 1.0, table.fresnel_curves.shape[1])
+    found = table.dielectric_weights(ior).T @ table.fresnel_curves
+    s, p = textbook.fresnel_amplitudes(cosine, ior[:, None])
+    assert np.abs(found / (0.5 * (s + p)) - 1.0).max() < 0.01
+
+
+@table_names
+def test_schlick_and_unit_curves_come_first(name):
+    table = TABLES[name]
+    cosine = np.linspace(0.0, 1.0, table.fresnel_curves.shape[1])
+    assert np.array_equal(table.fresnel_curves[0], np.ones_like(cosine))
+    assert np.abs(table.fresnel_curves[1] - (1.0 - cosine) ** 5).max() < 1e-15
+
+
+def contents(name):
+    """Arrays and metadata of a shipped table."""
+    table = TABLES[name]
+    return {key: getattr(table, key).copy() for key in ARRAYS}, dict(table.metadata)
+
+
+def written(path, arrays, metadata):
+    np.savez(path, **arrays, metadata=np.array(json.dumps(metadata)))
+    return path
+
+
+def assert_refused(path, *words):
+    with pytest.raises(shading.TableError) as caught:
+        shading.load_table(path)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message
+    for word in words:
+        assert word in message, message
+
+
+def test_a_written_table_is_read_back(tmp_path):
+    arrays, metadata = contents("ltsh2")
+    table = shading.load_table(written(tmp_path / "own.npz", arrays, metadata))
+    assert all(np.array_equal(getattr(table, key), value) for key, value in arrays.items())
+    assert shading.load_table(str(tmp_path / "own.npz")).name == "ltsh2"
+
+
+def test_missing_files_and_folders_are_named(tmp_path):
+    assert_refused(tmp_path / "none.npz", "no such file", "ltsh4")
+    assert_refused(tmp_path, "no such file")
+    with pytest.raises(shading.TableError, match="lookup table ltsh3: no such file or table; shipped are ltc"):
+        shading.load_table("ltsh3")
+
+
+def test_a_table_error_is_a_value_error():
+    assert issubclass(shading.TableError, ValueError)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip at all", b"PK\x03\x04", b"\x93NUMPY"])
+def test_files_that_are_no_zip_are_refused(tmp_path, content):
+    path = tmp_path / "bad.npz"
+    path.write_bytes(content)
+    assert_refused(path, "cannot be read")
+
+
+def test_a_plain_array_is_refused(tmp_path):
+    with open(tmp_path / "array.npz", "wb") as file:
+        np.save(file, np.ones(3))
+    assert_refused(tmp_path / "array.npz")
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.999])
+def test_truncated_files_are_refused(tmp_path, share):
+    arrays, metadata = contents("ltc")
+    content = written(tmp_path / "whole.npz", arrays, metadata).read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: int(share * len(content))])
+    assert_refused(tmp_path / "cut.npz", "cannot be read")
+
+
+def test_flipped_bytes_are_refused_or_harmless(tmp_path):
+    """A shipped, compressed file damaged anywhere gives TableError, never another exception."""
+    source = lookup_table.Path(lookup_table.__file__).parents[2] / "tables" / "ltc.npz"
+    whole = source.read_bytes()
+    generator = np.random.default_rng(2)
+    path = tmp_path / "flipped.npz"
+    refused = 0
+    offsets = [*generator.integers(0, len(whole), 60), *range(len(whole) - 120, len(whole)), *range(0, 40)]
+    for offset in offsets:
+        damaged = bytearray(whole)
+        damaged[offset] ^= 0x5A
+        path.write_bytes(damaged)
+        try:
+            shading.load_table(path)
+        except shading.TableError as error:
+            assert str(path) in str(error)
+            refused += 1
+    # Time stamps, attributes and the second copy of a header field carry no data.
+    assert refused > 0.5 * len(offsets)
+
+
+@pytest.mark.parametrize("key", [*ARRAYS, "metadata"])
+def test_missing_members_are_refused(tmp_path, key):
+    arrays, metadata = contents("ltsh2")
+    path = written(tmp_path / "full.npz", arrays, metadata)
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(tmp_path / "part.npz", "w") as target:
+        for entry in source.namelist():
+            if entry != f"{key}.npy":
+                target.writestr(entry, source.read(entry))
+    assert_refused(tmp_path / "part.npz", key)
+
+
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_other_format_versions_are_refused(tmp_path, version):
+    arrays, metadata = contents("ltc")
+    path = written(tmp_path / "version.npz", arrays, {**metadata, "format_version": version})
+    assert_refused(path, f"format version is {version!r}, expected 1")
+
+
+@pytest.mark.parametrize("metadata", ["not json {", "[1, 2]", "null"])
+def test_broken_metadata_is_refused(tmp_path, metadata):
+    arrays, _ = contents("ltc")
+    np.savez(tmp_path / "broken.npz", **arrays, metadata=np.array(metadata))
+    assert_refused(tmp_path / "broken.npz")
+
+
+@pytest.mark.parametrize("change", [{"family": "ltx"}, {"degree": 12}, {"degree": "4"}, {"degree": None}, {"degree": 3}])
+def test_unknown_families_and_degrees_are_refused(tmp_path, change):
+    arrays, metadata = contents("ltsh4")
+    assert_refused(written(tmp_path / "family.npz", arrays, {**metadata, **change}))
+
+
+@pytest.mark.parametrize("key", ARRAYS)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_nan_and_infinity_are_refused(tmp_path, key, value):
+    arrays, metadata = contents("ltsh2")
+    arrays[key].flat[arrays[key].size // 2] = value
+    assert_refused(written(tmp_path / "nan.npz", arrays, metadata), key, "NaN or infinity")
+
+
+@pytest.mark.parametrize("key", ARRAYS)
+@pytest.mark.parametrize("index", [np.s_[:1], np.s_[..., :-1], np.s_[:0], np.s_[None], np.s_[..., 0]])
+def test_wrong_shapes_are_refused(tmp_path, key, index):
+    arrays, metadata = contents("ltsh2")
+    arrays[key] = arrays[key][index]
+    if key == "fresnel_curves" and index == np.s_[..., :-1]:
+        pytest.skip("any number of cosines is allowed")
+    assert_refused(written(tmp_path / "shape.npz", arrays, metadata))
+
+
+def test_arrays_that_are_no_numbers_are_refused(tmp_path):
+    arrays, metadata = contents("ltsh2")
+    for wrong in (arrays["warp"].astype(str), arrays["warp"].astype(complex)):
+        assert_refused(written(tmp_path / "text.npz", {**arrays, "warp": wrong}, metadata), "warp")
+
+
+def test_a_decreasing_ior_axis_is_refused(tmp_path):
+    arrays, metadata = contents("ltsh2")
+    arrays["fresnel_ior"] = arrays["fresnel_ior"][::-1].copy()
+    assert_refused(written(tmp_path / "ior.npz", arrays, metadata), "fresnel_ior")

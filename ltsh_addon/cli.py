@@ -6,13 +6,14 @@ Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the argu
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import subprocess
 import sys
 from pathlib import Path
 
 from . import __version__
-from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, known_technique, shade_scene
+from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, known_technique, prepare, shade_scene
 from .progress_bar import ProgressBar
 from .scene import Cancelled
 from .shading import PASSES, TableError
@@ -23,6 +24,9 @@ EXAMPLES = """examples:
   %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
 """
 DEMO_RESOLUTION = (480, 270)
+# Blender's own limits: of a side of the picture in pixels, and of frames.
+SMALLEST_SIDE, LARGEST_SIDE = 4, 65536
+LAST_FRAME = 1048574
 
 
 class _Misuse(Exception):
@@ -45,9 +49,9 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
     except KeyboardInterrupt:
         return _fail(program, bar, "interrupted", 130)
     except Exception as error:
-        from .blender.child import SceneError
+        from .blender import child
 
-        if isinstance(error, SceneError):
+        if isinstance(error, child.SceneError | child.Cancelled):
             return _fail(program, bar, error, 1)
         bar.finish()
         logging.getLogger(__name__).exception("unexpected error")
@@ -70,7 +74,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     demo = commands.add_parser("demo", help="build the example scene and run compare on it")
-    _add_common(demo, cycles=True)
+    _add_common(demo, cycles=True, resolution="{}x{}".format(*DEMO_RESOLUTION))
     demo.set_defaults(run=_demo)
     compare = commands.add_parser("compare", help="techniques beside Cycles: EXR layers, sheet, report")
     _add_scene(compare)
@@ -91,14 +95,14 @@ def _add_scene(parser):
     parser.add_argument("scene", nargs="?", metavar="SCENE.blend", help="left out when Blender has a file open")
 
 
-def _add_common(parser, *, cycles):
+def _add_common(parser, *, cycles, resolution="as in the file"):
     parser.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the results")
     names = ",".join(DEFAULT_TECHNIQUES)
     parser.add_argument("--techniques", type=_techniques, default=DEFAULT_TECHNIQUES, help=f"default: {names}")
     parser.add_argument("--passes", type=_passes, default=PASSES, help=f"default: {','.join(PASSES)}")
-    parser.add_argument("--resolution", type=_resolution, metavar="WxH", help="default: as in the file")
+    parser.add_argument("--resolution", type=_resolution, metavar="WxH", help=f"default: {resolution}")
     parser.add_argument("--aa", type=_positive, default=1, metavar="N", help="sub-samples per pixel; 1: pixel centers")
-    parser.add_argument("--frame", type=int, metavar="F", help="default: the file's current frame")
+    parser.add_argument("--frame", type=_frame, metavar="F", help="default: the file's current frame")
     parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
     parser.add_argument(
         "--reference-samples",
@@ -136,9 +140,19 @@ def _passes(text: str) -> tuple[str, ...]:
 
 def _resolution(text: str) -> tuple[int, int]:
     width, separator, height = text.partition("x")
-    if separator and width.isdecimal() and height.isdecimal() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536:
-        return int(width), int(height)
-    raise argparse.ArgumentTypeError(f"resolution is {text!r}, expected WIDTHxHEIGHT such as 960x540")
+    if separator and width.isdecimal() and height.isdecimal():
+        size = int(width), int(height)
+        if SMALLEST_SIDE <= min(size) and max(size) <= LARGEST_SIDE:
+            return size
+    raise argparse.ArgumentTypeError(
+        f"resolution is {text!r}, expected WIDTHxHEIGHT such as 960x540, each from {SMALLEST_SIDE} to {LARGEST_SIDE}"
+    )
+
+
+def _frame(text: str) -> int:
+    if text.removeprefix("-").isdecimal() and abs(int(text)) <= LAST_FRAME:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"frame is {text!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}")
 
 
 def _positive(text: str) -> int:
@@ -182,10 +196,10 @@ def _scene(arguments, open_file) -> Path:
 def _demo(arguments, bar, open_file) -> int:
     from .blender import child
 
-    arguments.output.mkdir(parents=True, exist_ok=True)
     scene = arguments.output / "demo.blend"
-    child.build_demo(scene, progress=bar)
     options = _options(arguments, scene, arguments.output, DEMO_RESOLUTION)
+    prepare(options)
+    child.build_demo(scene, progress=bar)
     return _finish(arguments, bar, compare_scene(options, bar))
 
 
@@ -205,12 +219,19 @@ def _finish(arguments, bar, report) -> int:
 
     bar.finish()
     if arguments.json:
-        print(report_files.json_text(report))
+        # ASCII only: a redirected stdout may have an encoding that lacks the letters of a light's name.
+        print(json.dumps(json.loads(report_files.json_text(report)), indent=2))
         return 0
     for warning in report["warnings"]:
         print(f"warning: {warning}", file=sys.stderr)
-    print(summary(report, arguments.output))
+    _print(summary(report, arguments.output))
     return 0
+
+
+def _print(text: str) -> None:
+    """Print on stdout; letters that its encoding lacks are spelled out."""
+    encoding = sys.stdout.encoding or "ascii"
+    print(text.encode(encoding, "backslashreplace").decode(encoding))
 
 
 def _tables(arguments, bar, open_file) -> int:

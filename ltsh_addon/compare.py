@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from . import __version__, shading
-from .scene import Film, SurfaceSamples
+from .scene import Cancelled, Film, SurfaceSamples
 
 DEFAULT_TECHNIQUES = ("ltc", "ltsh2", "ltsh4", shading.REFERENCE)
 REFERENCE_SEED = 20160725
@@ -42,10 +43,10 @@ class Options:
 
 @dataclass(frozen=True)
 class Result:
-    """One technique on the samples: radiance per pass (G, P, 3); rows outside `subset` are zero."""
+    """One technique on the samples, or on a subset (Q,) of them: radiance per pass (G, Q, 3), time per pass."""
 
     shading: shading.Shading
-    seconds: float
+    seconds: dict[str, float]
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
 
 
@@ -59,15 +60,37 @@ def shade_scene(options: Options, progress: Progress | None = None) -> dict:
 
 def compare_scene(options: Options, progress: Progress | None = None) -> dict:
     """As `shade_scene`, beside Cycles: writes compare.exr, compare.png, report.json and report.html."""
+    if options.cycles_samples < 2:
+        raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
     return _run(options, True, progress)
+
+
+def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
+    """Tables by the names under which techniques appear in results; proves that the output folder takes files.
+
+    Done before anything takes long. Raises TableError, OSError.
+    """
+    tables = {}
+    for given in options.techniques:
+        name = given if given in (*shading.SHIPPED_TABLES, shading.REFERENCE) else _short_name(given, tables)
+        tables[name] = given if given == shading.REFERENCE else shading.load_table(given)
+    _make_writable(Path(options.output))
+    return tables
+
+
+def _short_name(path: str, taken) -> str:
+    """The name of a table's file without folder and dots, which separate the parts of a layer's name."""
+    stem = Path(path).stem.replace(".", "_")
+    candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
+    reserved = {*shading.SHIPPED_TABLES, shading.REFERENCE, "cycles", *taken}
+    return next(name for name in candidates if name not in reserved)
 
 
 def _run(options, with_cycles, progress):
     from .blender import child
 
     start = time.perf_counter()
-    output = _writable_folder(options.output)
-    tables = {name: _technique(name) for name in options.techniques}
+    tables = prepare(options)
     extraction = child.extract(
         child.ExtractOptions(
             scene=options.scene,
@@ -86,13 +109,12 @@ def _run(options, with_cycles, progress):
     comparison = Comparison(options, extraction, results)
     document = comparison.report()
     document["seconds"]["total"] = time.perf_counter() - start
-    comparison.write(output, document, with_cycles, progress)
+    comparison.write(Path(options.output), document, with_cycles, progress)
     return document
 
 
-def _writable_folder(path: Path) -> Path:
-    """Make the output folder and prove that it takes files, before anything takes long."""
-    path = Path(path)
+def _make_writable(path: Path) -> None:
+    """Make the output folder and prove that it takes files."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".ltsh-write-test"
@@ -100,11 +122,6 @@ def _writable_folder(path: Path) -> Path:
         probe.unlink()
     except OSError as error:
         raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
-    return path
-
-
-def _technique(name: str):
-    return name if name == shading.REFERENCE else shading.load_table(name)
 
 
 def _evaluate(name, table, extraction, options, progress) -> Result:
@@ -114,12 +131,27 @@ def _evaluate(name, table, extraction, options, progress) -> Result:
         subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
         samples = samples.take(subset)
 
-    def report(fraction):
-        return None if progress is None else progress(LABELS.get(name, name), fraction)
+    shaded, seconds = {}, {}
+    for index, pass_name in enumerate(options.passes):
 
-    start = time.perf_counter()
-    shaded = shading.shade(samples, extraction.lights, table, passes=options.passes, progress=report)
-    return Result(shaded, time.perf_counter() - start, subset)
+        def report(fraction, done=index):
+            whole = (done + fraction) / len(options.passes)
+            return None if progress is None else progress(LABELS.get(name, name), whole)
+
+        if report(0.0) is False:
+            raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
+        start = time.perf_counter()
+        shaded[pass_name] = shading.shade(samples, extraction.lights, table, passes=(pass_name,), progress=report)
+        seconds[pass_name] = time.perf_counter() - start
+    return Result(_joined(shaded), seconds, subset)
+
+
+def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
+    """One Shading of those of single passes."""
+    first = next(iter(shaded.values()))
+    passes = {name: getattr(part, name) for name, part in shaded.items()}
+    error = shaded["specular"].quadrature_error if "specular" in shaded else None
+    return shading.Shading(first.groups, passes.get("specular"), passes.get("diffuse"), error)
 
 
 def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:

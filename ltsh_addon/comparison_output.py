@@ -91,11 +91,12 @@ class Comparison:
                 for light in extraction.lights
             ],
             "versions": compare.versions(extraction.blender_version),
+            "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
             "passes": {name: self._pass_report(name) for name in options.passes},
             "seconds": {
                 **extraction.seconds,
-                "techniques": {name: result.seconds for name, result in self.results.items()},
+                "techniques": {name: sum(result.seconds.values()) for name, result in self.results.items()},
             },
             "warnings": list(extraction.warnings),
         }
@@ -113,6 +114,13 @@ class Comparison:
             "largest_error_estimate": None if error is None or not len(error) else float(error.max()),
         }
 
+    def _subset_notice(self) -> str:
+        """What to know about the reference where it stands for a part of the samples only, else nothing."""
+        facts = self._reference_facts()
+        if facts is None or facts["samples"] == facts["of"]:
+            return ""
+        return f"reference on {facts['samples']} of {facts['of']} samples, randomly chosen pixels; elsewhere zero"
+
     def _pass_report(self, pass_name: str) -> dict:
         report = {}
         if self.cycles:
@@ -122,8 +130,8 @@ class Comparison:
         return report
 
     def _technique_report(self, name: str, pass_name: str) -> dict:
-        report = {}
         result = self.results[name]
+        report = {"seconds": result.seconds[pass_name]}
         if self.cycles:
             halves = self.cycles[pass_name]
             statistics = imaging.noisy_error_statistics(
@@ -148,7 +156,7 @@ class Comparison:
     # -- files --------------------------------------------------------------------------------------------------------
 
     def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> None:
-        """Write all files into the folder `output`."""
+        """Write all files into the folder `output`, once all that goes into them is there."""
         if progress is not None and progress("write", 0.0) is False:
             raise Cancelled("stopped before the files were written")
         name = "compare" if with_cycles else "shade"
@@ -158,9 +166,12 @@ class Comparison:
             "ltsh:camera": self.extraction.camera,
             "ltsh:version": document["versions"]["ltsh"],
         }
-        imaging.write_layers(output / f"{name}.exr", self.layers(), metadata)
+        if notice := self._subset_notice():
+            metadata["ltsh:reference"] = notice
+        layers, sheet = self.layers(), self.sheet() if with_cycles else None
+        imaging.write_layers(output / f"{name}.exr", layers, metadata)
         if with_cycles:
-            imaging.write_png(output / "compare.png", self.sheet())
+            imaging.write_png(output / "compare.png", sheet)
             imaging.write_json(output / "report.json", document)
             imaging.write_html(output / "report.html", document)
         if progress is not None:
@@ -174,8 +185,8 @@ class Comparison:
             result = self.results[name]
             groups = result.shading.groups
             if len(groups) > 1:
-                for group, values in zip(groups, self._radiance(result, pass_name), strict=True):
-                    layers[f"{name}.{pass_name}@{group or 'ungrouped'}"] = self._image(result, values)
+                for group, values in zip(_group_names(groups), self._radiance(result, pass_name), strict=True):
+                    layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:
                 continue
@@ -194,7 +205,7 @@ class Comparison:
 
     def sheet(self) -> np.ndarray:
         """The comparison sheet (H, W, 3), 8 bit: the specular pass where there is one."""
-        pass_name = self.options.passes[0]
+        pass_name = "specular" if "specular" in self.options.passes else self.options.passes[0]
         halves = self.cycles[pass_name]
         mean = halves.mean(axis=0)
         hit = self.film.coverage() > 0.0
@@ -203,13 +214,15 @@ class Comparison:
         for name, result in self.results.items():
             report = self._technique_report(name, pass_name)
             error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
-            label = compare.LABELS.get(name, Path(name).stem)
-            tiles.append(imaging.Tile(label, self.images[name, pass_name], error, _caption(report, result)))
+            label = compare.LABELS.get(name, name)
+            tiles.append(imaging.Tile(label, self.images[name, pass_name], error, _caption(report)))
         title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
-        notes = (
+        notes = [
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
             f"noise of the Cycles reference {_percent(noise)}",
-        )
+        ]
+        if notice := self._subset_notice():
+            notes.append(notice)
         return imaging.comparison_sheet(title, ("Cycles", mean), tiles, notes=notes)
 
 
@@ -217,11 +230,19 @@ def _percent(value) -> str:
     return "-" if value is None else f"{100.0 * value:.2f} %"
 
 
-def _caption(report: dict, result) -> list[str]:
+def _group_names(groups) -> list[str]:
+    """Names of the light groups for layers; lights without a group get one that no group has."""
+    ungrouped = "ungrouped"
+    while ungrouped in groups:
+        ungrouped += "_"
+    return [group or ungrouped for group in groups]
+
+
+def _caption(report: dict) -> list[str]:
     lines = [f"against Cycles {_percent(report['against_cycles']['unbiased_relative_error'])}"]
     if "against_reference" in report:
         lines.append(f"against reference {_percent(report['against_reference']['relative_l2'])}")
-    lines.append(f"{result.seconds:.2f} s")
+    lines.append(f"{report['seconds']:.2f} s")
     return lines
 
 
@@ -237,10 +258,9 @@ def summary(report: dict, output: Path) -> str:
             cycles = row.get("against_cycles", {}).get("unbiased_relative_error")
             reference = row.get("against_reference", {})
             classes = [_percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
-            seconds = report["seconds"]["techniques"][name]
             lines.append(
-                f"  {Path(name).stem:<12}{_percent(cycles):>12}{_percent(reference.get('relative_l2')):>14}"
-                f"{classes[0]:>10}{classes[1]:>13}{seconds:>8.2f}"
+                f"  {name:<12}{_percent(cycles):>12}{_percent(reference.get('relative_l2')):>14}"
+                f"{classes[0]:>10}{classes[1]:>13}{row['seconds']:>8.2f}"
             )
     lines.append(f"written to {output}")
     return "\n".join(lines)

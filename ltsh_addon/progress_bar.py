@@ -17,6 +17,7 @@ class ProgressBar:
         self._terminal = bool(getattr(stream, "isatty", lambda: False)())
         self._stage = None
         self._stage_start = 0.0
+        self._fraction = 0.0
         self._last_shown = 0.0
         self._line_open = False
 
@@ -26,8 +27,11 @@ class ProgressBar:
             return True
         now = time.monotonic()
         if stage != self._stage:
+            if self._line_open and self._fraction < 1.0:  # many stages end without a last word
+                self._draw(self._stage, 1.0, now)
             self.finish()
             self._stage, self._stage_start, self._last_shown = stage, now, -1e9
+        self._fraction = fraction
         ended = fraction >= 1.0
         if self._terminal:
             if ended or now - self._last_shown > 0.1:

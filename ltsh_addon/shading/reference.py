@@ -93,6 +93,7 @@ class EllipseBoundary:
         height = _dot(normal, self.center) / np.where(normal[2] != 0.0, normal[2], 1.0)
         offset = -self.center + height * np.array([0.0, 0.0, 1.0])[:, None]
         scale = _dot(normal, normal)
+        scale = np.where(scale > 0.0, scale, 1.0)
         u = _dot(np.cross(offset, self.half_v, axis=0), normal) / scale
         v = _dot(np.cross(self.half_u, offset, axis=0), normal) / scale
         inside = (normal[2] != 0.0) & (height > 0.0) & (u * u + v * v <= 1.0)

@@ -1,0 +1,106 @@
+"""A child process that is none: `extract` answers with a small scene made here, so that no test needs Blender."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ltsh_addon import shading
+from ltsh_addon.blender import child
+from ltsh_addon.scene import AreaLight, Film, SurfaceSamples
+
+WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
+# Of both halves of the Cycles image around the true one; the factor of A is 1 + NOISE, of B 1 - NOISE.
+NOISE = 0.03
+WARNING = "material 'Glass': transmission is not shaded"
+
+
+def film() -> Film:
+    """The top row sees nothing, one pixel of the second row is half covered."""
+    pixel = np.repeat(np.arange(WIDTH, WIDTH * HEIGHT), SUB_SAMPLES)
+    return Film(WIDTH, HEIGHT, pixel[1:], SUB_SAMPLES)
+
+
+def samples(count: int, seed: int = 4) -> SurfaceSamples:
+    """Points of the plane z = 0; even ones are metals, odd ones dielectrics."""
+    generator = np.random.default_rng(seed)
+    up = np.tile([0.0, 0.0, 1.0], (count, 1))
+    view = up + generator.uniform(-1.0, 1.0, (count, 3)) * (1.0, 1.0, 0.3)
+    metal = (np.arange(count) % 2 == 0).astype(float)
+    return SurfaceSamples(
+        position=generator.uniform(-1.0, 1.0, (count, 3)) * (1.0, 1.0, 0.0),
+        view=view / np.linalg.norm(view, axis=1, keepdims=True),
+        normal=up,
+        diffuse_normal=up,
+        roughness=generator.uniform(0.2, 0.8, count),
+        specular_f0=generator.uniform(0.5, 0.9, (count, 3)) * metal[:, None],
+        specular_f90=np.tile(metal[:, None], 3),
+        dielectric=1.0 - metal,
+        ior=np.full(count, 1.5),
+        diffuse_albedo=generator.uniform(0.1, 0.9, (count, 3)) * (1.0 - metal)[:, None],
+    )
+
+
+def lights(groups=("Key", "Fill.001", "")) -> tuple[AreaLight, ...]:
+    """One square light over the plane per group."""
+    return tuple(
+        AreaLight(
+            name=f"Light {index}",
+            shape="SQUARE",
+            center=(0.7 * index - 0.7, 0.2 * index, 1.5),
+            half_u=(0.4, 0.0, 0.0),
+            half_v=(0.0, -0.4, 0.0),
+            direction=(0.0, 0.0, -1.0),
+            radiance=(3.0, 2.0 + index, 1.0),
+            group=group,
+        )
+        for index, group in enumerate(groups)
+    )
+
+
+def halves(points, some_lights, some_film) -> dict[str, np.ndarray]:
+    """Both halves of a Cycles image: the quadrature of the true BRDF, made brighter and darker by NOISE."""
+    truth = shading.shade(points, some_lights, shading.REFERENCE, workers=1)
+    reference = {}
+    for name in shading.PASSES:
+        image = some_film.image(getattr(truth, name).sum(axis=0))
+        reference[name] = np.stack([(1.0 + NOISE) * image, (1.0 - NOISE) * image]).astype(np.float32)
+    return reference
+
+
+class FakeChild:
+    """Stands in for `child.extract` and `child.build_demo`; `asked` and `built` tell how they were called."""
+
+    def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None):
+        self.groups, self.empty, self.error = groups, empty, error
+        self.asked: list[child.ExtractOptions] = []
+        self.built: list = []
+
+    def install(self, monkeypatch) -> FakeChild:
+        monkeypatch.setattr(child, "extract", self.extract)
+        monkeypatch.setattr(child, "build_demo", self.build_demo)
+        return self
+
+    def build_demo(self, path, *, progress=None):
+        self.built.append(path)
+        path.write_bytes(b"BLENDER")
+
+    def extract(self, options, *, progress=None):
+        self.asked.append(options)
+        if self.error is not None:
+            raise self.error
+        some_film = Film(WIDTH, HEIGHT, np.zeros(0, dtype=np.int64)) if self.empty else film()
+        points, some_lights = samples(len(some_film.pixel)), lights(self.groups)
+        for stage in ("samples", "Cycles A", "Cycles B"):
+            if progress is not None and progress(stage, 1.0) is False:
+                raise child.Cancelled(f"cancelled at {stage}")
+        return child.Extraction(
+            lights=some_lights,
+            samples=points,
+            film=some_film,
+            warnings=("camera 'Camera' sees no surface that can be shaded",) if self.empty else (WARNING,),
+            reference=halves(points, some_lights, some_film) if options.cycles_samples else None,
+            blender_version="5.2.3",
+            frame=options.frame if options.frame is not None else 7,
+            camera=options.camera or "Camera",
+            seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
+        )

@@ -1,0 +1,143 @@
+"""The shared vocabulary: area lights as polygons, surface samples on disk, film."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from surface_scenes import area_light, random_samples
+
+from ltsh_addon.scene import AREA_LIGHT_SHAPES, AreaLight, Film, SurfaceSamples
+
+shapes = pytest.mark.parametrize("shape", AREA_LIGHT_SHAPES)
+
+
+def vector_area(polygon):
+    return 0.5 * np.cross(polygon, np.roll(polygon, -1, axis=0)).sum(axis=0)
+
+
+def random_axes(seed):
+    """Center and two half axes, not orthogonal."""
+    return np.random.default_rng(seed).normal(size=(3, 3))
+
+
+@shapes
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_polygons_wind_around_the_emitting_side_and_have_the_area_of_the_light(shape, mirrored, seed):
+    center, half_u, half_v = random_axes(seed)
+    normal = np.cross(half_u, half_v) * (-1.0 if mirrored else 1.0)
+    light = area_light("Lamp", shape, center, half_u, half_v, direction=normal / np.linalg.norm(normal))
+    area = vector_area(light.polygon(17))
+    # Counterclockwise as seen from the lit side: the vector area points along the light's direction.
+    expected = (np.pi if light.is_round else 4.0) * normal
+    assert area == pytest.approx(expected, rel=1e-12)
+
+
+@shapes
+def test_corners_lie_in_the_plane_of_the_light_and_around_its_center(shape):
+    center, half_u, half_v = random_axes(5)
+    light = area_light("Lamp", shape, center, half_u, half_v)
+    corners = light.polygon(24)
+    assert corners.shape == ((24, 3) if light.is_round else (4, 3))
+    assert np.abs((corners - center) @ np.cross(half_u, half_v)).max() < 1e-13
+    assert corners.mean(axis=0) == pytest.approx(center, abs=1e-13)
+
+
+def test_round_lights_follow_the_ellipse():
+    light = area_light("Lamp", "ELLIPSE", (0, 0, 0), (2.0, 0, 0), (0, 0.5, 0))
+    x, y, _ = light.polygon(64).T
+    # Stretched to the area of the ellipse: radius^2 = step / sin(step) = 1 + step^2 / 6
+    assert (x / 2.0) ** 2 + (y / 0.5) ** 2 == pytest.approx(1.0 + (2.0 * np.pi / 64) ** 2 / 6.0, rel=1e-5)
+
+
+def test_lights_refuse_what_makes_no_sense():
+    with pytest.raises(ValueError, match="light 'Lamp': shape is 'POINT', expected one of SQUARE, RECTANGLE, DISK, ELLIPSE"):
+        area_light("Lamp", "POINT")
+    for field, value in [("center", (0, 0)), ("half_u", (0, np.nan, 0)), ("radiance", (1, 2, np.inf)), ("direction", 1.0)]:
+        with pytest.raises(ValueError, match=f"light 'Lamp': {field} is .*, expected three finite numbers"):
+            replace(area_light("Lamp"), **{field: value})
+
+
+def test_lights_become_float64_arrays():
+    light = area_light(center=[0, 1, 2])
+    assert isinstance(light, AreaLight) and light.center.dtype == np.float64
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(SurfaceSamples)])
+def test_samples_refuse_wrong_shapes(field):
+    samples = random_samples(5)
+    value = getattr(samples, field)
+    for wrong in (value[..., None], value[:-1] if field != "position" else value[:, :2]):
+        with pytest.raises(ValueError, match="surface samples: .* has shape .*, expected"):
+            replace(samples, **{field: wrong})
+
+
+def test_geometric_normals_default_to_the_normals():
+    samples = random_samples(5)
+    own = {field.name: getattr(samples, field.name) for field in fields(samples) if field.name != "geometric_normal"}
+    assert np.array_equal(SurfaceSamples(**own).geometric_normal, samples.normal)
+
+
+@pytest.mark.parametrize("count", [0, 7])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_samples_are_saved_and_loaded_bit_for_bit(tmp_path, count, dtype):
+    samples = random_samples(7)
+    samples = SurfaceSamples(**{field.name: getattr(samples, field.name).astype(dtype) for field in fields(samples)})
+    samples = samples.take(slice(0, count))
+    path = tmp_path / "samples.npz"
+    samples.save(path)
+    loaded = SurfaceSamples.load(path)
+    assert len(loaded) == count
+    for field in fields(samples):
+        written, read = getattr(samples, field.name), getattr(loaded, field.name)
+        assert written.dtype == read.dtype and written.tobytes() == read.tobytes(), field.name
+
+
+def test_files_without_samples_are_refused(tmp_path):
+    np.savez(tmp_path / "other.npz", position=np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="other.npz: no surface samples, view, normal, .* missing"):
+        SurfaceSamples.load(tmp_path / "other.npz")
+
+
+def test_samples_are_taken_by_index_mask_and_slice():
+    samples = random_samples(6)
+    mask = np.array([True, False, True, False, False, True])
+    for index in (np.array([0, 2, 5]), mask):
+        assert np.array_equal(samples.take(index).roughness, samples.roughness[[0, 2, 5]])
+    assert len(samples.take(slice(1, 4))) == 3
+
+
+def naive_image(film, values):
+    image = np.zeros((film.height, film.width, *values.shape[1:]))
+    for pixel, value in zip(film.pixel, values, strict=True):
+        image[pixel // film.width, pixel % film.width] += value / film.sub_samples
+    return image
+
+
+@pytest.mark.parametrize("channels", [(), (1,), (3,)])
+@pytest.mark.parametrize("sub_samples", [1, 4])
+def test_images_are_means_over_the_sub_samples(channels, sub_samples):
+    generator = np.random.default_rng(1)
+    pixel = np.sort(generator.integers(0, 5 * 4, 30))
+    film = Film(5, 4, pixel, sub_samples)
+    values = generator.normal(size=(30, *channels))
+    image = film.image(values)
+    assert image.shape == (4, 5, *channels)
+    # The order of summation may differ: a few units in the last place of sums of up to 30 terms
+    assert np.abs(image - naive_image(film, values)).max() < 1e-14
+
+
+def test_rows_count_from_the_top_left():
+    film = Film(3, 2, np.array([0, 4]))
+    assert np.array_equal(film.image(np.array([1.0, 2.0])), [[1, 0, 0], [0, 2, 0]])
+
+
+def test_coverage_is_the_share_of_hits():
+    film = Film(2, 1, np.array([0, 0, 0, 1]), sub_samples=4)
+    assert np.array_equal(film.coverage(), [[0.75, 0.25]])
+
+
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_an_image_without_samples_is_black(channels):
+    film = Film(3, 2, np.zeros(0, dtype=np.int64))
+    assert np.array_equal(film.image(np.zeros((0, *channels))), np.zeros((2, 3, *channels)))

@@ -1,0 +1,64 @@
+"""The Fresnel curves of the tables reproduce the reflectance of dielectrics."""
+
+import numpy as np
+import pytest
+
+from ltsh_addon.shading import SHIPPED_TABLES, load_table
+from tables.fresnel_basis import COSINES, TABULATED_IOR, combine, fresnel_basis
+
+
+@pytest.fixture(scope="module")
+def basis():
+    """(curves, weights) with few sweeps: the iteration starts from a singular value decomposition, which is close."""
+    return fresnel_basis(sweeps=30)
+
+
+def reflectance(ior):
+    """Fresnel equations by Snell's law: (I, C) at COSINES."""
+    index, cosine = np.asarray(ior)[:, None], COSINES[None]
+    transmitted = np.sqrt(1.0 - (1.0 - cosine**2) / index**2)
+    s = (cosine - index * transmitted) / (cosine + index * transmitted)
+    p = (index * cosine - transmitted) / (index * cosine + transmitted)
+    return 0.5 * (s**2 + p**2)
+
+
+def relative_error(curves, weights, ior, lowest, highest):
+    chosen = (ior >= lowest) & (ior <= highest)
+    exact = reflectance(ior[chosen])
+    return np.abs(weights[chosen] @ curves / exact - 1.0).max()
+
+
+def test_dielectrics_are_within_one_percent_at_every_angle(basis):
+    assert relative_error(*basis, TABULATED_IOR, 1.1, 3.0) < 0.01
+    assert relative_error(*basis, TABULATED_IOR, 3.0, 4.0) < 0.02
+
+
+@pytest.mark.parametrize("name", SHIPPED_TABLES)
+def test_shipped_tables_are_within_one_percent_at_every_angle(name):
+    table = load_table(name)
+    assert relative_error(table.fresnel_curves, table.fresnel_weights, table.fresnel_ior, 1.1, 3.0) < 0.01
+
+
+def test_all_shipped_tables_have_the_same_curves():
+    first, *others = (load_table(name) for name in SHIPPED_TABLES)
+    for other in others:
+        for field in ("fresnel_curves", "fresnel_ior", "fresnel_weights"):
+            assert np.array_equal(getattr(first, field), getattr(other, field)), field
+
+
+def test_optimized_curves_are_orthonormal(basis):
+    curves = basis[0][2:]
+    assert np.abs(curves @ curves.T - np.eye(len(curves))).max() < 1e-12
+
+
+def test_a_combination_of_the_curves_is_found_again(basis):
+    curves, _ = basis
+    wanted = np.array([[0.3, 0.4, 0.0, 0.0, 0.0], [0.05, 0.95, 0.1, -0.02, 0.01]])
+    # The damping of 1e-12 times the trace moves weights along directions that hardly matter for the reflectance.
+    assert np.abs(combine(curves, wanted @ curves) @ curves - wanted @ curves).max() < 1e-6
+
+
+def test_an_ior_of_one_reflects_nothing(basis):
+    curves, weights = basis
+    assert TABULATED_IOR[0] == 1.0
+    assert np.abs(weights[0] @ curves).max() < 1e-12

@@ -44,7 +44,7 @@ def _psi_coefficients(degree: int) -> np.ndarray:
 
 
 def one_plus_cosine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """1 + cos(theta) of edges between unit vectors (3, ...), accurate up to theta = pi, where 1 + start . end cancels."""
+    """1 + cos(theta) of edges between unit vectors (3, ...); accurate up to theta = pi, where 1 + dot is not."""
     total = start + end
     return 0.5 * (total[0] * total[0] + total[1] * total[1] + total[2] * total[2])
 

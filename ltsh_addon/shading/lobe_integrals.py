@@ -87,7 +87,7 @@ def _tilted_cosine_integral(warped, tilt):
 
 
 def form_factor(polygon: np.ndarray) -> np.ndarray:
-    """Signed Lambertian form factor (P,) of polygons (3, V, P) in z >= 0: the integral of cosine / pi (Lambert 1760)."""
+    """Signed form factor (P,) of polygons (3, V, P) in z >= 0: the integral of cosine / pi (Lambert 1760)."""
     return edge_integrals.clamped_cosine_integral(project_to_sphere(polygon)) / np.pi
 
 

@@ -73,7 +73,7 @@ def test_arc_factors_are_finite_at_the_ends(dtype):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_one_plus_cosine_is_accurate_up_to_half_a_circle(dtype):
-    """Unit vectors short of opposite by `gap`; their rounding moves the gap by about eps, so its square by 2 eps / gap."""
+    """Unit vectors short of opposite by `gap`: rounding moves it by about eps, its square by a share of 2 eps / gap."""
     eps = float(np.finfo(dtype).eps)
     generator = np.random.default_rng(9)
     for gap in (1.0, 1e-2, 1e-4, 1e-5):

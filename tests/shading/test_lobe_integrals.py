@@ -13,7 +13,7 @@ from ltsh_addon.shading.lookup_table import Lobe
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 FAR_RING = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
 
-# At grazing angles and low roughness the warp stretches a polygon up to 1e5 times: 1e5 * eps * a few edges and coefficients
+# At grazing angles and low roughness the warp stretches polygons up to 1e5 times: 1e5 * eps * some edges
 ROUNDING = 1e-9
 table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 

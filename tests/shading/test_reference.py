@@ -15,7 +15,7 @@ GAUSS = np.polynomial.legendre.leggauss(160)
 
 
 def ggx_color(cosine, roughness, light_directions, ior):
-    """Textbook GGX times cosine at unit directions (S, 3) for the Fresnel factors 1, (1 - c)^5 and dielectric: (3, S)."""
+    """Textbook GGX times cosine at unit directions (S, 3) for the Fresnel factors 1, (1 - c)^5, dielectric: (3, S)."""
     view = textbook.view_direction(cosine)
     lobe = textbook.ggx_brdf(view, light_directions, roughness**2) * light_directions[:, 2]
     half = view + light_directions
@@ -57,7 +57,7 @@ def random_lights(seed, count, lowest=0.2):
 
 
 def corners(center, half_u, half_v):
-    return np.array([center - half_u - half_v, center + half_u - half_v, center + half_u + half_v, center - half_u + half_v])
+    return center + np.array([-half_u - half_v, half_u - half_v, half_u + half_v, half_v - half_u])
 
 
 def quadrature(light, round_light, **options):

@@ -226,11 +226,8 @@ def test_extreme_surfaces_give_finite_radiance(technique):
     for roughness in (0.0, 1e-3, 1.0):
         for view in ((0, 0, 1), (1, 0, 1e-9), (0.6, 0, 0.8)):
             for ior in (1.0, 1.5, 10.0):
-                rows.append(
-                    single_sample(
-                        roughness=roughness, view=view, ior=ior, dielectric=1.0, specular_f0=(0, 0, 0), specular_f90=(1, 1, 1)
-                    )
-                )
+                fields = {"specular_f90": (1, 1, 1), "dielectric": 1.0, "ior": ior}
+                rows.append(single_sample(roughness=roughness, view=view, **fields))
     samples = type(rows[0])(
         **{name: np.concatenate([getattr(row, name) for row in rows]) for name in rows[0].__dataclass_fields__}
     )

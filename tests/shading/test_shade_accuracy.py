@@ -23,8 +23,8 @@ def reflecting_samples(count, seed, metal):
     view = 2.0 * (towards * normal).sum(axis=1, keepdims=True) * normal - towards
     share = np.full((count, 3), 1.0 if metal else 0.0)
     fields = {name: getattr(samples, name) for name in samples.__dataclass_fields__}
-    fields.update(normal=normal, diffuse_normal=normal, geometric_normal=normal, view=view, dielectric=1.0 - share[:, 0])
-    fields.update(specular_f0=0.9 * share, specular_f90=share)
+    fields.update(normal=normal, diffuse_normal=normal, geometric_normal=normal, view=view)
+    fields.update(specular_f0=0.9 * share, specular_f90=share, dielectric=1.0 - share[:, 0])
     return SurfaceSamples(**fields)
 
 

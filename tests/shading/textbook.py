@@ -33,7 +33,8 @@ def fresnel_amplitudes(cosine, ior):
 
 def lhuilier(a, b, c):
     """Area of a spherical triangle of unit corners (..., 3), by L'Huilier's theorem; never negative."""
-    sides = [np.arctan2(np.linalg.norm(np.cross(p, q), axis=-1), (p * q).sum(axis=-1)) for p, q in [(b, c), (c, a), (a, b)]]
+    pairs = [(b, c), (c, a), (a, b)]
+    sides = [np.arctan2(np.linalg.norm(np.cross(p, q), axis=-1), (p * q).sum(axis=-1)) for p, q in pairs]
     half = 0.5 * sum(sides)
     product = np.tan(0.5 * half)
     for side in sides:

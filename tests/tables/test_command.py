@@ -16,7 +16,10 @@ ROOT = Path(__file__).resolve().parents[2]
 STATISTICS = validate.TableStatistics(*np.linspace(0.1, 0.8, 8).tolist())
 
 
-@pytest.mark.parametrize("arguments", [[], ["polish"], ["fit", "ltsh9"], ["validate", "ltc", "nonsense"], ["fit", "--size"]])
+WRONG = [[], ["polish"], ["fit", "ltsh9"], ["validate", "ltc", "nonsense"], ["fit", "--size"]]
+
+
+@pytest.mark.parametrize("arguments", WRONG)
 def test_bad_arguments_end_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         command.main(arguments)

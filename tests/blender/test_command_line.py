@@ -1,0 +1,199 @@
+"""The command line with real child processes: small pictures, few samples."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+
+from ltsh_addon import cli, imaging
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = ["--resolution", "32x18", "--cycles-samples", "8"]
+
+
+def saved(path, *, camera=True, light=True, plane=True, sky_only=False):
+    """A scene of one metal plane, one area light and a camera from above, saved as `path`."""
+    scene_parts.empty_scene()
+    if plane:
+        scene_parts.add_plane(scene_parts.principled(Metallic=1.0, Roughness=0.4)[0])
+    if light:
+        scene_parts.add_area_light("Key")
+    if camera:
+        scene_parts.add_top_camera()
+        if sky_only:
+            bpy.context.scene.camera.rotation_euler = (np.pi, 0.0, 0.0)
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+@pytest.fixture
+def room(tmp_path):
+    return saved(tmp_path / "room.blend")
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+@pytest.fixture
+def temporary_root(tmp_path, monkeypatch):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    return folder
+
+
+def run(capsys, *arguments):
+    code = cli.main([str(argument) for argument in arguments])
+    return code, *capsys.readouterr()
+
+
+def left_over(folder):
+    return [path.name for path in folder.iterdir() if path.name.startswith("ltsh-")]
+
+
+def test_compare_as_a_program(room, out, temporary_root):
+    before = room.read_bytes()
+    command = [sys.executable, "-m", "ltsh_addon", "compare", room, "-o", out, *SMALL, "--json", "--quiet"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    report = json.loads(done.stdout)
+    assert report == json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["resolution"] == [32, 18] and report["surface_samples"] == 32 * 18 and report["warnings"] == []
+    assert report["versions"]["blender"] == bpy.app.version_string
+    layers = imaging.read_layers(out / "compare.exr")
+    assert layers["cycles.specular"].any() and np.allclose(layers["samples.roughness"], 0.4)
+    assert sorted(path.name for path in out.iterdir()) == ["compare.exr", "compare.png", "report.html", "report.json"]
+    assert room.read_bytes() == before and left_over(temporary_root) == []
+
+
+def test_shade_gives_the_open_file(capsys, room, out):
+    code = cli.main(["shade", "-o", str(out), "--techniques", "ltsh4", "--resolution", "32x18"], open_file=str(room))
+    stdout, stderr = capsys.readouterr()
+    assert code == 0 and "written to" in stdout and "samples: " in stderr
+    assert [path.name for path in out.iterdir()] == ["shade.exr"]
+
+
+def damaged_scene(folder, kind):
+    """A file that is no usable scene."""
+    path = folder / f"{kind}.blend"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "cut":
+        whole = saved(path).read_bytes()
+        path.write_bytes(whole[: len(whole) // 2])
+    elif kind == "text":
+        path.write_text("not a scene\n" * 100)
+    elif kind == "no camera":
+        saved(path, camera=False)
+    elif kind == "no light":
+        saved(path, light=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "complaint"),
+    [
+        ("missing", "no such file"),
+        ("folder", "cannot be read"),
+        ("cut", "cannot open it"),
+        ("text", "cannot open it"),
+        ("no camera", "no active camera"),
+        ("no light", "no area light"),
+    ],
+)
+def test_a_scene_that_cannot_be_shaded_is_one_line_and_no_file(capsys, tmp_path, out, temporary_root, kind, complaint):
+    code, stdout, stderr = run(capsys, "compare", damaged_scene(tmp_path, kind), "-o", out, *SMALL, "--quiet")
+    assert (code, stdout) == (1, "") and complaint in stderr and len(stderr.splitlines()) == 1
+    assert stderr.startswith("ltsh: ") and list(out.iterdir()) == [] and left_over(temporary_root) == []
+
+
+def test_an_unknown_camera_is_one_line(capsys, room, out):
+    code, _, stderr = run(capsys, "shade", room, "-o", out, "--camera", "Nobody", "--quiet")
+    assert code == 1 and "'Nobody'" in stderr and "'Camera'" in stderr and list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("scene", ["sky_only", "no_surface"])
+def test_a_camera_that_sees_no_surface_is_a_warning(capsys, tmp_path, out, scene):
+    path = saved(tmp_path / "sky.blend", sky_only=scene == "sky_only", plane=scene != "no_surface")
+    code, _, stderr = run(capsys, "compare", path, "-o", out, *SMALL, "--quiet")
+    assert code == 0 and "warning: " in stderr and "sees no surface" in stderr
+    layers = imaging.read_layers(out / "compare.exr")
+    assert not layers["coverage.hit"].any() and not layers["ltsh4.specular"].any()
+
+
+def test_objects_without_material_or_faces_do_no_harm(capsys, tmp_path, out):
+    scene_parts.empty_scene()
+    scene_parts.add_plane()
+    scene_parts.add_mesh("Empty", [], [])
+    scene_parts.add_mesh("Edge", [(0, 0, 1), (1, 0, 1)], [])
+    bare_slot = scene_parts.add_plane(size=1.0, location=(0.0, 0.0, 0.1), name="Slot")
+    bare_slot.data.materials.append(None)
+    scene_parts.add_area_light("Key")
+    scene_parts.add_top_camera()
+    path = tmp_path / "bare.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    code, stdout, _ = run(capsys, "compare", path, "-o", out, *SMALL, "--json", "--quiet")
+    report = json.loads(stdout)
+    assert code == 0 and report["surface_samples"] == 32 * 18
+    for figures in report["passes"].values():
+        assert all(row["against_cycles"]["not_finite"] == 0 for row in figures["techniques"].values())
+    assert report["passes"]["diffuse"]["techniques"]["ltsh4"]["against_cycles"]["unbiased_relative_error"] < 0.1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="SIGINT to one process as in POSIX")
+def test_ctrl_c_is_130_and_leaves_nothing(room, out, temporary_root):
+    command = [sys.executable, "-m", "ltsh_addon", "compare", room, "-o", out, "--resolution", "640x360",
+               "--cycles-samples", "100000"]  # fmt: skip
+    program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    watchdog = threading.Timer(90.0, program.kill)
+    watchdog.start()
+    try:
+        for line in program.stderr:
+            if line.startswith("Cycles A"):
+                break
+        program.send_signal(signal.SIGINT)
+        stdout, stderr = program.communicate()
+    finally:
+        watchdog.cancel()
+        program.kill()
+        program.wait()
+    assert (program.returncode, stdout) == (130, "") and stderr.splitlines()[-1] == "ltsh: interrupted"
+    assert list(out.iterdir()) == [] and left_over(temporary_root) == []
+
+
+def test_the_demo_end_to_end(capsys, out):
+    """`reference` against 16 samples of Cycles only has to lie within their noise; ltsh4 beats ltc without noise."""
+    code, stdout, _ = run(
+        capsys, "demo", "-o", out, "--resolution", "48x27", "--cycles-samples", "16",
+        "--techniques", "ltc,ltsh4,reference", "--json", "--quiet",
+    )  # fmt: skip
+    report = json.loads(stdout)
+    assert code == 0 and report["warnings"] == [] and report["resolution"] == [48, 27]
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["compare.exr", "compare.png", "demo.blend", "report.html", "report.json"]
+    assert {light["shape"] for light in report["lights"]} == {"SQUARE", "RECTANGLE", "DISK", "ELLIPSE"}
+    layers = imaging.read_layers(out / "compare.exr")
+    assert all(np.isfinite(plane).all() for plane in layers.values())
+    assert layers["coverage.hit"].mean() > 0.9
+    for figures in report["passes"].values():
+        for row in figures["techniques"].values():
+            assert row["against_cycles"]["not_finite"] == 0
+    specular = report["passes"]["specular"]["techniques"]
+    ltc, ltsh4 = (specular[name]["against_reference"] for name in ("ltc", "ltsh4"))
+    for part in (lambda row: row, lambda row: row["metals"], lambda row: row["dielectrics"]):
+        assert part(ltsh4)["relative_l2"] < 0.5 * part(ltc)["relative_l2"]
+    noise = report["passes"]["specular"]["noise"]
+    # Half the difference of two halves is the noise of their mean, so a right image is that far from it.
+    assert specular["reference"]["against_cycles"]["relative_l2"] < 1.3 * noise

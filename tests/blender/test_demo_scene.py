@@ -1,0 +1,203 @@
+"""The example scene: built in a child as a user's is, opened here and looked at."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+from ltsh_addon.blender import child, demo_objects, demo_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
+
+
+@pytest.fixture(scope="module")
+def demo_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("demo") / "demo.blend"
+    child.build_demo(path)
+    return path
+
+
+@pytest.fixture
+def demo(demo_file):
+    bpy.ops.wm.open_mainfile(filepath=str(demo_file), load_ui=False, use_scripts=False)
+    return bpy.context.scene
+
+
+def surface_shader(material):
+    """The one shader that feeds the material's surface."""
+    (output,) = (node for node in material.node_tree.nodes if node.type == "OUTPUT_MATERIAL")
+    (link,) = output.inputs["Surface"].links
+    return link.from_node
+
+
+def image_behind(socket):
+    """The image that feeds `socket`, through a normal map where there is one; None without."""
+    if not socket.is_linked:
+        return None
+    node = socket.links[0].from_node
+    if node.type == "NORMAL_MAP":
+        node = node.inputs["Color"].links[0].from_node
+    assert node.type == "TEX_IMAGE"
+    return node.image
+
+
+def pixels(image):
+    values = np.empty(len(image.pixels), dtype=np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], -1)[..., :3]
+
+
+def test_only_the_file_is_left_beside_it(demo_file):
+    assert [path.name for path in demo_file.parent.iterdir()] == ["demo.blend"]
+
+
+def test_four_area_lights_of_the_four_shapes_shine(demo):
+    lights = [ob.data for ob in demo.objects if ob.type == "LIGHT"]
+    assert {light.type for light in lights} == {"AREA"}
+    assert sorted(light.shape for light in lights) == ["DISK", "ELLIPSE", "RECTANGLE", "SQUARE"]
+    assert all(light.energy > 0.0 for light in lights)
+    # Between them they use what the radiance of a light depends on.
+    assert any(light.use_temperature for light in lights) and any(light.exposure != 0.0 for light in lights)
+    assert any(max(light.color) > 2.0 * min(light.color) for light in lights)
+
+
+def test_the_picture_is_480x270_through_a_camera(demo):
+    render = demo.render
+    assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (480, 270, 100)
+    assert demo.camera is not None and demo.camera.type == "CAMERA" and render.engine == "CYCLES"
+
+
+def test_every_material_is_a_single_scatter_ggx_lobe(demo):
+    used = {slot.material for ob in demo.objects for slot in ob.material_slots}
+    assert used and None not in used
+    for material in used:
+        shader = surface_shader(material)
+        assert shader.type in SPECULAR_NODES and shader.distribution == "GGX", material.name
+    assert {surface_shader(material).type for material in used} == SPECULAR_NODES
+
+
+def test_every_mesh_has_faces_and_a_material(demo):
+    meshes = [ob for ob in demo.objects if ob.type == "MESH"]
+    assert len(meshes) > 20
+    assert all(len(ob.data.polygons) > 0 and len(ob.material_slots) == 1 for ob in meshes)
+
+
+@pytest.mark.parametrize("kind", ["metal", "plastic"])
+def test_balls_of_metal_and_plastic_go_from_smooth_to_rough(demo, kind):
+    balls = [ob for ob in demo.objects if ob.name.startswith(f"{kind} ball")]
+    shaders = [surface_shader(ball.material_slots[0].material) for ball in balls]
+    roughness = sorted(shader.inputs["Roughness"].default_value for shader in shaders)
+    assert np.allclose((roughness[0], roughness[-1]), (0.1, 0.8)) and len(roughness) >= 6
+    assert np.diff(roughness).min() > 0.05 and np.diff(roughness).max() < 0.3
+    assert {shader.inputs["Metallic"].default_value for shader in shaders} == {float(kind == "metal")}
+
+
+def test_the_roughness_of_the_floor_varies(demo):
+    floor = demo.objects["floor"]
+    image = image_behind(surface_shader(floor.material_slots[0].material).inputs["Roughness"])
+    values = pixels(image)
+    assert image.colorspace_settings.name == "Non-Color" and floor.data.uv_layers
+    assert 0.1 < values.min() < 0.2 and 0.4 < values.max() < 0.7 and values.std() > 0.05
+    # 8 bits per channel, gray.
+    assert np.ptp(values, axis=2).max() <= 1.0 / 255.0
+
+
+def test_the_wall_is_normal_mapped(demo):
+    wall = demo.objects["back wall"]
+    image = image_behind(surface_shader(wall.material_slots[0].material).inputs["Normal"])
+    normal = 2.0 * pixels(image) - 1.0
+    assert image.colorspace_settings.name == "Non-Color" and wall.data.uv_layers
+    # Half floats or better: 2^-10 near 1.
+    assert np.abs(np.linalg.norm(normal, axis=2) - 1.0).max() < 2e-3
+    assert normal[..., 2].min() > 0.8 and normal[..., :2].std(axis=(0, 1)).min() > 0.1
+    assert np.abs(normal[..., :2].mean(axis=(0, 1))).max() < 1e-3
+
+
+def test_nothing_lies_outside_the_file(demo):
+    images = [image for image in bpy.data.images if image.type == "IMAGE"]
+    assert len(images) >= 4 and all(image.packed_file is not None and image.users > 0 for image in images)
+    assert not bpy.data.libraries and not bpy.data.texts and not bpy.data.sounds and not bpy.data.movieclips
+    # Paths of packed images are not looked up, and none may lead to the machine the file was made on.
+    assert all(str(Path.home()) not in path for path in bpy.utils.blend_paths(absolute=False, packed=True))
+
+
+def test_images_show_what_was_computed(demo):
+    """Row 0 of Blender's images is the bottom row; 8 bits per channel round by at most half a step."""
+    for name, computed in (
+        ("screen", demo_scene.demo_textures.screen_picture()),
+        ("floor roughness", demo_scene.demo_textures.floor_textures()[0][..., None]),
+    ):
+        assert np.abs(pixels(bpy.data.images[name]) - np.clip(computed, 0.0, 1.0)).max() < 0.51 / 255.0
+
+
+def fingerprint_in_fresh_interpreter():
+    """Hash of all arrays of all parts and textures, computed in an interpreter with hash seed of its own."""
+    code = (
+        "import hashlib, sys, types\n"
+        "import numpy as np\n"
+        "from ltsh_addon.blender import demo_objects, demo_textures as t\n"
+        "digest = hashlib.sha256()\n"
+        "for part in demo_objects.everything():\n"
+        "    shape = part.shape\n"
+        "    digest.update(f'{part.name} {part.material} {part.location} {part.bevel}'.encode())\n"
+        "    digest.update(np.ascontiguousarray(shape.vertices).tobytes() + repr(shape.faces()).encode())\n"
+        "    digest.update(np.ascontiguousarray(part.rotation).tobytes())\n"
+        "for image in (*t.floor_textures(), t.quilted_normals(), t.screen_picture(), t.side_art()):\n"
+        "    digest.update(np.ascontiguousarray(image).tobytes())\n"
+        "print(digest.hexdigest())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout.strip()
+
+
+def test_parts_and_textures_are_the_same_in_every_run():
+    assert fingerprint_in_fresh_interpreter() == fingerprint_in_fresh_interpreter() != ""
+
+
+def scene_arrays():
+    """All meshes, matrices, images, lights of the open file as arrays by name."""
+    arrays = {}
+    for mesh in bpy.data.meshes:
+        vertices = np.empty(3 * len(mesh.vertices), dtype=np.float32)
+        mesh.vertices.foreach_get("co", vertices)
+        corners = np.empty(len(mesh.loops), dtype=np.int32)
+        mesh.loops.foreach_get("vertex_index", corners)
+        arrays[f"mesh {mesh.name} vertices"], arrays[f"mesh {mesh.name} corners"] = vertices, corners
+    for ob in bpy.data.objects:
+        arrays[f"object {ob.name}"] = np.array(ob.matrix_world)
+    for image in bpy.data.images:
+        arrays[f"image {image.name}"] = pixels(image)
+    for light in bpy.data.lights:
+        arrays[f"light {light.name}"] = np.array([light.energy, light.size, light.size_y, *light.color])
+    return arrays
+
+
+def test_two_builds_are_equal(demo, tmp_path):
+    first = scene_arrays()
+    demo_scene.build(tmp_path / "again.blend")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "again.blend"), load_ui=False, use_scripts=False)
+    second = scene_arrays()
+    assert first.keys() == second.keys() and len(first) > 100
+    assert not [name for name in first if not np.array_equal(first[name], second[name])]
+
+
+def test_shapes_are_closed_enough_to_shade(demo):
+    """Every vertex is finite, every face has an area: degenerate faces would have no normal."""
+    for part in demo_objects.everything():
+        assert np.isfinite(part.shape.vertices).all(), part.name
+    for mesh in bpy.data.meshes:
+        areas = np.empty(len(mesh.polygons))
+        mesh.polygons.foreach_get("area", areas)
+        assert areas.min() > 1e-9, mesh.name
+
+
+def test_a_build_that_cannot_be_saved_leaves_the_old_file(tmp_path):
+    folder = tmp_path / "demo.blend"
+    folder.mkdir()
+    with pytest.raises((OSError, child.SceneError)):
+        child.build_demo(folder)
+    assert [path.name for path in tmp_path.iterdir()] == ["demo.blend"]

@@ -1,0 +1,305 @@
+"""The command line without Blender: arguments, exit codes, what goes to stdout and stderr, what is left in OUT."""
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import fake_scene
+import numpy as np
+import pytest
+
+from ltsh_addon import __version__, cli, shading
+from ltsh_addon.blender.child import Cancelled, SceneError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def child(monkeypatch):
+    return fake_scene.FakeChild().install(monkeypatch)
+
+
+@pytest.fixture
+def room(tmp_path):
+    path = tmp_path / "room.blend"
+    path.write_bytes(b"BLENDER")
+    return str(path)
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+def run(capsys, *arguments, **options):
+    """Exit code, stdout, stderr."""
+    code = cli.main([str(argument) for argument in arguments], **options)
+    return code, *capsys.readouterr()
+
+
+def assert_misuse(result, complaint):
+    """Code 2, usage and one line that holds `complaint` on stderr, nothing on stdout."""
+    code, stdout, stderr = result
+    assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1]
+    assert stderr.splitlines()[-1].startswith("ltsh") and "Traceback" not in stderr
+
+
+def assert_failure(result, complaint):
+    """Code 1 and, quiet, one line alone."""
+    code, stdout, stderr = result
+    assert (code, stdout) == (1, "") and len(stderr.splitlines()) == 1
+    assert stderr.startswith("ltsh: ") and complaint in stderr
+
+
+@pytest.mark.parametrize("command", ["compare", "shade"])
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--techniques", "ltsh9"], "'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4, reference"),
+        (["--techniques", ""], "is unknown"),
+        (["--techniques", "ltc,ltsh2.exr"], "'ltsh2.exr' is unknown"),
+        (["--passes", "glossy"], "passes are 'glossy', expected some of specular, diffuse"),
+        (["--passes", ","], "expected some of"),
+        *((["--resolution", text], f"resolution is {text!r}, expected WIDTHxHEIGHT")
+          for text in ("480", "0x270", "480x", "x", "8x-8", "4.5x4", "480x270x1", "3x3", "65537x8", "480X270")),
+        (["--aa", "0"], "'0' was given, expected a whole number above 0"),
+        (["--aa", "-1"], "expected"),
+        (["--aa", "two"], "'two' was given"),
+        (["--frame", "1.5"], "frame is '1.5', expected a whole number"),
+        (["--frame", "1048575"], "frame is '1048575'"),
+        (["--reference-samples", "0"], "'0' was given"),
+        (["--no-such-option"], "--no-such-option"),
+    ],
+)  # fmt: skip
+def test_wrong_values_are_misuse(capsys, child, room, out, command, arguments, complaint):
+    assert_misuse(run(capsys, command, room, "-o", out, *arguments), complaint)
+    assert child.asked == [] and not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([], "COMMAND"),
+        (["render"], "'render'"),
+        (["compare", "room.blend"], "-o"),
+        (["compare", "-o", "out"], "SCENE.blend is missing"),
+        (["shade", "-o", "out"], "SCENE.blend is missing"),
+        (["demo"], "-o"),
+        (["demo", "room.blend", "-o", "out"], "room.blend"),
+        (["compare", "room.blend", "-o", "out", "--cycles-samples", "1"], "expected at least 2"),
+        (["compare", "room.blend", "-o", "out", "--cycles-samples", "0"], "'0' was given"),
+        (["shade", "room.blend", "-o", "out", "--cycles-samples", "8"], "--cycles-samples"),
+        (["tables"], "action"),
+        (["tables", "burn"], "'burn'"),
+    ],
+)
+def test_wrong_calls_are_misuse(capsys, child, tmp_path, monkeypatch, arguments, complaint):
+    monkeypatch.chdir(tmp_path)
+    assert_misuse(run(capsys, *arguments), complaint)
+    assert child.asked == [] and list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["compare", "shade"])
+def test_a_scene_beside_an_open_file_is_misuse(capsys, child, room, out, command):
+    result = run(capsys, command, room, "-o", out, open_file="/scenes/open.blend")
+    assert_misuse(result, "'/scenes/open.blend' open already")
+    assert child.asked == [] and not out.exists()
+
+
+def test_the_open_file_is_the_scene(capsys, child, out):
+    assert run(capsys, "shade", "-o", out, "--quiet", open_file="/scenes/open.blend")[0] == 0
+    assert child.asked[0].scene == Path("/scenes/open.blend")
+
+
+def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
+    """Blender's bpy.data.filepath is "" before a file is saved or opened."""
+    assert_misuse(run(capsys, "shade", "-o", out, open_file=""), "SCENE.blend is missing")
+
+
+def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(cli, "__file__", str(tmp_path / "site" / "ltsh_addon" / "cli.py"))
+    assert_misuse(run(capsys, "tables", "fit"), "need the source checkout")
+
+
+def test_options_reach_the_scene(capsys, child, room, out):
+    arguments = ["--techniques", "ltsh4,ltc,ltsh4", "--passes", "diffuse", "--resolution", "640x360", "--aa", "4",
+                 "--frame", "-12", "--camera", "Side", "--cycles-samples", "32", "--json"]  # fmt: skip
+    code, stdout, _ = run(capsys, "compare", room, "-o", out, *arguments)
+    asked, report = child.asked[0], json.loads(stdout)
+    assert code == 0 and asked.scene == Path(room)
+    assert (asked.width, asked.height, asked.sub_samples, asked.frame) == (640, 360, 4, -12)
+    assert (asked.camera, asked.cycles_samples) == ("Side", 32)
+    assert list(report["passes"]) == ["diffuse"] and list(report["tables"]) == ["ltsh4", "ltc"]
+
+
+def test_left_out_options_mean_as_in_the_file(capsys, child, room, out):
+    assert run(capsys, "shade", room, "-o", out)[0] == 0
+    asked = child.asked[0]
+    assert (asked.width, asked.height, asked.sub_samples, asked.frame, asked.camera) == (None, None, 1, None, None)
+
+
+def test_the_demo_is_built_and_compared(capsys, child, out):
+    code, stdout, _ = run(capsys, "demo", "-o", out, "--techniques", "ltc,reference", "--cycles-samples", "10")
+    assert code == 0 and "written to" in stdout
+    assert child.built == [out / "demo.blend"] and child.asked[0].scene == out / "demo.blend"
+    assert (child.asked[0].width, child.asked[0].height, child.asked[0].cycles_samples) == (480, 270, 10)
+    names = {path.name for path in out.iterdir()}
+    assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html"}
+
+
+def test_json_is_one_document_on_stdout_and_the_same_as_the_file(capsys, child, room, out):
+    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--json")
+    assert code == 0 and json.loads(stdout) == json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert "samples: 100 %" in stderr
+
+
+def test_what_stands_on_stdout_does_not_hang_on_its_encoding(monkeypatch, room, out):
+    fake_scene.FakeChild(groups=("Schlüssel", "鍵")).install(monkeypatch)
+    for arguments in ([], ["--json"]):
+        stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
+        monkeypatch.setattr(sys, "stdout", stdout)
+        folder = out / "Bücher"
+        assert cli.main(["compare", room, "-o", str(folder), "--techniques", "ltc", "--quiet", *arguments]) == 0
+        text = stdout.buffer.getvalue().decode("ascii")
+        assert "B\\xfccher" in text or json.loads(text)["lights"][1]["group"] == "鍵"
+
+
+def test_without_json_a_table_of_errors_is_printed_and_warnings_go_to_stderr(capsys, child, room, out):
+    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
+    assert code == 0 and stderr == f"warning: {fake_scene.WARNING}\n"
+    rows = [line.split()[0] for line in stdout.splitlines()]
+    table = ["technique", "ltc", "ltsh2", "ltsh4", "reference"]
+    assert rows == ["specular,", *table, "diffuse,", *table, "written"]
+
+
+def test_quiet_keeps_stderr_empty(capsys, child, room, out):
+    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet", "--json")
+    assert code == 0 and stderr == "" and json.loads(stdout)["warnings"] == [fake_scene.WARNING]
+
+
+def test_a_camera_that_sees_nothing_is_a_warning(capsys, monkeypatch, room, out):
+    fake_scene.FakeChild(empty=True).install(monkeypatch)
+    code, _, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
+    assert code == 0 and stderr.startswith("warning: ") and "sees no surface" in stderr
+
+
+@pytest.mark.parametrize("command", ["compare", "shade", "demo"])
+def test_an_output_folder_that_is_a_file_fails_before_anything_runs(capsys, child, room, tmp_path, command):
+    blocker = tmp_path / "blocker"
+    blocker.write_text("mine")
+    scene = [] if command == "demo" else [room]
+    for folder in (blocker, blocker / "below"):
+        assert_failure(run(capsys, command, *scene, "-o", folder, "--quiet"), "cannot be written")
+    assert child.asked == child.built == [] and blocker.read_text() == "mine"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permissions of folders as in POSIX")
+def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path, monkeypatch):
+    """The system's refusal is imitated: root, who may run the tests, is refused nothing."""
+
+    def refuse(self, *arguments):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    assert_failure(run(capsys, "shade", room, "-o", tmp_path, "--quiet"), "Permission denied")
+    assert child.asked == []
+
+
+def _empty(path):
+    path.write_bytes(b"")
+
+
+def _cut(path):
+    whole = (ROOT / "tables" / "ltsh2.npz").read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+
+
+def _flipped(path):
+    data = bytearray((ROOT / "tables" / "ltsh2.npz").read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+
+
+def _other_arrays(path):
+    np.savez(path, position=np.zeros(3))
+
+
+@pytest.mark.parametrize("command", ["compare", "shade", "demo"])
+@pytest.mark.parametrize("damage", [None, _empty, _cut, _flipped, _other_arrays, Path.mkdir])
+def test_a_broken_table_fails_before_anything_runs(capsys, child, room, out, tmp_path, command, damage):
+    path = tmp_path / "broken.npz"
+    if damage is not None:
+        damage(path)
+    scene = [] if command == "demo" else [room]
+    result = run(capsys, command, *scene, "-o", out, "--quiet", "--techniques", f"ltc,{path}")
+    assert_failure(result, f"lookup table {path}")
+    assert child.asked == child.built == [] and not out.exists()
+
+
+@pytest.mark.parametrize(
+    "error", [SceneError("room.blend: no active camera"), OSError("disk\nis full"), Cancelled("x is full")]
+)
+def test_what_is_wrong_with_the_world_is_one_line(capsys, monkeypatch, room, out, error):
+    fake_scene.FakeChild(error=error).install(monkeypatch)
+    assert_failure(run(capsys, "compare", room, "-o", out, "--quiet"), " ".join(str(error).split()))
+    assert list(out.iterdir()) == []
+
+
+def test_interrupting_is_130(capsys, monkeypatch, room, out):
+    fake_scene.FakeChild(error=KeyboardInterrupt()).install(monkeypatch)
+    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
+    assert (code, stdout, stderr) == (130, "", "ltsh: interrupted\n") and list(out.iterdir()) == []
+
+
+def test_a_defect_of_ours_shows_its_traceback(capsys, monkeypatch, room, out, caplog):
+    fake_scene.FakeChild(error=RuntimeError("this cannot be")).install(monkeypatch)
+    assert run(capsys, "compare", room, "-o", out, "--quiet")[0] == 1
+    assert "this cannot be" in caplog.text and "Traceback" in caplog.text
+
+
+def test_memory_that_runs_out_has_a_line(capsys, monkeypatch, room, out):
+    fake_scene.FakeChild(error=MemoryError()).install(monkeypatch)
+    assert_failure(run(capsys, "compare", room, "-o", out, "--quiet"), "MemoryError")
+
+
+def test_the_program_is_named_as_it_was_called(capsys, out):
+    stderr = run(capsys, "shade", "-o", out, program="blender --command ltsh")[2]
+    assert stderr.startswith("blender --command ltsh: ")
+
+
+def test_version(capsys):
+    code, stdout, _ = run(capsys, "--version")
+    assert (code, stdout) == (0, f"ltsh {__version__}\n")
+
+
+@pytest.mark.parametrize("command", ["demo", "compare", "shade"])
+def test_help_names_every_option_and_default(capsys, command):
+    code, stdout, stderr = run(capsys, command, "--help")
+    assert (code, stderr) == (0, "")
+    options = ["-o", "--techniques", "--passes", "--resolution", "--aa", "--frame", "--camera", "--json", "--quiet"]
+    options += [] if command == "shade" else ["--cycles-samples"]
+    assert not [option for option in options if option not in stdout]
+    assert "ltc,ltsh2,ltsh4,reference" in stdout and ("480x270" in stdout) == (command == "demo")
+
+
+def test_the_main_help_names_the_commands_and_examples(capsys):
+    code, stdout, _ = run(capsys, "--help", program="blender --command ltsh")
+    assert code == 0 and all(f"\n    {command} " in stdout for command in ("demo", "compare", "shade", "tables"))
+    assert "blender --command ltsh demo -o out/demo" in stdout
+
+
+def test_help_in_a_fresh_interpreter_loads_neither_blender_nor_scipy():
+    code = (
+        "import sys\nfrom ltsh_addon import cli\nassert cli.main(['compare', '--help']) == 0\n"
+        "print('loaded', sorted({'bpy', 'scipy', 'OpenEXR'} & set(sys.modules)))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.splitlines()[-1] == "loaded []" and done.stderr == ""
+
+
+def test_every_shipped_table_is_a_technique():
+    assert cli._techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES

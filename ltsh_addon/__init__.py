@@ -18,9 +18,10 @@ __version__ = "0.1.0"
 
 def register():
     """Add LTSH to the running Blender."""
+    from . import cli
     from .blender import registration
 
-    registration.register()
+    registration.register(cli.main)
 
 
 def unregister():

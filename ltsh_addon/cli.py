@@ -60,7 +60,7 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
 
 def _fail(program, bar, error, code) -> int:
     bar.finish()
-    print(f"{program}: {' '.join(str(error).split()) or type(error).__name__}", file=sys.stderr)
+    _print(f"{program}: {' '.join(str(error).split()) or type(error).__name__}", sys.stderr)
     return code
 
 
@@ -220,18 +220,19 @@ def _finish(arguments, bar, report) -> int:
     bar.finish()
     if arguments.json:
         # ASCII only: a redirected stdout may have an encoding that lacks the letters of a light's name.
-        print(json.dumps(json.loads(report_files.json_text(report)), indent=2))
+        _print(json.dumps(json.loads(report_files.json_text(report)), indent=2), sys.stdout)
         return 0
     for warning in report["warnings"]:
-        print(f"warning: {warning}", file=sys.stderr)
-    _print(summary(report, arguments.output))
+        _print(f"warning: {warning}", sys.stderr)
+    _print(summary(report, arguments.output), sys.stdout)
     return 0
 
 
-def _print(text: str) -> None:
-    """Print on stdout; letters that its encoding lacks are spelled out."""
-    encoding = sys.stdout.encoding or "ascii"
-    print(text.encode(encoding, "backslashreplace").decode(encoding))
+def _print(text: str, stream) -> None:
+    """Print to `stream`, which is None when it was closed; letters that its encoding lacks are spelled out."""
+    if stream is not None:
+        encoding = stream.encoding or "ascii"
+        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
 
 
 def _tables(arguments, bar, open_file) -> int:

@@ -13,7 +13,7 @@ class ProgressBar:
 
     def __init__(self, stream, *, quiet: bool = False):
         self._stream = stream
-        self._quiet = quiet
+        self._quiet = quiet or stream is None  # print would take None for stdout
         self._terminal = bool(getattr(stream, "isatty", lambda: False)())
         self._stage = None
         self._stage_start = 0.0

@@ -43,7 +43,8 @@ def _fit(name: str) -> None:
 
     arrays, errors = fit.fit(fit.FAMILIES[name], progress=show)
     fit.write_table(FOLDER / f"{name}.npz", fit.FAMILIES[name], arrays, errors)
-    print(f"\r{name}: fitted in {time.perf_counter() - start:.0f} s, node error mean {errors.mean():.4f}", file=sys.stderr)
+    seconds = time.perf_counter() - start
+    print(f"\r{name}: fitted in {seconds:.0f} s, node error mean {errors.mean():.4f}", file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -2,10 +2,11 @@
 
 For every node (roughness, theta_o) the warp minimizes the L2 error of the cosine-weighted BRDF over the upper
 hemisphere, with the tail of the lobe weighted up: a light is often seen in the tail alone, and a plain L2 norm would
-trade a tail that is 20 % too dark for a little at the peak. The coefficients are the linear least-squares solution for that warp (variable projection, Golub and
-Pereyra 1973) under the constraint that the directional albedo is exact. The nodes are visited along anti-diagonals,
-from rough to smooth and from normal to grazing incidence: each starts from what its neighbors predict, and a small
-penalty on the distance to the prediction keeps the table smooth, because a lookup interpolates it.
+trade a tail that is 20 % too dark for a little at the peak. The coefficients are the linear least-squares solution for
+that warp (variable projection, Golub and Pereyra 1973) under the constraint that the directional albedo is exact. The
+nodes are visited along anti-diagonals, from rough to smooth and from normal to grazing incidence: each starts from what
+its neighbors predict, and a small penalty on the distance to the prediction keeps the table smooth, because a lookup
+interpolates it. At roughness 0 the warp is the limit of GGX, which is known: nothing is searched for.
 
 Parameters of a node: log(a cos^2(beta) / (2 alpha)), log(c / (2 alpha)), beta, tilt, for
 M = [[a, 0, tan(beta)], [0, c, 0], [0, 0, 1]]: all of them tend to simple limits as alpha -> 0.
@@ -37,7 +38,8 @@ MAX_BETA = 1.5705
 # Where the lobe is cut by the horizon on the scale of alpha, free parameters would run away for no gain.
 LOWEST = np.array([-2.0, -2.5, -MAX_BETA, -1.5])
 HIGHEST = np.array([6.0, 2.0, 0.5, 1.5])
-GRAZING_COSINE = 1e-3
+# Beyond 89.4 degrees smooth lobes are cut by the horizon on the scale of alpha; their fits would hide needles.
+GRAZING_COSINE = 0.01
 
 
 @dataclass(frozen=True)
@@ -195,6 +197,16 @@ def _predict(parameters, i, j, last):
     return parameters[i + 1, j] + parameters[i, j - 1] - parameters[i + 1, j - 1]
 
 
+def _limit_parameters(family, cosine, alpha):
+    """Parameters (P, n) of A = B = C = 1 without tilt: what GGX tends to as alpha -> 0."""
+    regularized = np.sqrt(cosine**2 + WARP_REGULARIZATION**2 * alpha**2)
+    sine = np.sqrt(1.0 - cosine**2)
+    parameters = np.zeros((len(alpha), family.parameters))
+    parameters[:, 0] = -np.log(regularized**2 + sine**2)
+    parameters[:, 2] = -np.arctan2(sine, regularized)
+    return parameters
+
+
 def fit(family: Family, size: int = 64, progress=None):
     """Fit one table of size x size nodes; returns the arrays and the node errors (size, size).
 
@@ -218,7 +230,10 @@ def fit(family: Family, size: int = 64, progress=None):
         symmetric = (j == 0)[:, None]
         frozen = symmetric & (np.arange(family.parameters) >= 2)
         prediction[frozen] = 0.0
+        prediction = np.clip(prediction, LOWEST[: family.parameters], HIGHEST[: family.parameters])
         solution = _minimize(family, nodes, prediction, frozen)
+        limit = _limit_parameters(family, cosine[j], roughness[i] ** 2)
+        solution = np.where((i == 0)[:, None], limit, solution)
         isotropic = solution.copy()
         isotropic[:, :2] = solution[:, :2].mean(axis=1, keepdims=True)
         parameters[i, j] = np.where(symmetric, isotropic, solution)

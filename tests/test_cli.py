@@ -41,6 +41,12 @@ def run(capsys, *arguments, **options):
     return code, *capsys.readouterr()
 
 
+def run_python(code):
+    """Run `code` in an interpreter of its own."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+
+
 def assert_misuse(result, complaint):
     """Code 2, usage and one line that holds `complaint` on stderr, nothing on stdout."""
     code, stdout, stderr = result
@@ -166,6 +172,23 @@ def test_what_stands_on_stdout_does_not_hang_on_its_encoding(monkeypatch, room, 
         assert cli.main(["compare", room, "-o", str(folder), "--techniques", "ltc", "--quiet", *arguments]) == 0
         text = stdout.buffer.getvalue().decode("ascii")
         assert "B\\xfccher" in text or json.loads(text)["lights"][1]["group"] == "鍵"
+
+
+def test_closed_streams_do_no_harm(capsys, monkeypatch, child, room, out):
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", None)
+        code, stdout, _ = run(capsys, "compare", room, "-o", out, "--json")
+        assert code == 0 and json.loads(stdout)
+        assert run(capsys, "compare", room, "-o", out)[0] == 0
+        patch.setattr(sys, "stdout", None)
+        assert run(capsys, "compare", room, "-o", out)[0] == 0
+
+
+def test_an_error_below_the_noise_is_not_shown_as_zero(capsys, child, room, out):
+    """The halves lie symmetrically around the quadrature, so its squared error is negative."""
+    stdout = run(capsys, "compare", room, "-o", out, "--quiet")[1]
+    rows = [line for line in stdout.splitlines() if line.split()[0] == "reference"]
+    assert len(rows) == 2 and all("in noise" in row and "0.00 %" not in row for row in rows)
 
 
 def test_without_json_a_table_of_errors_is_printed_and_warnings_go_to_stderr(capsys, child, room, out):
@@ -297,8 +320,21 @@ def test_help_in_a_fresh_interpreter_loads_neither_blender_nor_scipy():
         "import sys\nfrom ltsh_addon import cli\nassert cli.main(['compare', '--help']) == 0\n"
         "print('loaded', sorted({'bpy', 'scipy', 'OpenEXR'} & set(sys.modules)))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.splitlines()[-1] == "loaded []" and done.stderr == ""
+    done = run_python(code)
+    assert done.stdout.splitlines()[-1] == "loaded []" and (done.returncode, done.stderr) == (0, "")
+
+
+def test_without_bpy_a_line_says_what_to_install(room, out):
+    code = f"""
+import importlib.util as util, sys
+find = util.find_spec
+util.find_spec = lambda name, *rest: None if name == "bpy" else find(name, *rest)
+from ltsh_addon import cli
+sys.exit(cli.main(["compare", {room!r}, "-o", {str(out)!r}, "--quiet"]))
+"""
+    done = run_python(code)
+    assert (done.returncode, done.stdout) == (1, "") and len(done.stderr.splitlines()) == 1
+    assert "no module bpy" in done.stderr and "pip install" in done.stderr and list(out.iterdir()) == []
 
 
 def test_every_shipped_table_is_a_technique():

@@ -130,6 +130,12 @@ def test_quiet_writes_nothing(terminal):
     assert stream.getvalue() == ""
 
 
+def test_a_closed_stream_is_quiet(capsys):
+    """sys.stderr is None in a program started without one, and print would write to stdout instead."""
+    ProgressBar(None)("samples", 1.0)
+    assert capsys.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize("terminal", [True, False])
 def test_the_bar_never_stops_the_work(clock, terminal):
     bar = ProgressBar(Stream(terminal))

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import bpy
 
 _handles = []
 
 
-def _run_command(arguments: list[str]) -> int:
-    from .. import cli
+def register(command_line: Callable[..., int]) -> None:
+    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
 
-    return cli.main(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
+    def run(arguments: list[str]) -> int:
+        return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
-
-def register() -> None:
-    """Add everything; `unregister` removes it."""
-    _handles.append(bpy.utils.register_cli_command("ltsh", _run_command))
+    _handles.append(bpy.utils.register_cli_command("ltsh", run))
 
 
 def unregister() -> None:

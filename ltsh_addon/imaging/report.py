@@ -51,10 +51,16 @@ def _plain(value):
 
 def write_html(path: str | os.PathLike, report: Mapping) -> None:
     """Write the page of a comparison's `report`, beside compare.png and compare.exr; complete or not at all."""
-    facts = (
-        f"camera {report['camera']}, frame {report['frame']}, "
-        f"{report['resolution'][0]} x {report['resolution'][1]} pixels, {report['sub_samples']} sub-samples, {report['cycles_samples']} Cycles samples; "
-        + ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    width, height = report["resolution"]
+    facts = ", ".join(
+        (
+            f"camera {report['camera']}",
+            f"frame {report['frame']}",
+            f"{width} x {height} pixels",
+            f"{report['sub_samples']} sub-samples",
+            f"{report['cycles_samples']} Cycles samples",
+            *(f"{name} {version}" for name, version in report["versions"].items()),
+        )
     )
     body = [
         f"<h1>{_text(report['scene'])}</h1>",

@@ -18,7 +18,7 @@ from math import comb
 import numpy as np
 
 from . import spherical_harmonics
-from .polygon import solid_angle
+from .polygon import edge_sums, one_plus_cosine, solid_angle
 
 RIDGE_DIRECTIONS = np.array([[1, 0], [0, 1], [1, 1], [1, -1], [1, 2], [2, 1], [1, -2], [2, -1], [1, 3]], dtype=float)
 MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
@@ -43,12 +43,6 @@ def _psi_coefficients(degree: int) -> np.ndarray:
     return chebyshev.convert(kind=np.polynomial.Polynomial).coef[::-1].copy()
 
 
-def one_plus_cosine(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """1 + cos(theta) of edges between unit vectors (3, ...); accurate up to theta = pi, where 1 + dot is not."""
-    total = start + end
-    return 0.5 * (total[0] * total[0] + total[1] * total[1] + total[2] * total[2])
-
-
 def arc_factors(one_plus_cosine: np.ndarray):
     """(phi, psi, q) of edges of length theta: theta / sin(theta), (phi - 1) / (1 - cos theta), 1 / (1 + cos theta).
 
@@ -68,9 +62,9 @@ def arc_factors(one_plus_cosine: np.ndarray):
 
 def clamped_cosine_integral(unit: np.ndarray) -> np.ndarray:
     """Signed integral (P,) of max(0, z) over spherical polygons (3, V, P) in z >= 0 (Lambert 1760; sign as there)."""
-    following = np.roll(unit, -1, axis=1)
-    phi, _, _ = arc_factors(one_plus_cosine(unit, following))
-    return 0.5 * ((unit[0] * following[1] - unit[1] * following[0]) * phi).sum(axis=0)
+    total = edge_sums(unit)
+    phi, _, _ = arc_factors(one_plus_cosine(total))
+    return 0.5 * ((unit[0] * total[1] - unit[1] * total[0]) * phi).sum(axis=0)
 
 
 def moments(unit: np.ndarray, degree: int) -> np.ndarray:
@@ -78,36 +72,35 @@ def moments(unit: np.ndarray, degree: int) -> np.ndarray:
 
     Order: solid angle; then for k = 0 .. degree - 1 the sums of (u.X) K_k over the first k + 2 `RIDGE_DIRECTIONS`.
     """
-    following = np.roll(unit, -1, axis=1)
-    phi, psi, q = arc_factors(one_plus_cosine(unit, following))
-    normal_x = unit[1] * following[2] - unit[2] * following[1]
-    normal_z = unit[0] * following[1] - unit[1] * following[0]
+    total = edge_sums(unit)
+    phi, psi, q = arc_factors(one_plus_cosine(total))
+    normal_x = unit[1] * total[2] - unit[2] * total[1]
+    normal_z = unit[0] * total[1] - unit[1] * total[0]
     result = np.empty((spherical_harmonics.coefficient_count(degree), unit.shape[2]), dtype=unit.dtype)
     result[0] = solid_angle(unit)
     for j, (u_x, u_z) in enumerate(RIDGE_DIRECTIONS[: degree + 1]):
-        start, end = u_x * unit[0] + u_z * unit[2], u_x * following[0] + u_z * following[2]
+        start, both = u_x * unit[0] + u_z * unit[2], u_x * total[0] + u_z * total[2]
         normal = u_x * normal_x + u_z * normal_z
         for k in range(max(j - 1, 0), degree):
             row = 1 + k * (k + 3) // 2 + j
-            result[row] = (normal * _arc_power(k, start, end, phi, psi, q)).sum(axis=0)
+            result[row] = (normal * _arc_power(k, start, both, phi, psi, q)).sum(axis=0)
     return result
 
 
-def _arc_power(k, start, end, phi, psi, q):
-    """K_k of edges on which u.w runs from `start` to `end`."""
+def _arc_power(k, start, total, phi, psi, q):
+    """K_k of edges on which u.w runs from `start` to `total - start`."""
     if k == 0:
         return phi
-    total = start + end
     if k == 1:
         return q * total
-    product = start * end
+    product = start * (total - start)
     if k == 2:
         return 0.5 * q * (1.0 + psi) * total * total - psi * product
     if k == 3:
         return q * total * ((q + 1.0) / 3.0 * total * total - product)
     # Along the edge u.w is a sinusoid, so K_k is a trigonometric polynomial: Gauss-Legendre is exact to rounding.
     theta = 2.0 * np.arctan2(np.sqrt(np.maximum(1.0 - 0.5 / q, 0.0)), np.sqrt(0.5 / q))
-    middle, half_difference = 0.5 * total, 0.5 * (end - start)
+    middle, half_difference = 0.5 * total, 0.5 * total - start
     cos_half, sin_half = np.cos(0.5 * theta), np.sin(0.5 * theta)
     across = np.where(sin_half > 0.0, half_difference / np.where(sin_half > 0.0, sin_half, 1.0), 0.0)
     result = np.zeros_like(phi)

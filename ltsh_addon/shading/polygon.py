@@ -59,15 +59,29 @@ def project_to_sphere(vertices: np.ndarray) -> np.ndarray:
     return vertices / np.sqrt(np.maximum(squared, tiny))
 
 
+def edge_sums(unit: np.ndarray) -> np.ndarray:
+    """Sums (3, V, P) of the two ends of every edge of spherical polygons (3, V, P).
+
+    What an edge contributes is computed from its start and this sum, which is exact where the ends are nearly opposite:
+    a x b = a x (a + b) and 1 + a . b = |a + b|^2 / 2 keep their digits there.
+    """
+    return unit + np.roll(unit, -1, axis=1)
+
+
+def one_plus_cosine(total: np.ndarray) -> np.ndarray:
+    """1 + cos(theta) of edges of length theta from the sums (3, ...) of their ends."""
+    return 0.5 * (total[0] * total[0] + total[1] * total[1] + total[2] * total[2])
+
+
 def solid_angle(unit: np.ndarray) -> np.ndarray:
     """Signed solid angle (P,) in sr of spherical polygons (3, V, P) in the hemisphere z >= 0.
 
     Positive where the corners run counterclockwise about +z as seen from outside the sphere. Product over the edges of
     the spherical triangles with apex e_z (Van Oosterom and Strackee 1983), with one arc tangent at the end.
     """
-    following = np.roll(unit, -1, axis=1)
-    real = 1.0 + unit[2] + following[2] + (unit * following).sum(axis=0)
-    imaginary = unit[0] * following[1] - unit[1] * following[0]
+    total = edge_sums(unit)
+    real = total[2] + one_plus_cosine(total)
+    imaginary = unit[0] * total[1] - unit[1] * total[0]
     product_real, product_imaginary = real[0], imaginary[0]
     for edge in range(1, unit.shape[1]):
         product_real, product_imaginary = (

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import brdf
-from .edge_integrals import arc_factors, one_plus_cosine
+from .edge_integrals import arc_factors
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
-from .polygon import project_to_sphere
+from .polygon import one_plus_cosine, project_to_sphere
 
 # Gauss-Legendre orders along each piece of the boundary, and along a radius; tried in turn.
 _ORDERS = ((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72))
@@ -58,7 +58,7 @@ class PolygonBoundary:
         normal = np.cross(start, end, axis=0)
         theta = np.arctan2(np.sqrt((normal**2).sum(axis=0)), cosine)
         points = _slerp(start, end, theta, fractions[:, None])
-        measure = normal * arc_factors(one_plus_cosine(start, end))[0] * weights[:, None]
+        measure = normal * arc_factors(one_plus_cosine(start + end))[0] * weights[:, None]
         count = self.unit.shape[2]
         return points.reshape(3, -1, count), measure.reshape(3, -1, count)
 

@@ -55,6 +55,7 @@ def temporary_root(tmp_path, monkeypatch):
 
 
 def run(capsys, *arguments):
+    capsys.readouterr()  # bpy tells on stdout that it saved a scene
     code = cli.main([str(argument) for argument in arguments])
     return code, *capsys.readouterr()
 

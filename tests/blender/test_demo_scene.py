@@ -137,7 +137,7 @@ def test_images_show_what_was_computed(demo):
 def fingerprint_in_fresh_interpreter():
     """Hash of all arrays of all parts and textures, computed in an interpreter with hash seed of its own."""
     code = (
-        "import hashlib, sys, types\n"
+        "import hashlib\n"
         "import numpy as np\n"
         "from ltsh_addon.blender import demo_objects, demo_textures as t\n"
         "digest = hashlib.sha256()\n"
@@ -150,7 +150,8 @@ def fingerprint_in_fresh_interpreter():
         "    digest.update(np.ascontiguousarray(image).tobytes())\n"
         "print(digest.hexdigest())\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
     return done.stdout.strip()
 
 

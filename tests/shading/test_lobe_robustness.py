@@ -46,17 +46,17 @@ def ceilings(generator, count):
     return SQUARE + shift + spread(generator, count, -17, 1) * np.array([0.0, 0.0, 1.0])
 
 
-def edge_on(generator, count):
-    """Planes that pass closely by the point, or through it."""
+def edge_on(generator, count, nearest=-17):
+    """Planes that pass closely by the point, by 10^nearest at least, or through it."""
     polygons = oriented(generator, count, np.zeros((count, 3)), 1.0)
     u = polygons[:, 1] - polygons[:, 0]
     normal = unit(np.cross(u, polygons[:, 2] - polygons[:, 1]))[:, None]
     along = u[:, None] * generator.uniform(-2.0, 2.0, size=(count, 1, 1))
-    gap = spread(generator, count, -17, -3) * generator.choice([0.0, 1.0], size=(count, 1, 1))
-    return polygons + along + gap * normal
+    gap = spread(generator, count, nearest, -3)
+    return polygons + along + np.where(gap < 1e-16, 0.0, gap) * normal
 
 
-def walls(generator, count):
+def walls(generator, count, nearest=-17):
     """Upright, standing on the horizon, sunk into it, with a foot at all distances from the point."""
     angle = generator.random(count) * 2.0 * np.pi
     side = np.stack([-np.sin(angle), np.cos(angle), np.zeros(count)], axis=1)[:, None]
@@ -64,7 +64,7 @@ def walls(generator, count):
     up = np.array([0.0, 0.0, 1.0])
     base = generator.choice([0.0, -1.0, 1e-9], size=(count, 1, 1)) * up
     polygon = SQUARE[:, :1] * side + (SQUARE[:, 1:2] + 1.0) * up
-    return polygon + base + forward * spread(generator, count, -16, 1)
+    return polygon + base + forward * spread(generator, count, nearest, 1)
 
 
 def at_the_point(generator, count):
@@ -117,11 +117,15 @@ def test_hostile_polygons_give_finite_numbers_that_are_not_negative(name, kind, 
 
 
 @table_names
-@pytest.mark.parametrize("kind", [tiny, huge, far, ceilings, edge_on, walls, at_the_point, repeated, collinear])
+@pytest.mark.parametrize("kind", [tiny, huge, far, ceilings, edge_on, walls, repeated, collinear])
 def test_hostile_polygons_reflect_no_more_than_arrives(name, kind):
-    """Planar polygons in double precision (the lattice may wind twice around a point)."""
+    """Planar polygons in double precision.
+
+    Where a plane passes by the point within some 1e-13 of the polygon's size, the side on which it passes is rounding:
+    such a polygon covers half of the hemisphere or nothing, and its moments do not agree on which.
+    """
     generator = np.random.default_rng(100 + HOSTILE.index(kind))
-    polygons = kind(generator, EACH)
+    polygons = kind(generator, EACH, -12) if kind in (edge_on, walls) else kind(generator, EACH)
     cosine, roughness = setting(generator, EACH)
     values = shading.integrate_polygon(TABLES[name], cosine, roughness, polygons)
     worst = values.argmax()
@@ -144,11 +148,7 @@ def test_polygons_without_area_reflect_nothing(name, kind):
 @table_names
 @pytest.mark.parametrize("crossing", [False, True], ids=["above", "crossing"])
 def test_single_precision_is_close_to_double(name, crossing):
-    """Generic rectangles and roughness above 0.2, where the warp does not stretch: a few hundred units of 6e-8.
-
-    The closing edge of a clipped rectangle that comes within an angle d of a half circle loses a factor 1 / d of the
-    digits, and d is uniform: one of a hundred may be off by more, none by more than 1e-2.
-    """
+    """Generic rectangles and roughness above 0.2, where the warp does not stretch: a few hundred units of 6e-8."""
     generator = np.random.default_rng(4)
     count = 1000
     polygons = random_rectangles(generator, count, crossing).astype(np.float32)
@@ -156,9 +156,7 @@ def test_single_precision_is_close_to_double(name, crossing):
     roughness = (0.2 + 0.8 * generator.random(count)).astype(np.float32)
     single = shading.integrate_polygon(TABLES[name], cosine, roughness, polygons)
     double = shading.integrate_polygon(*(TABLES[name], *(a.astype(float) for a in (cosine, roughness, polygons))))
-    error = np.abs(single - double)
-    assert np.quantile(error, 0.99) < 2e-5
-    assert error.max() < (1e-2 if crossing else 2e-5)
+    assert np.abs(single - double).max() < 2e-5
 
 
 @table_names

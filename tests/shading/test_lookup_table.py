@@ -239,6 +239,18 @@ def test_arrays_that_are_no_numbers_are_refused(tmp_path):
         assert_refused(written(tmp_path / "text.npz", {**arrays, "warp": wrong}, metadata), "warp")
 
 
+def test_pickled_objects_are_refused_and_not_run(tmp_path):
+    class Bomb:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "exploded"), "w"))
+
+    arrays, metadata = contents("ltsh2")
+    path = tmp_path / "pickle.npz"
+    np.savez(path, **{**arrays, "warp": np.array([Bomb()], dtype=object)}, metadata=np.array(json.dumps(metadata)))
+    assert_refused(path, "cannot be read")
+    assert not (tmp_path / "exploded").exists()
+
+
 def test_a_decreasing_ior_axis_is_refused(tmp_path):
     arrays, metadata = contents("ltsh2")
     arrays["fresnel_ior"] = arrays["fresnel_ior"][::-1].copy()

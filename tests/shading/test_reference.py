@@ -1,5 +1,7 @@
 """The reference quadrature against brute force, and its own error estimate."""
 
+from dataclasses import replace
+
 import numpy as np
 import polygon_quadrature
 import pytest
@@ -168,6 +170,26 @@ def test_lights_cut_by_the_horizon_match_adaptive_quadrature():
             # 2048 corners leave an error of about 1e-6 of the ellipse.
             assert shaded.specular[0, 0, 0] == pytest.approx(expected, rel=1e-4, abs=1e-5), (shape, cosine, roughness)
             assert shaded.quadrature_error[0] < 1e-4 * expected + 1e-6
+
+
+@pytest.mark.parametrize("center", [(-1.2, 0.1, 0.2), (-1.2, 0.1, -0.2), (0.5, 0.9, 0.0)])
+def test_ellipses_cut_by_the_shading_horizon_alone_are_exact(center):
+    """The geometric horizon lies lower, so that an ellipse stays an ellipse; the oracle is a fine polygon."""
+    view = textbook.view_direction(0.5)
+    light = area_light(shape="ELLIPSE", center=center, half_u=(0.0, 0.8, 0.1), half_v=(0.1, 0, 0.5), radiance=(1, 1, 1))
+    light = replace(light, direction=-light.direction) if light.direction @ light.center > 0.0 else light
+    normal = surface_scenes.unit(np.array([center[0], center[1], 0.3]))
+    white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "geometric_normal": normal}
+    polygon = light.polygon(2048)
+    assert (polygon @ normal).min() > 0.0 > polygon[:, 2].min()
+    kept = np.concatenate([clip_edge(a, b) for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True)])
+    for roughness in (0.3, 0.7):
+        sample = single_sample(view=view, roughness=roughness, **white)
+        found = shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]).specular[0, 0, 0]
+        lobe = brdf_of(0.5, roughness)
+        expected = abs(polygon_quadrature.integral(kept, lobe, kept.mean(axis=0), order=24, pieces=1))
+        assert found == pytest.approx(expected, rel=1e-4, abs=1e-6)
+        assert found > 1e-4
 
 
 def brdf_of(cosine, roughness):

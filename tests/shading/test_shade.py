@@ -114,6 +114,45 @@ def test_specular_light_ends_at_the_geometric_horizon(technique):
     assert half == pytest.approx(0.5 * whole, rel=QUADRATURE if technique == shading.REFERENCE else 1e-10)
 
 
+def test_each_pass_has_its_own_normal():
+    """The diffuse light follows `diffuse_normal`, the specular light `normal`."""
+    sample = single_sample(specular_f0=(1, 1, 1), specular_f90=(1, 1, 1), view=(0.0, 0.3, 1.0))
+    tilted = np.array([[0.6, 0.0, 0.8]])
+    light = area_light(center=(1.0, 0.3, 2.0))
+    plain = shading.shade(sample, [light])
+    bumped = shading.shade(replace(sample, diffuse_normal=tilted), [light])
+    assert np.array_equal(bumped.specular, plain.specular)
+    # Turned about y, so that the tilted normal is z
+    turn = np.array([[0.8, 0.0, -0.6], [0.0, 1.0, 0.0], [0.6, 0.0, 0.8]])
+    factor = textbook.lambert_form_factor(light.polygon() @ turn.T)
+    assert bumped.diffuse[0, 0] == pytest.approx(abs(factor) * light.radiance, rel=1e-9)
+    assert not np.allclose(bumped.diffuse, plain.diffuse, rtol=0.01)
+
+
+@pytest.mark.parametrize("technique", shading.SHIPPED_TABLES)
+def test_specular_light_is_the_clamped_integral_of_the_lobe(technique):
+    """White metals and small lights all around: where a lobe rings below zero nothing is reflected."""
+    table = shading.load_table(technique)
+    generator = np.random.default_rng(11)
+    cosine, roughness = generator.uniform(0.02, 1.0, size=4000), generator.uniform(0.05, 1.0, size=4000)
+    center = surface_scenes.unit(generator.normal(size=(4000, 3))) * np.array([1, 1, 0.5]) + np.array([0, 0, 0.6])
+    half_u = 0.1 * surface_scenes.unit(np.cross(center, generator.normal(size=(4000, 3))))
+    half_v = np.cross(half_u, center)
+    corners = [center - half_u - half_v, center + half_u - half_v, center + half_u + half_v, center - half_u + half_v]
+    polygons = np.stack(corners, axis=1)
+    signed = -shading.integrate_polygon(table, cosine, roughness, polygons, signed=True)
+    clamped = shading.integrate_polygon(table, cosine, roughness, polygons)
+    # The harmonics ring, the clamped cosine does not: else this test would show nothing.
+    assert (signed.min() < -1e-6) == (technique != "ltc")
+    for n in [*np.argsort(signed)[:20], *range(40)]:
+        light = area_light(center=center[n], half_u=half_u[n], half_v=half_v[n], radiance=(1, 1, 1))
+        white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": roughness[n]}
+        sample = single_sample(view=textbook.view_direction(cosine[n]), **white)
+        found = shading.shade(sample, [light], table, passes=["specular"], workers=1).specular[0, 0, 0]
+        assert found == pytest.approx(max(signed[n], 0.0), abs=1e-12)
+        assert clamped[n] == pytest.approx(max(signed[n], 0.0), abs=1e-12)
+
+
 @techniques
 def test_lights_affect_only_what_they_should(technique):
     samples = random_samples(50, seed=5)

@@ -1,5 +1,7 @@
 """A coarse fit runs, keeps the albedo, and writes the same bytes again."""
 
+import zipfile
+
 import numpy as np
 import pytest
 
@@ -45,6 +47,8 @@ def test_the_written_table_is_readable_and_its_bytes_are_reproducible(coarse, tm
     for path in (first, second):
         fit.write_table(path, fit.FAMILIES["ltsh2"], arrays, errors)
     assert first.read_bytes() == second.read_bytes()
+    with zipfile.ZipFile(first) as archive:
+        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["first.npz", "second.npz"]
     table = load_table(first)
     assert (table.family, table.degree, table.name) == ("ltsh", 2, "ltsh2")

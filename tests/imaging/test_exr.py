@@ -1,0 +1,104 @@
+"""EXR layers: bit for bit, by name, complete or not at all."""
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from ltsh_addon.imaging import Layer, read_channels, read_layers, write_layers
+
+
+def layers():
+    generator = np.random.default_rng(3)
+    color = generator.normal(size=(7, 11, 3)).astype(np.float32)
+    color[0, 0], color[0, 1, 0], color[1, 1, 2] = (-3.0e38, 3.0e38, 1e-42), np.nan, -np.inf
+    return {
+        "ltsh4.specular": color,
+        "ltsh4.specular@Key": color * 0.5,
+        "samples.position": Layer(generator.normal(size=(7, 11, 3)).astype(np.float32), "XYZ"),
+        "coverage.hit": Layer(generator.uniform(size=(7, 11)).astype(np.float32), "V"),
+    }
+
+
+def test_layers_come_back_bit_for_bit(tmp_path):
+    path = tmp_path / "a.exr"
+    written = layers()
+    write_layers(path, written, {"ltsh:scene": "room"})
+    read = read_layers(path)
+    assert set(read) == set(written)
+    for name, layer in written.items():
+        pixels = layer.pixels if isinstance(layer, Layer) else layer
+        assert np.array_equal(read[name].view(np.uint32), pixels.view(np.uint32)), name
+
+
+def test_openexr_itself_sees_the_channel_names_and_rows_from_the_top(tmp_path):
+    path = tmp_path / "a.exr"
+    write_layers(path, layers(), {"ltsh:scene": "room"})
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = file.channels()
+        assert file.header()["ltsh:scene"] == "room"
+        assert {"ltsh4.specular.R", "samples.position.X", "coverage.hit.V"} <= set(channels)
+        assert channels["ltsh4.specular.R"].pixels[0, 0] == np.float32(-3.0e38)
+
+
+def test_a_file_of_one_part_per_pass_reads_like_one_of_a_single_part(tmp_path):
+    pixels = {name: np.full((4, 5), value, dtype=np.float32) for name, value in (("X", 1.0), ("Y", 2.0), ("Z", 3.0))}
+    parts = [
+        OpenEXR.Part({}, {"ViewLayer.Position." + key: value for key, value in pixels.items()}, "ViewLayer.Position"),
+        OpenEXR.Part({}, {"ViewLayer.Depth.V": pixels["X"]}, "ViewLayer.Depth"),
+    ]
+    path = tmp_path / "parts.exr"
+    with OpenEXR.File(parts) as file:
+        file.write(str(path))
+    channels = read_channels(path)
+    assert set(channels) == {*(f"ViewLayer.Position.{letter}" for letter in "XYZ"), "ViewLayer.Depth.V"}
+    assert (channels["ViewLayer.Position.Z"] == 3.0).all()
+
+
+@pytest.mark.parametrize("damage", ["truncated", "text", "empty"])
+def test_a_damaged_file_is_named(tmp_path, damage):
+    path = tmp_path / "a.exr"
+    write_layers(path, layers())
+    data = path.read_bytes()
+    path.write_bytes({"truncated": data[: len(data) // 2], "text": b"not an image", "empty": b""}[damage])
+    with pytest.raises(ValueError, match="a.exr"):
+        read_channels(path)
+
+
+def test_a_missing_file_is_an_os_error(tmp_path):
+    with pytest.raises(OSError, match="missing.exr"):
+        read_channels(tmp_path / "missing.exr")
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"a": np.zeros((2, 2, 2))},
+        {"a": np.zeros(5)},
+        {"a": np.zeros((2, 2, 3)), "b": np.zeros((3, 2, 3))},
+        {"a": Layer(np.zeros((2, 2, 3)), "XY")},
+        {"a": np.array([["x", "y"]])},
+    ],
+)
+def test_layers_that_do_not_fit_are_refused_and_nothing_is_written(tmp_path, bad):
+    with pytest.raises(ValueError):
+        write_layers(tmp_path / "a.exr", bad)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, monkeypatch):
+    path = tmp_path / "a.exr"
+    path.write_bytes(b"old")
+
+    def fail(self, name):
+        raise RuntimeError("no space left")
+
+    monkeypatch.setattr(OpenEXR.File, "write", fail)
+    with pytest.raises(OSError, match="a.exr"):
+        write_layers(path, layers())
+    assert [item.name for item in tmp_path.iterdir()] == ["a.exr"]
+    assert path.read_bytes() == b"old"
+
+
+def test_a_missing_folder_is_said(tmp_path):
+    with pytest.raises(OSError, match="nowhere does not exist"):
+        write_layers(tmp_path / "nowhere" / "a.exr", layers())

@@ -260,9 +260,8 @@ def summary(report: dict, output: Path) -> str:
         for name, row in figures["techniques"].items():
             reference = row.get("against_reference", {})
             classes = [_percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
-            lines.append(
-                f"  {name:<12}{_unbiased(row.get('against_cycles', {})):>12}{_percent(reference.get('relative_l2')):>14}"
-                f"{classes[0]:>10}{classes[1]:>13}{row['seconds']:>8.2f}"
-            )
+            cycles, truth = _unbiased(row.get("against_cycles", {})), _percent(reference.get("relative_l2"))
+            errors = f"{cycles:>12}{truth:>14}{classes[0]:>10}{classes[1]:>13}"
+            lines.append(f"  {name:<12}{errors}{row['seconds']:>8.2f}")
     lines.append(f"written to {output}")
     return "\n".join(lines)

@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import AreaLight, Film, SurfaceSamples
+from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
 from . import gbuffer
 
 WORKER = Path(__file__).with_name("worker.py")
@@ -34,10 +34,6 @@ BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
 
 class SceneError(Exception):
     """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
-
-
-class Cancelled(Exception):
-    """The progress callback asked to stop."""
 
 
 @dataclass(frozen=True)

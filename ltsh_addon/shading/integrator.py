@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Shading:
 def shade(
     samples: SurfaceSamples,
     lights: Iterable[AreaLight],
-    technique: str | LookupTable = "ltsh4",
+    technique: str | Path | LookupTable = "ltsh4",
     *,
     passes: Sequence[str] = PASSES,
     workers: int | None = None,
@@ -59,7 +60,7 @@ def shade(
     lights = tuple(lights)
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     table = technique
-    if isinstance(technique, str) and technique != REFERENCE:
+    if isinstance(technique, str | Path) and technique != REFERENCE:
         table = load_table(technique)
     prepared = [(light, groups.index(light.group), light.polygon(ROUND_LIGHT_CORNERS)) for light in lights]
     radiance = {name: np.zeros((len(groups), len(samples), 3)) for name in passes}

@@ -63,6 +63,13 @@ def test_even_a_coarse_fit_is_a_usable_table(coarse, tmp_path):
     assert validate(load_table(tmp_path / "coarse.npz"), count=5).mean < 0.1
 
 
+def test_mirrors_get_the_known_warp_and_no_coefficient_runs_away(coarse):
+    """A = B = C = 1 at roughness 0; lobes of albedo 1 need no coefficients above a few units."""
+    arrays, _, _ = coarse
+    assert np.abs(arrays["warp"][0] - 1.0).max() < 1e-3
+    assert np.abs(arrays["coefficients"]).max() < 10.0
+
+
 def test_at_normal_incidence_lobes_are_round(coarse):
     """Isotropic: A = C up to the regularization, no harmonics with m > 0."""
     arrays, _, _ = coarse

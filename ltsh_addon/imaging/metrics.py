@@ -27,6 +27,7 @@ class ErrorStatistics:
     bias: float | None  # sum T / sum R - 1
     median_relative_error: float | None  # over lit pixels
     percentile_95_relative_error: float | None
+    max_relative_error: float | None
     max_absolute_error: float | None  # W m^-2 sr^-1
     not_finite: int  # values of T that are NaN or Inf
     pixels: int
@@ -86,6 +87,7 @@ def _statistics(technique, half_a, half_b, mask) -> ErrorStatistics:
         bias=float(technique.sum() / total - 1.0) if total > 0.0 else None,
         median_relative_error=float(np.median(relative)) if relative.size else None,
         percentile_95_relative_error=float(np.percentile(relative, 95.0)) if relative.size else None,
+        max_relative_error=float(relative.max()) if relative.size else None,
         max_absolute_error=float(np.abs(difference).max()) if difference.size else None,
         not_finite=not_finite,
         pixels=pixels,

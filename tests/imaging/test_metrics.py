@@ -15,6 +15,7 @@ def test_figures_of_a_small_example_by_hand():
     assert figures.bias == pytest.approx(4.5 / 3.0 - 1.0, rel=1e-12)
     assert figures.median_relative_error == pytest.approx(0.5, rel=1e-12)  # both pixels are off by half their norm
     assert figures.relative_rmse == pytest.approx(0.5, rel=1e-12)
+    assert figures.max_relative_error == pytest.approx(0.5, rel=1e-12)
     assert figures.max_absolute_error == 1.0
     assert (figures.pixels, figures.not_finite) == (2, 0)
 

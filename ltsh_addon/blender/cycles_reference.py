@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 
 from .inventory import SURFACE_TYPES
-from .render_settings import enable_passes, render_exr, set_pixel_filter
+from .render_settings import enable_passes, pin_pixel_filter, render_exr, shifted_pixels, sub_pixel_offsets
 
 SEEDS = {"A": 1, "B": 7919}
 FIRST_CHUNK = 16
@@ -30,14 +30,33 @@ def remove_occlusion() -> None:
 def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
     """For each half the list of [file name in `folder`, samples in it]; a half has cycles_samples / 2 samples.
 
-    A half is rendered in chunks of one sample sequence, because Cycles reports progress only about once a minute.
+    The camera rays are those of `render_pixel_samples`, so that edges agree: with several sub-samples each gets its
+    share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
+    progress only about once a minute.
     """
     remove_occlusion()
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
-    set_pixel_filter(scene, sub_samples)
-    return [
-        _render_half(scene, folder, half, seed, max(1, cycles_samples // 2), progress) for half, seed in SEEDS.items()
-    ]
+    pin_pixel_filter(scene)
+    samples = max(1, cycles_samples // 2)
+    if sub_samples == 1:
+        return [_render_half(scene, folder, half, seed, samples, progress) for half, seed in SEEDS.items()]
+    share = max(1, samples // sub_samples)
+    return [_render_shifted(scene, folder, half, seed, sub_samples, share, progress) for half, seed in SEEDS.items()]
+
+
+def _render_shifted(scene, folder: Path, half: str, seed: int, sub_samples: int, share: int, progress) -> list[list]:
+    """One file per sub-sample, each with the next `share` samples of one sequence."""
+    cycles = scene.cycles
+    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, share * sub_samples, True
+    files = []
+    for index, offset in enumerate(sub_pixel_offsets(sub_samples)):
+        progress(f"Cycles {half}", index / sub_samples)
+        cycles.sample_offset, cycles.sample_subset_length = index * share, share
+        files.append([f"cycles_{half}_{index:04d}.exr", share])
+        with shifted_pixels(scene, offset):
+            render_exr(scene, folder / files[-1][0])
+    cycles.use_sample_subset = False
+    return files
 
 
 def _render_half(scene, folder: Path, half: str, seed: int, samples: int, progress) -> list[list]:

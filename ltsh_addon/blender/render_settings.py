@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from .child import SceneError
 from .inventory import SURFACE_TYPES
@@ -12,8 +14,8 @@ from .inventory import SURFACE_TYPES
 VIEW_LAYER = "ltsh"
 CAMERA_TYPES = ("PERSP", "ORTHO")
 # In pixels. The interface ends at 0.01, which is too wide: reference rays then cross edges that the central sample
-# does not (measured: 1 % of the pixels of a detailed picture, 6 % relative L2). BOX ignores the width, it is one pixel
-# wide. What remains: 1 in 1000 rays per axis strays by up to half a pixel, by the first cell of Cycles' filter table.
+# does not (measured: 1 % of the pixels of a detailed picture, 6 % relative L2). What
+# remains: 1 in 1000 rays per axis strays by up to half a pixel, by the first cell of Cycles' filter table.
 CENTER_FILTER_WIDTH = 1e-6
 
 
@@ -84,6 +86,8 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
             warnings.append(f"{label} is switched off, in the Cycles reference as well")
             setattr(owner, name, False)
     _leave_out_world(scene, view_layer, warnings)
+    scene.camera = camera
+    _hold_lens_still(camera)
     render.engine = "CYCLES"
     render.threads_mode = "AUTO"
     render.use_compositing = render.use_sequencer = render.film_transparent = False
@@ -99,6 +103,12 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     cycles.light_sampling_threshold = 0.0
     cycles.caustics_reflective = True
     view_layer.samples = 0
+
+
+def _hold_lens_still(camera) -> None:
+    """Keep the lens at its values of this frame: an animated shift would undo `shifted_pixels`."""
+    if camera.data.animation_data is not None:
+        camera.data.animation_data_clear()
 
 
 def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
@@ -149,13 +159,40 @@ def prepare_surfaces(warnings: list[str]) -> None:
             ob.shadow_terminator_shading_offset = 0.0
 
 
-def set_pixel_filter(scene, sub_samples: int) -> None:
-    """Pixel centers for one sample per pixel, a box of one pixel for several."""
+def pin_pixel_filter(scene) -> None:
+    """Put all camera rays of a pixel through its center; sub-samples come from shifting the camera."""
     cycles = scene.cycles
-    cycles.pixel_filter_type = "GAUSSIAN" if sub_samples == 1 else "BOX"
+    cycles.pixel_filter_type = "GAUSSIAN"
     # Written past the property's limits, into what stores it.
     stored = cycles.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else cycles
-    stored["filter_width"] = CENTER_FILTER_WIDTH if sub_samples == 1 else 1.0
+    stored["filter_width"] = CENTER_FILTER_WIDTH
+
+
+def sub_pixel_offsets(count: int) -> np.ndarray:
+    """Offsets (count, 2) from the pixel's center, right and up, in pixels: evenly over the pixel, 0 for a single one.
+
+    The R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences").
+    """
+    if count == 1:
+        return np.zeros((1, 2))
+    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    return (np.arange(count)[:, None] * steps + 0.5) % 1.0 - 0.5
+
+
+@contextmanager
+def shifted_pixels(scene, offset: np.ndarray):
+    """Meanwhile the rays of `scene` go through the points `offset` (2,) pixels from the pixels' centers."""
+    render, lens = scene.render, scene.camera.data
+    width, height = render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
+    fits_width = lens.sensor_fit == "HORIZONTAL" or (lens.sensor_fit == "AUTO" and width >= height)
+    unit = width if fits_width else height
+    before = lens.shift_x, lens.shift_y
+    try:
+        lens.shift_x += offset[0] * render.pixel_aspect_x / unit
+        lens.shift_y += offset[1] * render.pixel_aspect_y / unit
+        yield
+    finally:
+        lens.shift_x, lens.shift_y = before
 
 
 def enable_passes(view_layer, names: tuple[str, ...]) -> None:

@@ -20,6 +20,8 @@ SAMPLE_LAYERS = {
     "normal": "XYZ",
     "diffuse_normal": "XYZ",
     "geometric_normal": "XYZ",
+    "smooth_normal": "XYZ",
+    "bump_alpha2": "V",
     "roughness": "V",
     "specular_f0": "RGB",
     "specular_f90": "RGB",

@@ -78,7 +78,9 @@ class SurfaceSamples:
     The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
     ``f0 + (f90 - f0) (1 - c)^5  +  dielectric * F_d(c, ior)``, c = cosine of the half angle, F_d the exact unpolarized
     reflectance of a dielectric. `diffuse_albedo` already includes what the specular layer takes away. As in Cycles the
-    specular lobe ends at the horizons of both the shading and the geometric normal.
+    specular lobe ends at the horizons of both the shading and the geometric normal, and a bump-mapped diffuse lobe at
+    the horizon of the smooth normal; toward that it is shadowed by 2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)),
+    theta_i the angle of the light from the smooth normal (Estevez, Lecocq and Stein 2019).
     """
 
     position: np.ndarray  # (P, 3) m
@@ -92,14 +94,22 @@ class SurfaceSamples:
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
     geometric_normal: np.ndarray | None = None  # (P, 3); left out: `normal`
+    smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
+    bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
-        if self.geometric_normal is None:
-            object.__setattr__(self, "geometric_normal", self.normal)
+        defaults = {
+            "geometric_normal": self.normal,
+            "smooth_normal": self.diffuse_normal,
+            "bump_alpha2": np.zeros(count),
+        }
+        for name, value in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         for field in fields(self):
             value = np.asarray(getattr(self, field.name))
-            vector = field.name not in ("roughness", "dielectric", "ior")
+            vector = field.name not in ("roughness", "dielectric", "ior", "bump_alpha2")
             expected = (count, 3) if vector else (count,)
             if value.shape != expected:
                 raise ValueError(f"surface samples: {field.name} has shape {value.shape}, expected {expected}")

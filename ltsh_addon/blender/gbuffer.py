@@ -159,6 +159,8 @@ def _samples_of(values: dict[str, np.ndarray]) -> SurfaceSamples:
         ior=effective_ior(np.maximum(values["ior"], 1e-5), values["specular_level"]),
         diffuse_albedo=values["albedo"],
         geometric_normal=true_normal,
+        smooth_normal=smooth_normal,
+        bump_alpha2=np.where(corrected, bump_alpha2(normal, smooth_normal), 0.0),
     )
 
 

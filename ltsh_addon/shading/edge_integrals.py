@@ -67,6 +67,13 @@ def clamped_cosine_integral(unit: np.ndarray) -> np.ndarray:
     return 0.5 * ((unit[0] * total[1] - unit[1] * total[0]) * phi).sum(axis=0)
 
 
+def vector_irradiance(unit: np.ndarray) -> np.ndarray:
+    """Signed integral (3, P) of the direction over spherical polygons (3, V, P) (Lambert 1760; sign as solid angle)."""
+    total = edge_sums(unit)
+    phi, _, _ = arc_factors(one_plus_cosine(total))
+    return 0.5 * (np.cross(unit, total, axis=0) * phi).sum(axis=1)
+
+
 def moments(unit: np.ndarray, degree: int) -> np.ndarray:
     """Moments (K, P) of spherical polygons (3, V, P) in z >= 0; K = (degree + 1)(degree + 2) / 2.
 

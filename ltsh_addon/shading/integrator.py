@@ -13,9 +13,10 @@ import numpy as np
 
 from ..scene import AreaLight, Cancelled, SurfaceSamples
 from . import reference
+from .edge_integrals import vector_irradiance
 from .lobe_integrals import form_factor, polygon_integrals
 from .lookup_table import Lobe, LookupTable, load_table
-from .polygon import split_at_horizon
+from .polygon import project_to_sphere, split_at_horizon
 
 REFERENCE = "reference"
 PASSES = ("specular", "diffuse")
@@ -100,12 +101,26 @@ def _run(work, chunks, workers, progress):
 def _shade_diffuse(samples, lights, radiance):
     frame = _frame(samples.diffuse_normal, samples.view)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
+    bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
     for light, group, corners in lights:
         if not light.affects_diffuse:
             continue
-        for index, polygon in _visible_parts(samples, frame, light, corners, lit, geometric_horizon=False):
+        for index, polygon in _visible_parts(samples, frame, light, corners, lit[~bumped]):
             irradiance = np.abs(form_factor(polygon))
             radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * light.radiance
+        for index, polygon in _visible_parts(samples, frame, light, corners, lit[bumped], samples.smooth_normal):
+            irradiance = _shadowed_form_factor(samples, frame, index, polygon)
+            radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * light.radiance
+
+
+def _shadowed_form_factor(samples, frame, index, polygon):
+    """Form factor (Q,) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+    direction = -vector_irradiance(project_to_sphere(polygon))
+    smooth = _to_local(frame[:, :, index], samples.smooth_normal[index].T)
+    along = (direction * smooth).sum(axis=0)
+    tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
+    shadowing = 2.0 / (1.0 + np.sqrt(1.0 + samples.bump_alpha2[index] * np.maximum(tangent2, 0.0)))
+    return np.where(along > 0.0, np.abs(form_factor(polygon)) * shadowing, 0.0)
 
 
 def _shade_specular(samples, lights, table, radiance, error):
@@ -123,7 +138,7 @@ def _shade_specular(samples, lights, table, radiance, error):
         if table == REFERENCE:
             parts = _reference_integrals(samples, cosine, frame, light, corners, lit, error)
         else:
-            visible = _visible_parts(samples, frame, light, corners, lit)
+            visible = _visible_parts(samples, frame, light, corners, lit, samples.geometric_normal)
             parts = ((index, _table_integrals(table, lobe.take(index), polygon)) for index, polygon in visible)
         for index, integrals in parts:
             plain, schlick, dielectric = integrals[..., None]
@@ -140,7 +155,7 @@ def _reference_integrals(samples, cosine, frame, light, corners, candidates, err
         if len(whole):
             batches.append((whole, lambda warp: reference.EllipseBoundary.warped(warp, *local)))
         corners = light.polygon(FINE_ROUND_LIGHT_CORNERS)
-    for index, polygon in _visible_parts(samples, frame, light, corners, candidates):
+    for index, polygon in _visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
         batches.append((index, partial(reference.PolygonBoundary.warped, polygon=polygon)))
     for index, make_boundary in batches:
         alpha = samples.roughness[index] ** 2
@@ -207,10 +222,10 @@ def _to_local(axes, vectors):
     return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])
 
 
-def _visible_parts(samples, frame, light, corners, candidates, *, geometric_horizon=True):
+def _visible_parts(samples, frame, light, corners, candidates, second_normal=None):
     """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on.
 
-    Polygons are clipped at the shading horizon, and before that at the geometric one where it is asked for.
+    Polygons are clipped at the shading horizon, and before that at the horizon of `second_normal` (P, 3).
     """
     index = _in_front(samples.position, light, candidates)
     if len(index) == 0:
@@ -218,8 +233,8 @@ def _visible_parts(samples, frame, light, corners, candidates, *, geometric_hori
     offset = (corners[:, None, :] - samples.position[index]).transpose(2, 0, 1)
     local = _to_local(frame[:, :, index], offset)
     parts = [(slice(None), local)]
-    if geometric_horizon:
-        height = (offset * samples.geometric_normal[index].T[:, None, :]).sum(axis=0)
+    if second_normal is not None:
+        height = (offset * second_normal[index].T[:, None, :]).sum(axis=0)
         if not (height > 0.0).all():
             with_height = np.concatenate([local, height[None]])
             parts = ((part, clipped[:3]) for part, clipped in split_at_horizon(with_height, axis=3))

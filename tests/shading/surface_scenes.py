@@ -69,7 +69,7 @@ def single_sample(position=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), view=(0.0, 0
 def moved(samples, lights, rotation=None, shift=(0.0, 0.0, 0.0)):
     """Samples and lights under one rigid motion."""
     rotation = np.eye(3) if rotation is None else rotation
-    vectors = ("view", "normal", "diffuse_normal", "geometric_normal")
+    vectors = ("view", "normal", "diffuse_normal", "geometric_normal", "smooth_normal")
     fields = {name: getattr(samples, name) for name in samples.__dataclass_fields__}
     fields.update({name: fields[name] @ rotation.T for name in vectors})
     fields["position"] = samples.position @ rotation.T + np.asarray(shift)

@@ -73,10 +73,14 @@ def test_samples_refuse_wrong_shapes(field):
             replace(samples, **{field: wrong})
 
 
-def test_geometric_normals_default_to_the_normals():
+def test_optional_fields_default_to_a_surface_without_bumps():
     samples = random_samples(5)
-    own = {field.name: getattr(samples, field.name) for field in fields(samples) if field.name != "geometric_normal"}
-    assert np.array_equal(SurfaceSamples(**own).geometric_normal, samples.normal)
+    optional = ("geometric_normal", "smooth_normal", "bump_alpha2")
+    own = {field.name: getattr(samples, field.name) for field in fields(samples) if field.name not in optional}
+    made = SurfaceSamples(**own)
+    assert np.array_equal(made.geometric_normal, samples.normal)
+    assert np.array_equal(made.smooth_normal, samples.diffuse_normal)
+    assert np.array_equal(made.bump_alpha2, np.zeros(5))
 
 
 @pytest.mark.parametrize("count", [0, 7])

@@ -114,6 +114,30 @@ def test_specular_light_ends_at_the_geometric_horizon(technique):
     assert half == pytest.approx(0.5 * whole, rel=QUADRATURE if technique == shading.REFERENCE else 1e-10)
 
 
+def test_bump_mapped_diffuse_light_is_shadowed_toward_the_smooth_horizon():
+    """A light so small that its mean direction is its direction: the factor is 2 / (1 + sqrt(1 + a^2 tan^2))."""
+    smooth, bumped = np.array([0.0, 0.0, 1.0]), np.array([0.6, 0.0, 0.8])
+    sample = single_sample(diffuse_normal=bumped, smooth_normal=smooth, bump_alpha2=0.25)
+    open_sample = replace(sample, smooth_normal=sample.diffuse_normal, bump_alpha2=np.zeros(1))
+    for tangent in (0.5, 2.0, 8.0):
+        light = area_light(center=(tangent, 0.0, 1.0), half_u=(1e-3, 0, 0), half_v=(0, -1e-3, 0))
+        factor = shading.shade(sample, [light]).diffuse / shading.shade(open_sample, [light]).diffuse
+        # Directions within the light differ by its size over its distance, 1e-3.
+        assert factor == pytest.approx(2.0 / (1.0 + np.sqrt(1.0 + 0.25 * tangent**2)), rel=2e-3)
+
+
+def test_bump_mapped_diffuse_light_ends_at_the_smooth_horizon():
+    sample = single_sample(diffuse_normal=(1.0, 0.0, 0.0), smooth_normal=(0.0, 0.0, 1.0))
+    open_sample = replace(sample, smooth_normal=sample.diffuse_normal)
+    # Facing the point from the side; half of it lies below the smooth horizon.
+    light = area_light(center=(2.0, 0.0, 0.0), half_u=(0, 1, 0), half_v=(0, 0, -1), direction=(-1.0, 0.0, 0.0))
+    whole, half = (shading.shade(point, [light]).diffuse for point in (open_sample, sample))
+    assert half == pytest.approx(0.5 * whole, rel=1e-10)
+    below = area_light(center=(2.0, 0.0, -1.5), half_u=(0, 1, 0), half_v=(0, 0, -1), direction=(-1.0, 0.0, 0.0))
+    assert shading.shade(sample, [below]).diffuse.max() == 0.0
+    assert shading.shade(open_sample, [below]).diffuse.min() > 0.0
+
+
 def test_each_pass_has_its_own_normal():
     """The diffuse light follows `diffuse_normal`, the specular light `normal`."""
     sample = single_sample(specular_f0=(1, 1, 1), specular_f90=(1, 1, 1), view=(0.0, 0.3, 1.0))

@@ -197,6 +197,16 @@ def _predict(parameters, i, j, last):
     return parameters[i + 1, j] + parameters[i, j - 1] - parameters[i + 1, j - 1]
 
 
+def _search(family, nodes, prediction, symmetric):
+    """Parameters (P, n) of a batch of nodes from their prediction; `symmetric` (P,) marks normal incidence."""
+    prediction = prediction.copy()
+    prediction[:, 2] = np.clip(prediction[:, 2], -MAX_BETA, 0.0)
+    frozen = symmetric[:, None] & (np.arange(family.parameters) >= 2)
+    prediction[frozen] = 0.0
+    prediction = np.clip(prediction, LOWEST[: family.parameters], HIGHEST[: family.parameters])
+    return _minimize(family, nodes, prediction, frozen)
+
+
 def _limit_parameters(family, cosine, alpha):
     """Parameters (P, n) of A = B = C = 1 without tilt: what GGX tends to as alpha -> 0."""
     regularized = np.sqrt(cosine**2 + WARP_REGULARIZATION**2 * alpha**2)
@@ -226,17 +236,12 @@ def fit(family: Family, size: int = 64, progress=None):
         i, j = np.array(nodes_at).T
         nodes = _Nodes.at(cosine[j], roughness[i] ** 2, curves)
         prediction = np.stack([_predict(parameters, *node, size - 1) for node in nodes_at])
-        prediction[:, 2] = np.clip(prediction[:, 2], -MAX_BETA, 0.0)
-        symmetric = (j == 0)[:, None]
-        frozen = symmetric & (np.arange(family.parameters) >= 2)
-        prediction[frozen] = 0.0
-        prediction = np.clip(prediction, LOWEST[: family.parameters], HIGHEST[: family.parameters])
-        solution = _minimize(family, nodes, prediction, frozen)
+        found = _search(family, nodes, prediction, symmetric=j == 0)
         limit = _limit_parameters(family, cosine[j], roughness[i] ** 2)
-        solution = np.where((i == 0)[:, None], limit, solution)
-        isotropic = solution.copy()
-        isotropic[:, :2] = solution[:, :2].mean(axis=1, keepdims=True)
-        parameters[i, j] = np.where(symmetric, isotropic, solution)
+        found = np.where((i == 0)[:, None], limit, found)
+        isotropic = found.copy()
+        isotropic[:, :2] = found[:, :2].mean(axis=1, keepdims=True)
+        parameters[i, j] = np.where((j == 0)[:, None], isotropic, found)
         coefficients[i, j] = _project(family, nodes, parameters[i, j], slice(None))[0]
         errors[i, j] = _relative_error(family, nodes, parameters[i, j], coefficients[i, j, 0])
         if progress is not None:

@@ -6,8 +6,10 @@ Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the argu
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import logging
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +18,7 @@ from . import __version__
 from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, known_technique, prepare, shade_scene
 from .progress_bar import ProgressBar
 from .scene import Cancelled
-from .shading import PASSES, TableError
+from .shading import PASSES, SHIPPED_TABLES, TableError
 
 EXAMPLES = """examples:
   %(prog)s demo -o out/demo
@@ -84,11 +86,23 @@ def _parser(program: str) -> argparse.ArgumentParser:
     _add_scene(shade)
     _add_common(shade, cycles=False)
     shade.set_defaults(run=_shade)
-    tables = commands.add_parser("tables", help="fit or validate the lookup tables (needs the source checkout)")
-    tables.add_argument("action", choices=("fit", "validate"))
-    tables.add_argument("names", nargs="*", metavar="TABLE", help="default: all shipped tables")
-    tables.set_defaults(run=_tables, quiet=False)
+    _add_tables(commands.add_parser("tables", help="fit, validate or export the lookup tables"))
     return parser
+
+
+def _add_tables(parser):
+    actions = parser.add_subparsers(dest="action", required=True)
+    for action in ("fit", "validate", "optimum", "plot"):
+        # The script parses its own options: nothing starts with this prefix, so that all of them are taken as they are.
+        script = actions.add_parser(action, help="in the source checkout", add_help=False, prefix_chars="\0")
+        script.add_argument("arguments", nargs="*")
+        script.set_defaults(run=_run_table_script, quiet=False)
+    export = actions.add_parser("export", help="an EXR and a C, C++ and GLSL header of each, for other engines")
+    export.add_argument("names", nargs="*", type=_table, metavar="TABLE", help="or a path (.npz); default: all shipped")
+    export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
+    export.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
+    export.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    export.set_defaults(run=_export_tables)
 
 
 def _add_scene(parser):
@@ -129,6 +143,14 @@ def _techniques(text: str) -> tuple[str, ...]:
             "or the path of a table (.npz)"
         )
     return names
+
+
+def _table(text: str) -> str:
+    if text in SHIPPED_TABLES or text.endswith(".npz"):
+        return text
+    raise argparse.ArgumentTypeError(
+        f"table {text!r} is unknown, expected some of {', '.join(SHIPPED_TABLES)} or the path of a table (.npz)"
+    )
 
 
 def _passes(text: str) -> tuple[str, ...]:
@@ -235,9 +257,31 @@ def _print(text: str, stream) -> None:
         print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
 
 
-def _tables(arguments, bar, open_file) -> int:
+def _run_table_script(arguments, bar, open_file) -> int:
     root = Path(__file__).resolve().parents[1]
     if not (root / "tables" / "fit.py").is_file():
-        raise _Misuse("tables fit and validate need the source checkout with tables/fit.py, which is not here")
-    command = [sys.executable, "-m", "tables", arguments.action, *arguments.names]
-    return subprocess.run(command, cwd=root, check=False).returncode
+        raise _Misuse(f"tables {arguments.action} needs the source checkout with tables/fit.py, which is not here")
+    for library in ("scipy", *(["matplotlib"] if arguments.action == "plot" else [])):
+        if importlib.util.find_spec(library) is None:
+            fix = f"install it with `pip install {library}`"
+            raise _Misuse(f"tables {arguments.action} needs {library}, which is not here; {fix}")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-m", "tables", arguments.action, *arguments.arguments]
+    return subprocess.run(command, env=environment, check=False).returncode
+
+
+def _export_tables(arguments, bar, open_file) -> int:
+    from . import table_export
+
+    try:
+        prefixes = table_export.export_prefixes(arguments.names or SHIPPED_TABLES)
+    except ValueError as error:
+        raise _Misuse(str(error)) from error
+    files = table_export.export_tables(prefixes, arguments.output, bar)
+    bar.finish()
+    paths = {name: [str(path) for path in written] for name, written in files.items()}
+    if arguments.json:
+        _print(json.dumps({"tables": paths}, indent=2), sys.stdout)
+    else:
+        _print("\n".join(path for written in paths.values() for path in written), sys.stdout)
+    return 0

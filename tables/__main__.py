@@ -1,50 +1,217 @@
-"""`python -m tables fit|validate [TABLE ...]`, what `ltsh tables` runs from the source checkout."""
+"""`python -m tables fit|validate|optimum|plot ...`, what `ltsh tables` runs from the source checkout."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
+import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
-from ltsh_addon.shading import TableError, load_table
+import numpy as np
 
-from . import fit, validate
+from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
+
+from . import families, fit, optimum, table_file, validate
+from .brdfs import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
 
 
 def main(arguments: list[str]) -> int:
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (TableError, OSError) as error:
+        print(f"ltsh tables: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("ltsh tables: interrupted; the same command goes on from here", file=sys.stderr)
+        return 130
+
+
+def _parser():
     parser = argparse.ArgumentParser(prog="ltsh tables")
-    parser.add_argument("action", choices=("fit", "validate"))
-    parser.add_argument("names", nargs="*", metavar="TABLE", help=f"of {', '.join(fit.FAMILIES)}; default: all")
-    options = parser.parse_args(arguments)
-    unknown = [name for name in options.names if name not in fit.FAMILIES]
-    if unknown:
-        parser.error(f"table {unknown[0]!r} is unknown, expected some of {', '.join(fit.FAMILIES)}")
-    for name in options.names or fit.FAMILIES:
-        if options.action == "fit":
-            _fit(name)
-        else:
-            try:
-                print(json.dumps({name: validate.validate(load_table(name)).to_dict()}))
-            except TableError as error:
-                print(f"ltsh tables: {error}", file=sys.stderr)
-                return 1
+    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot")
+    default = f"default: {', '.join(SHIPPED_TABLES)}"
+    fitting = actions.add_parser("fit", help="fit tables; goes on where a fit of the same settings was stopped")
+    fitting.add_argument("names", nargs="*", type=_name, metavar="TABLE", help=f"ltc or ltsh1 to ltsh8; {default}")
+    fitting.add_argument("-o", dest="output", type=Path, default=FOLDER, metavar="OUT", help="folder; default: tables")
+    fitting.add_argument("--brdf", choices=BRDFS, default="ggx", help="other BRDFs get the name <brdf>_<table>")
+    fitting.add_argument("--size", type=_size, default=64, metavar="N", help="nodes per axis, default 64")
+    fitting.add_argument("--jobs", type=_jobs, default=2, metavar="N", help="tables at a time, default 2")
+    fitting.set_defaults(run=_fit_all)
+    single = actions.add_parser("fit-one")
+    for name, kind in (("name", _name), ("path", Path), ("brdf", str), ("size", int)):
+        single.add_argument(name, type=kind)
+    single.set_defaults(run=_fit_one)
+    checking = actions.add_parser("validate", help="measure tables between their nodes")
+    checking.add_argument("names", nargs="*", metavar="TABLE", help=f"or a path; {default}")
+    checking.add_argument("--count", type=_size, default=28, metavar="N", help="points per axis, default 28")
+    checking.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    checking.set_defaults(run=_validate)
+    bounding = actions.add_parser("optimum", help="the least error of families of lobes at single points")
+    bounding.add_argument("names", nargs="*", type=_name, metavar="FAMILY", help=f"as for fit; {default}")
+    bounding.add_argument("--count", type=_size, default=optimum.COUNT, metavar="N", help="points per axis, default 12")
+    bounding.set_defaults(run=_optimum)
+    plotting = actions.add_parser("plot", help="draw the figures of tables/README.md")
+    plotting.add_argument("-o", dest="output", type=Path, default=FOLDER.parent / "docs", metavar="OUT")
+    plotting.set_defaults(run=_plot)
+    return parser
+
+
+def _name(text):
+    try:
+        families.family_named(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return text
+
+
+def _number(text, lowest, what):
+    if text.isdecimal() and int(text) >= lowest:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{what} is {text!r}, expected a whole number of at least {lowest}")
+
+
+def _size(text):
+    return _number(text, 4, "size")
+
+
+def _jobs(text):
+    return _number(text, 1, "number of jobs")
+
+
+def _fit_all(options) -> int:
+    """Fit every table in an interpreter of its own: with one thread each, so that the bytes do not depend on them."""
+    folder = options.output.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    # The largest first: the others then share the remaining time.
+    names = sorted(dict.fromkeys(options.names or SHIPPED_TABLES), key=lambda name: -families.family_named(name).size)
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    running, waiting, failed = {}, list(names), False
+    shares, shown = dict.fromkeys(names, "0 %"), ""
+    try:
+        while running or waiting:
+            while waiting and len(running) < options.jobs:
+                name = waiting.pop(0)
+                prefix = "" if options.brdf == "ggx" else f"{options.brdf}_"
+                path = folder / f"{prefix}{name}.npz"
+                command = [sys.executable, "-m", "tables", "fit-one", name, str(path), options.brdf, str(options.size)]
+                child = subprocess.Popen(command, cwd=FOLDER.parent, env=environment, stdout=subprocess.PIPE, text=True)
+                reader = threading.Thread(target=_follow, args=(child, name, shares), daemon=True)
+                reader.start()
+                running[name] = (child, reader)
+            time.sleep(0.2)
+            for name in [name for name, (child, _) in running.items() if child.poll() is not None]:
+                child, reader = running.pop(name)
+                reader.join()
+                failed |= child.returncode != 0
+            shown = _show(shares, shown)
+    finally:
+        for child, _ in running.values():
+            child.terminate()
+            child.wait()
+        if sys.stderr.isatty():
+            print(file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _show(shares, shown):
+    """Print where the fits stand, when that has changed: on one line of a terminal, else a line at the end of each."""
+    text = ", ".join(f"{name} {share}" for name, share in shares.items())
+    if sys.stderr.isatty():
+        if text != shown:
+            print(f"\r{text}", end="", file=sys.stderr, flush=True)
+    elif text.count("fitted") != shown.count("fitted"):
+        print(text, file=sys.stderr, flush=True)
+    return text
+
+
+def _follow(child, name, shares):
+    for line in child.stdout:
+        shares[name] = line.strip()
+
+
+def _fit_one(options) -> int:
+    try:
+        return _fit_and_write(options)
+    except KeyboardInterrupt:
+        return 130
+
+
+def _fit_and_write(options) -> int:
+    start = time.perf_counter()
+    family, model, path = families.family_named(options.name), BRDFS[options.brdf], options.path
+    checkpoint = table_file.Checkpoint(path.with_suffix(".progress"), table_file.settings(family, model, options.size))
+
+    def show(fraction):
+        print(f"{100.0 * fraction:.0f} %", flush=True)
+
+    fitted = fit.fit(family, options.size, model=model, progress=show, checkpoint=checkpoint)
+    table_file.write_table(path, fitted)
+    checkpoint.remove()
+    print(f"fitted in {time.perf_counter() - start:.0f} s")
     return 0
 
 
-def _fit(name: str) -> None:
-    start = time.perf_counter()
+def _validate(options) -> int:
+    results = {}
+    for name in options.names or SHIPPED_TABLES:
+        table = load_table(name)
+        results[name] = {
+            **validate.validate(table, options.count).to_dict(),
+            **validate.validate_corners(table, max(options.count // 2, 4)).to_dict(),
+        }
+        basis = validate.fresnel_basis_error(table, max(options.count // 4, 2))
+        results[name]["fresnel_basis"] = {str(ior): error for ior, error in basis.items()}
+    print(json.dumps(results, indent=2) if options.json else _as_text(results))
+    return 0
 
-    def show(fraction):
-        print(f"\r{name}: {100.0 * fraction:3.0f} %", end="", file=sys.stderr, flush=True)
 
-    arrays, errors = fit.fit(fit.FAMILIES[name], progress=show)
-    fit.write_table(FOLDER / f"{name}.npz", fit.FAMILIES[name], arrays, errors)
-    seconds = time.perf_counter() - start
-    print(f"\r{name}: fitted in {seconds:.0f} s, node error mean {errors.mean():.4f}", file=sys.stderr)
+def _as_text(results):
+    lines = ["| table | mean | median | 90 % | max | solved | light | albedo mean | max | negative mean | max |"]
+    lines.append("|---" * 11 + "|")
+    keys = ("mean", "median", "percentile_90", "maximum", "solved_mean", "light_error")
+    shares = ("albedo_mean", "albedo_maximum", "negative_mass_mean", "negative_mass_maximum")
+    for name, found in results.items():
+        cells = [f"{found[key]:.4f}" for key in keys] + [f"{100.0 * found[key]:.3f} %" for key in shares]
+        lines.append(f"| `{name}` | {' | '.join(cells)} |")
+    lines += ["", "| table | smooth mean | max | corner albedo | largest step | largest number | dielectrics |"]
+    lines.append("|---" * 7 + "|")
+    for name, found in results.items():
+        worst = max(max(errors) for errors in found["fresnel_basis"].values())
+        albedo = f"{found['lowest_albedo']:.4f} to {found['highest_albedo']:.4f}"
+        cells = [f"{found[key]:.4f}" for key in ("smooth_mean", "smooth_maximum")]
+        cells += [albedo, f"{found['largest_albedo_step']:.4f}", f"{found['largest_number']:.1f}"]
+        lines.append(f"| `{name}` | {' | '.join(cells)} | {100.0 * worst:.2f} % |")
+    return "\n".join(lines)
+
+
+def _optimum(options) -> int:
+    print("| family | coefficients | moments | mean | median | 90 % | max | shipped table: mean | median |")
+    print("|---" * 9 + "|")
+    for name in options.names or SHIPPED_TABLES:
+        found = optimum.optimum(name, options.count).errors
+        cells = [found.mean(), np.median(found), np.quantile(found, 0.9), found.max()]
+        if name in SHIPPED_TABLES:
+            errors = validate.error_map(load_table(name), options.count)
+            cells += [errors.mean(), np.median(errors)]
+        size = f"{families.family_named(name).size} | {optimum.edge_terms(name)}"
+        print(f"| `{name}` | {size} | {' | '.join(f'{cell:.4f}' for cell in cells)} |", flush=True)
+    return 0
+
+
+def _plot(options) -> int:
+    from . import plots
+
+    options.output.mkdir(parents=True, exist_ok=True)
+    for path in plots.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
+        print(path)
+    return 0
 
 
 if __name__ == "__main__":

@@ -12,18 +12,25 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ltsh_addon.shading import brdf, evaluate_lobe
+from ltsh_addon.shading import brdf, evaluate_lobe, spherical_harmonics
 from ltsh_addon.shading.lookup_table import LookupTable
+
+IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
+# Disk-shaped lights of the light error: as many directions, and the radii in degrees that they take in turn.
+LIGHTS = 96
+LIGHT_RADII = (10.0, 20.0, 35.0)
 
 
 @dataclass(frozen=True)
 class TableStatistics:
-    """Relative L2 error over the upper hemisphere, relative albedo error and relative negative mass."""
+    """What a lookup between the nodes gets wrong; relative to the lobe's L2 norm or to its albedo."""
 
-    mean: float
+    mean: float  # L2 error over the upper hemisphere, F = 1
     median: float
     percentile_90: float
     maximum: float
+    solved_mean: float  # the same with the coefficients solved at the point itself, under the interpolated warp
+    light_error: float  # root mean square error of integrals over disks, relative to their root mean square
     albedo_mean: float
     albedo_maximum: float
     negative_mass_mean: float
@@ -35,30 +42,131 @@ class TableStatistics:
 
 def validate(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_theta=88.0) -> TableStatistics:
     """Statistics over count x count cell-centered points of (roughness, theta_o in degrees)."""
-    center = (np.arange(count) + 0.5) / count
-    rough = roughness[0] + center * (roughness[1] - roughness[0])
-    cosine = np.cos(np.radians(center * max_theta))
-    errors, albedo, negative = [], [], []
-    for value in rough:
-        for mu in cosine:
-            directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([value**2])))
-            lobe = brdf.ggx_brdf_cosine(mu, value**2, directions)
-            fitted = evaluate_lobe(table, np.array([mu]), np.array([value]), directions[None])[0]
-            errors.append(np.sqrt((weights * (fitted - lobe) ** 2).sum() / (weights * lobe**2).sum()))
-            mass = (weights * lobe).sum()
-            albedo.append(abs((weights * fitted).sum() / mass - 1.0))
-            negative.append((weights * np.maximum(-fitted, 0.0)).sum() / mass)
-    errors, albedo, negative = (np.array(values) for values in (errors, albedo, negative))
+    errors, solved, albedo, negative, lights, light_errors = np.array(
+        [_measure(table, *point) for point in grid(count, roughness, max_theta)]
+    ).T
     return TableStatistics(
         float(errors.mean()),
         float(np.median(errors)),
         float(np.quantile(errors, 0.9)),
         float(errors.max()),
+        float(solved.mean()),
+        float(np.sqrt(light_errors.sum() / lights.sum())),
         float(albedo.mean()),
         float(albedo.max()),
         float(negative.mean()),
         float(negative.max()),
     )
+
+
+def grid(count, roughness=(0.1, 1.0), max_theta=88.0):
+    """(cos_theta_o, roughness) of count x count cell-centered points, roughness by roughness."""
+    center = (np.arange(count) + 0.5) / count
+    rough = roughness[0] + center * (roughness[1] - roughness[0])
+    return [(mu, value) for value in rough for mu in np.cos(np.radians(center * max_theta))]
+
+
+def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_theta=88.0) -> np.ndarray:
+    """Relative L2 errors (count, count) of the points of `validate`: rows roughness, columns theta_o."""
+    points = grid(count, roughness, max_theta)
+    return np.array([_measure(table, *point)[0] for point in points]).reshape(count, count)
+
+
+def _measure(table, mu, roughness):
+    """(L2 error, L2 error with solved coefficients, albedo error, negative mass, squared disk integrals and errors)."""
+    directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([roughness**2])))
+    directions, weights = directions[weights > 0.0], weights[weights > 0.0]
+    lobe = brdf.ggx_brdf_cosine(mu, roughness**2, directions)
+    fitted = evaluate_lobe(table, np.array([mu]), np.array([roughness]), directions[None])[0]
+    squared, mass = (weights * lobe**2).sum(), (weights * lobe).sum()
+    basis = _basis_at(table, mu, roughness, directions)
+    weighted = basis * weights
+    best = np.linalg.lstsq(weighted @ basis.T, weighted @ lobe, rcond=1e-13)[0] @ basis
+    disks = _disks(directions) * weights
+    exact, approximate = disks @ lobe / mass, disks @ fitted / mass
+    return (
+        np.sqrt((weights * (fitted - lobe) ** 2).sum() / squared),
+        np.sqrt((weights * (best - lobe) ** 2).sum() / squared),
+        abs((weights * fitted).sum() / mass - 1.0),
+        (weights * np.maximum(-fitted, 0.0)).sum() / mass,
+        (exact**2).sum(),
+        ((approximate - exact) ** 2).sum(),
+    )
+
+
+def _basis_at(table, mu, roughness, directions):
+    """Warped basis functions (K, S) of the table at one point."""
+    lobe = table.lookup(np.array([mu]), np.array([roughness]))
+    x, y, z = directions.T
+    warped = np.stack([lobe.xx * x + lobe.xz * z, lobe.yy * y, lobe.zz * z], axis=-1)
+    length = np.linalg.norm(warped, axis=-1)
+    unit = warped / length[:, None]
+    if lobe.tilt is None:
+        basis = spherical_harmonics.evaluate(table.degree, unit)
+    else:
+        basis = np.maximum(np.sin(lobe.tilt) * unit[:, 0] + np.cos(lobe.tilt) * unit[:, 2], 0.0)[None]
+    basis = basis / length**3
+    return basis / np.sqrt((basis * basis).mean(axis=1, keepdims=True))
+
+
+def _disks(directions):
+    """(D, S) share of a pair of mirror-symmetric disk-shaped lights that covers each direction, spread evenly."""
+    k = np.arange(LIGHTS) + 0.5
+    z, azimuth = 1.0 - k / LIGHTS, np.pi * (1.0 + np.sqrt(5.0)) * k
+    radius = np.sqrt(1.0 - z * z)
+    centers = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
+    reach = np.cos(np.radians(np.resize(LIGHT_RADII, LIGHTS)))[:, None]
+    mirrored = directions * np.array([1.0, -1.0, 1.0])
+    return 0.5 * (centers @ directions.T > reach) + 0.5 * (centers @ mirrored.T > reach)
+
+
+@dataclass(frozen=True)
+class CornerStatistics:
+    """Smooth surfaces and the corner of the table where they are seen at grazing angles."""
+
+    smooth_mean: float  # L2 error, roughness 0.02 .. 0.1, theta_o 0 .. 88 degrees
+    smooth_maximum: float
+    lowest_albedo: float  # roughness 0 .. 0.02 and theta_o 88 .. 90 degrees; NaN if anything is not finite
+    highest_albedo: float
+    largest_albedo_step: float  # between neighbors of a 65 x 65 grid there
+    largest_number: float  # stored
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+
+def validate_corners(table: LookupTable, count: int = 14) -> CornerStatistics:
+    """Statistics of smooth surfaces, and of the mirror-like ones at grazing angles."""
+    errors = error_map(table, count, (0.02, 0.1))
+    rough, theta = np.meshgrid(np.linspace(0.0, 0.02, 65), np.radians(np.linspace(88.0, 90.0, 65)), indexing="ij")
+    lobe = table.lookup(np.cos(theta).ravel().clip(0.0), rough.ravel())
+    albedo = lobe.albedo()[0].reshape(rough.shape)
+    steps = max(np.abs(np.diff(albedo, axis=axis)).max() for axis in (0, 1))
+    largest = max(np.abs(table.warp).max(), np.abs(table.coefficients).max())
+    finite = all(np.isfinite(part).all() for part in (lobe.xx, lobe.xz, lobe.yy, lobe.zz, lobe.coefficients))
+    lowest = albedo.min() if finite else np.nan
+    return CornerStatistics(
+        float(errors.mean()), float(errors.max()), float(lowest), float(albedo.max()), float(steps), float(largest)
+    )
+
+
+def fresnel_basis_error(table: LookupTable, count: int = 7, ior=IOR) -> dict[float, tuple[float, float]]:
+    """For each index of refraction the largest relative error of the directional albedo and of the lobe (L2) that the
+    combination of the table's Fresnel curves has, with the exact GGX lobe, at count x count points of `validate`."""
+    worst = {index: (0.0, 0.0) for index in ior}
+    cosines = np.linspace(0.0, 1.0, table.fresnel_curves.shape[1])
+    weights_of = table.dielectric_weights(np.array(ior))
+    for mu, roughness in grid(count):
+        directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([roughness**2])))
+        lobe = brdf.ggx_brdf_cosine(mu, roughness**2, directions)
+        half = brdf.half_angle_cosine(mu, directions)
+        for column, index in enumerate(ior):
+            exact = lobe * brdf.dielectric_reflectance(half, index)
+            combined = lobe * np.interp(half, cosines, weights_of[:, column] @ table.fresnel_curves)
+            albedo = abs((weights * combined).sum() / (weights * exact).sum() - 1.0)
+            norm = np.sqrt((weights * (combined - exact) ** 2).sum() / (weights * exact**2).sum())
+            worst[index] = (max(worst[index][0], float(albedo)), max(worst[index][1], float(norm)))
+    return worst
 
 
 def hemisphere_samples(cos_theta_o, alpha, radial: int = 56, angular: int = 56, horizon: int = 40):

@@ -128,7 +128,7 @@ def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
 
 def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(cli, "__file__", str(tmp_path / "site" / "ltsh_addon" / "cli.py"))
-    assert_misuse(run(capsys, "tables", "fit"), "need the source checkout")
+    assert_misuse(run(capsys, "tables", "fit"), "needs the source checkout")
 
 
 def test_options_reach_the_scene(capsys, child, room, out):

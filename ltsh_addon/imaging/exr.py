@@ -55,7 +55,15 @@ def write_layers(
     included. `metadata` becomes string attributes of the header. The file appears complete or not at all.
     Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
     """
-    planes = _planes(layers)
+    write_channels(path, _planes(layers), metadata)
+
+
+def write_channels(
+    path: str | os.PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write `channels` (H, W) by full name, which need not end in a single letter; else as `write_layers`."""
+    planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
+    _check_planes(planes)
     OpenEXR = _openexr()
     header = {str(key): str(value) for key, value in (metadata or {}).items()}
     reserved = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version"}
@@ -119,16 +127,23 @@ def _planes(layers: Mapping[str, np.ndarray | Layer]) -> dict[str, np.ndarray]:
         if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME - 2:
             raise ValueError(f"layer {name!r}: expected a name of 1 to {_LONGEST_NAME - 2} bytes without NUL")
         planes |= (layer if isinstance(layer, Layer) else Layer(layer)).planes(name)
+    return planes
+
+
+def _check_planes(planes: Mapping[str, np.ndarray]) -> None:
     if not planes:
         raise ValueError("no layers were given, an EXR file needs at least one")
     first_name, first = next(iter(planes.items()))
     for name, plane in planes.items():
+        if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME:
+            raise ValueError(f"channel {name!r}: expected a name of 1 to {_LONGEST_NAME} bytes without NUL")
+        if plane.ndim != 2 or 0 in plane.shape:
+            raise ValueError(f"channel {name!r}: an array of shape {plane.shape} was given, expected (height, width)")
         if plane.shape != first.shape:
             raise ValueError(
                 f"channel {name!r} is {plane.shape[1]}x{plane.shape[0]}, but {first_name!r} is "
                 f"{first.shape[1]}x{first.shape[0]}; all layers of a file need the same size"
             )
-    return planes
 
 
 def _read_parts(path: Path) -> list:

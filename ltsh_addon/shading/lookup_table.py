@@ -3,14 +3,17 @@
 The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1), where the warp W = M^-1,
 known up to a factor, is upper triangular: it leaves the horizon in place.
 
-    W = [[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 alpha]],   g^2 = cos^2(theta_o) + alpha^2 / 4
+    W = [[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 alpha]],
+    g^2 = cos^2(theta_o) + sin^2(theta_o) alpha^2 / 4
 
 The stored A, B, C tend to 1 as alpha -> 0, where GGX becomes an exactly transformed clamped cosine; that is why they
-may be interpolated. D_orig is a spherical harmonics expansion ("ltsh"), or a clamped cosine around the axis
-(sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M).
+may be interpolated. At normal incidence A = C. D_orig is a spherical harmonics expansion ("ltsh"), or a clamped cosine
+around the axis (sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M).
 
 Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg), which is dense at grazing angles.
-One coefficient vector per Fresnel curve shares the warp; curve 0 is F = 1.
+One coefficient vector per Fresnel curve shares the warp: a lobe is linear in its coefficients, so that a reflectance
+sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f c_f. Curves 0, 1 and 2 are 1 and
+(1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals); `dielectric_weights` gives w_f for dielectrics.
 """
 
 from __future__ import annotations
@@ -24,14 +27,14 @@ from pathlib import Path
 import numpy as np
 
 from .edge_integrals import MAX_DEGREE, ridge_matrix
-from .spherical_harmonics import coefficient_count
+from .spherical_harmonics import coefficient_count, degree_of, hemisphere_integrals
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SHIPPED_TABLES = ("ltc", "ltsh2", "ltsh4")
 WARP_REGULARIZATION = 0.5
 # Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
 MIN_ALPHA = 1e-5
-_ARRAYS = ("warp", "coefficients", "fresnel_curves", "fresnel_ior", "fresnel_weights")
+_ARRAYS = ("warp", "coefficients", "fresnel_curves", "fresnel_ior", "fresnel_weights", "average_albedo")
 
 
 class TableError(ValueError):
@@ -55,7 +58,6 @@ class Lobe:
             [self.xx * vectors[0] + self.xz * vectors[2], self.yy * vectors[1], self.zz * vectors[2]], axis=0
         )
 
-
     def with_coefficients(self, coefficients: np.ndarray) -> Lobe:
         """The same warps with other coefficients (F, K, P)."""
         return replace(self, coefficients=coefficients)
@@ -65,6 +67,14 @@ class Lobe:
         tilt = None if self.tilt is None else self.tilt[index]
         entries = (self.xx[index], self.xz[index], self.yy[index], self.zz[index])
         return Lobe(*entries, tilt, self.coefficients[:, :, index])
+
+    def albedo(self) -> np.ndarray:
+        """Integrals (F, P) over the hemisphere: the directional albedo for every Fresnel curve."""
+        if self.tilt is not None:
+            return self.coefficients[:, 0] * (0.5 + 0.5 * np.cos(self.tilt))
+        integrals = hemisphere_integrals(degree_of(self.coefficients.shape[1])).astype(self.coefficients.dtype)
+        # No BLAS, so that a result does not depend on how many points share a batch.
+        return sum(integral * self.coefficients[:, k] for k, integral in enumerate(integrals) if integral != 0.0)
 
 
 @dataclass(frozen=True)
@@ -79,6 +89,7 @@ class LookupTable:
     fresnel_curves: np.ndarray  # (F, C) sampled at C uniform cosines of the half angle in [0, 1]
     fresnel_ior: np.ndarray  # (I,) increasing
     fresnel_weights: np.ndarray  # (I, F): the reflectance of a dielectric of that IOR as a combination of the curves
+    average_albedo: np.ndarray  # (R, F) integral of 2 mu albedo(mu) over mu in [0, 1]
     metadata: dict
 
     @cached_property
@@ -100,22 +111,28 @@ class LookupTable:
         roughness = np.clip(roughness, 0.0, 1.0).astype(dtype, copy=False)
         channels = _interpolate(self._channels, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
         parameters = self.warp.shape[2]
-        a, b, c = channels[0], channels[1], channels[2]
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
-        squared = cosine * cosine + WARP_REGULARIZATION**2 * alpha * alpha
-        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
         return Lobe(
-            xx=a * squared,
-            xz=a * b * np.sqrt(squared) * sine,
-            yy=c,
-            zz=2.0 * alpha,
+            *warp_entries(cosine, alpha, *channels[:3]),
             tilt=channels[3] if parameters == 4 else None,
             coefficients=channels[parameters:].reshape(*self.coefficients.shape[2:], -1),
         )
 
+    def average_albedos(self, roughness: np.ndarray) -> np.ndarray:
+        """`average_albedo` (F, P) at roughness (P,), clamped to [0, 1]."""
+        nodes = roughness_nodes(len(self.average_albedo))
+        return np.stack([np.interp(roughness, nodes, column) for column in self.average_albedo.T])
+
     def dielectric_weights(self, ior: np.ndarray) -> np.ndarray:
         """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
+
+
+def warp_entries(cosine, alpha, a, b, c):
+    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast."""
+    sine_squared = np.maximum(1.0 - cosine * cosine, 0.0)
+    squared = cosine * cosine + WARP_REGULARIZATION**2 * alpha * alpha * sine_squared
+    return a * squared, a * b * np.sqrt(squared * sine_squared), c, 2.0 * alpha
 
 
 def _theta_coordinate(cosine):
@@ -124,7 +141,12 @@ def _theta_coordinate(cosine):
 
 def theta_nodes(count: int) -> np.ndarray:
     """theta_o (T,) in radians of the table's columns."""
-    return 0.5 * np.pi * (1.0 - (1.0 - np.linspace(0.0, 1.0, count)) ** 2)
+    return theta_at(np.linspace(0.0, 1.0, count))
+
+
+def theta_at(coordinate: np.ndarray) -> np.ndarray:
+    """theta_o in radians at a coordinate in [0, 1] along the columns."""
+    return 0.5 * np.pi * (1.0 - (1.0 - coordinate) ** 2)
 
 
 def roughness_nodes(count: int) -> np.ndarray:
@@ -178,10 +200,10 @@ def _validated(path, arrays, metadata) -> LookupTable:
     family, degree = metadata.get("family"), metadata.get("degree")
     if family not in ("ltc", "ltsh") or not isinstance(degree, int) or not 1 <= degree <= MAX_DEGREE:
         raise TableError(f"lookup table {path}: family {family!r} of degree {degree!r} is unknown; fit it again")
-    dimensions = {"warp": 3, "coefficients": 4, "fresnel_curves": 2, "fresnel_ior": 1, "fresnel_weights": 2}
+    dimensions = {"warp": 3, "coefficients": 4, "fresnel_ior": 1}
     for key, value in arrays.items():
-        if value.dtype.kind != "f" or value.ndim != dimensions[key]:
-            found, expected = f"{value.ndim} axes of {value.dtype}", f"{dimensions[key]} of floats"
+        if value.dtype.kind != "f" or value.ndim != dimensions.get(key, 2):
+            found, expected = f"{value.ndim} axes of {value.dtype}", f"{dimensions.get(key, 2)} of floats"
             raise TableError(f"lookup table {path}: {key} has {found}, expected {expected}; fit it again")
         if not np.isfinite(value).all():
             raise TableError(f"lookup table {path}: {key} holds NaN or infinity, expected finite numbers; fit it again")
@@ -192,6 +214,7 @@ def _validated(path, arrays, metadata) -> LookupTable:
         "warp": (rows, columns, 4 if family == "ltc" else 3),
         "coefficients": (rows, columns, curves, 1 if family == "ltc" else coefficient_count(degree)),
         "fresnel_weights": (indices, curves),
+        "average_albedo": (rows, curves),
     }
     for key, shape in shapes.items():
         found = arrays[key].shape

@@ -7,7 +7,8 @@ Condon-Shortley phase) and K_lm = sqrt((2 - [m = 0]) (2 l + 1) (l - m)! / (4 pi 
 
 from __future__ import annotations
 
-from math import factorial, pi, sqrt
+from functools import cache
+from math import factorial, isqrt, pi, sqrt
 
 import numpy as np
 
@@ -15,6 +16,11 @@ import numpy as np
 def coefficient_count(degree: int) -> int:
     """Number of basis functions (l, m) with 0 <= m <= l <= degree."""
     return (degree + 1) * (degree + 2) // 2
+
+
+def degree_of(count: int) -> int:
+    """The degree that has `count` basis functions."""
+    return (isqrt(8 * count + 1) - 3) // 2
 
 
 def coefficient_index(l: int, m: int) -> int:  # noqa: E741 (the field's letter)
@@ -45,6 +51,7 @@ def evaluate(degree: int, directions: np.ndarray) -> np.ndarray:
     return basis
 
 
+@cache
 def hemisphere_integrals(degree: int) -> np.ndarray:
     """Integrals (K,) of the basis functions over the hemisphere z >= 0: the albedo of a unit coefficient."""
     nodes, weights = np.polynomial.legendre.leggauss(degree + 1)

@@ -5,6 +5,7 @@ import OpenEXR
 import pytest
 
 from ltsh_addon.imaging import Layer, read_channels, read_layers, write_layers
+from ltsh_addon.imaging.exr import write_channels
 
 
 def layers():
@@ -67,6 +68,37 @@ def test_a_damaged_file_is_named(tmp_path, damage):
 def test_a_missing_file_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="missing.exr"):
         read_channels(tmp_path / "missing.exr")
+
+
+def test_channels_with_long_names_come_back_bit_for_bit(tmp_path):
+    generator = np.random.default_rng(5)
+    names = ("warp.A", "curve0.c_2_1", "curve10.average_albedo", "plain")
+    channels = {name: generator.normal(size=(3, 5)).astype(np.float32) for name in names}
+    path = tmp_path / "a.exr"
+    write_channels(path, {**channels, "plain": channels["plain"].T.copy().T}, {"ltsh:note": "{}"})
+    read = read_channels(path)
+    assert set(read) == set(names)
+    for name, plane in channels.items():
+        assert np.array_equal(read[name].view(np.uint32), plane.view(np.uint32)), name
+    with OpenEXR.File(str(path), header_only=True) as file:
+        assert file.header()["ltsh:note"] == "{}"
+
+
+@pytest.mark.parametrize(
+    ("bad", "complaint"),
+    [
+        ({}, "at least one"),
+        ({"": np.zeros((2, 2))}, "channel ''"),
+        ({"n" * 256: np.zeros((2, 2))}, "1 to 255 bytes"),
+        ({"a": np.zeros((2, 2, 1))}, "channel 'a': an array of shape"),
+        ({"a": np.zeros((0, 2))}, "channel 'a': an array of shape"),
+        ({"a": np.zeros((2, 2)), "b": np.zeros((2, 3))}, "channel 'b' is 3x2"),
+    ],
+)
+def test_channels_that_do_not_fit_are_refused_and_nothing_is_written(tmp_path, bad, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        write_channels(tmp_path / "a.exr", bad)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

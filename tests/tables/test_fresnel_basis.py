@@ -47,7 +47,7 @@ def test_all_shipped_tables_have_the_same_curves():
 
 
 def test_optimized_curves_are_orthonormal(basis):
-    curves = basis[0][2:]
+    curves = basis[0][3:]
     assert np.abs(curves @ curves.T - np.eye(len(curves))).max() < 1e-12
 
 
@@ -56,6 +56,18 @@ def test_a_combination_of_the_curves_is_found_again(basis):
     wanted = np.array([[0.3, 0.4, 0.0, 0.0, 0.0], [0.05, 0.95, 0.1, -0.02, 0.01]])
     # The damping of 1e-12 times the trace moves weights along directions that hardly matter for the reflectance.
     assert np.abs(combine(curves, wanted @ curves) @ curves - wanted @ curves).max() < 1e-6
+
+
+def test_metals_with_an_f82_tint_are_exact(basis):
+    """Reflectance 1 - B at c = 1/7, that is 82 degrees, F0 = 1: the definition of the tint (Kutz et al. 2021)."""
+    curves, _ = basis
+    cosine, tint = 1.0 / 7.0, 0.3
+    curve = np.array([np.interp(cosine, COSINES, values) for values in curves[:3]])
+    b = (1.0 - tint) / (cosine * (1.0 - cosine) ** 6)
+    assert curve @ [1.0, 0.0, -b] == pytest.approx(tint, abs=2e-3)
+    for f0 in (0.2, 0.9):
+        wanted = f0 + (1.0 - f0) * (1.0 - COSINES) ** 5 - 0.4 * COSINES * (1.0 - COSINES) ** 6
+        assert np.abs(np.array([f0, 1.0 - f0, -0.4]) @ curves[:3] - wanted).max() < 1e-15
 
 
 def test_an_ior_of_one_reflects_nothing(basis):

@@ -40,6 +40,18 @@ def test_directional_albedo_of_ggx(rule, tolerance):
     assert found == pytest.approx(expected, rel=tolerance)
 
 
+def test_the_fit_sees_needles_under_the_view():
+    """A lobe that wraps around to a needle at the horizon below the view direction: against ten times the points."""
+    cosine, alpha = np.array([np.cos(np.radians(86.4))]), np.array([0.06])
+    norms = []
+    for counts in [(28, 28), (90, 120)]:
+        directions, weights = polar_samples(cosine, alpha, *counts)
+        x, y, z = np.moveaxis(directions, -1, 0)
+        needle = np.exp(-((y / 0.05) ** 2) - (z / 0.03) ** 2) * (x > 0.0)
+        norms.append((weights * needle**2).sum())
+    assert norms[0] == pytest.approx(norms[1], rel=0.02)
+
+
 def test_sharp_lobes_are_integrated_too():
     """Both rules, from roughness 0.03 on; smooth surfaces seen from above reflect nearly everything."""
     cosine, alpha = np.array([0.9, 0.5, 0.3]), np.array([1e-3, 1e-3, 3e-3])

@@ -1,0 +1,242 @@
+"""`ltsh tables export`: the EXR against the table, the file handling, the command line."""
+
+import errno
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from ltsh_addon import cli, shading, table_export
+from ltsh_addon.imaging import read_channels
+from ltsh_addon.shading import lookup_table
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENT = ROOT / "tables" / "EXPORT.md"
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, stderr."""
+    code = cli.main([str(argument) for argument in arguments])
+    return code, *capsys.readouterr()
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("exported")
+    table_export.export_tables(table_export.export_prefixes(shading.SHIPPED_TABLES), folder)
+    return folder
+
+
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "out"
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_the_image_holds_the_table_bit_for_bit(exported, name):
+    table, channels = shading.load_table(name), read_channels(exported / f"{name}.exr")
+    pairs = [(l, m) for l in range(table.degree + 1) for m in range(l + 1)]  # noqa: E741
+    suffixes = ["c"] if table.family == "ltc" else [f"c_{l}_{m}" for l, m in pairs]  # noqa: E741
+    warp_names = ["A", "B", "C", "tilt"][: table.warp.shape[2]]
+    expected = {f"warp.{key}": table.warp[..., n] for n, key in enumerate(warp_names)}
+    curves = range(len(table.fresnel_curves))
+    for curve in curves:
+        for k, suffix in enumerate(suffixes):
+            expected[f"curve{curve}.{suffix}"] = table.coefficients[:, :, curve, k]
+    derived = {f"curve{curve}.{kind}" for curve in curves for kind in ("albedo", "average_albedo")}
+    assert set(channels) == set(expected) | derived
+    for key, plane in expected.items():
+        assert channels[key].dtype == np.float32 and plane.dtype == np.float32
+        assert np.array_equal(channels[key].view(np.uint32), np.ascontiguousarray(plane).view(np.uint32)), key
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_the_albedo_is_the_integral_of_the_lobe(exported, name):
+    """At nodes of medium roughness; Gauss-Legendre in z times the trapezoidal rule converges for such smooth lobes,
+    the rest is the rounding of the image to float32. The tilted cosine of LTC has a kink, which leaves 1e-3."""
+    table, channels = shading.load_table(name), read_channels(exported / f"{name}.exr")
+    rows, columns = table.warp.shape[:2]
+    row, column = np.repeat([rows // 2, rows - 1], 3), np.tile([0, columns // 3, columns // 2], 2)
+    z, weights = np.polynomial.legendre.leggauss(200)
+    z, weights = 0.5 * (z + 1.0), 0.5 * weights
+    angle = np.arange(400) * (2.0 * np.pi / 400)
+    side = np.sqrt(1.0 - z * z)[:, None]
+    directions = np.stack(np.broadcast_arrays(side * np.cos(angle), side * np.sin(angle), z[:, None]), axis=-1)
+    directions = directions.reshape(-1, 3)
+    cosine, roughness = np.cos(lookup_table.theta_nodes(columns))[column], lookup_table.roughness_nodes(rows)[row]
+    values = shading.evaluate_lobe(table, cosine, roughness, np.broadcast_to(directions, (len(row), *directions.shape)))
+    expected = values @ np.repeat(weights * (2.0 * np.pi / 400), 400)
+    tolerance = 1e-3 if table.family == "ltc" else 1e-5
+    assert channels["curve0.albedo"][row, column] == pytest.approx(expected, abs=tolerance)
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_the_average_albedo_is_that_of_the_row(exported, name):
+    table, channels = shading.load_table(name), read_channels(exported / f"{name}.exr")
+    for curve in range(len(table.fresnel_curves)):
+        plane = channels[f"curve{curve}.average_albedo"]
+        assert (plane == table.average_albedo[:, curve, None].astype(np.float32)).all()
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_the_attributes_say_the_conventions_and_hold_the_fresnel_curves(exported, name):
+    table = shading.load_table(name)
+    with OpenEXR.File(str(exported / f"{name}.exr"), header_only=True) as file:
+        conventions, fresnel = (json.loads(file.header()[f"ltsh:{key}"]) for key in ("conventions", "fresnel"))
+    assert conventions["table"] == name and "top" in conventions["rows"] and "left" in conventions["columns"]
+    assert conventions["fit"] == table.metadata
+    assert len(conventions["fresnel_curves"]) == len(table.fresnel_curves)
+    assert np.array_equal(fresnel["curves"], table.fresnel_curves) and np.array_equal(fresnel["ior"], table.fresnel_ior)
+    assert np.array_equal(fresnel["dielectric_weights"], table.fresnel_weights)
+
+
+def test_every_channel_is_documented_and_every_documented_one_is_written(exported):
+    documented = re.findall(r"`((?:warp|curve<f>)\.[^`]*)`", DOCUMENT.read_text(encoding="utf-8"))
+    patterns = {re.sub("<[flm]>", r"\\d+", name.replace(".", r"\.")): 0 for name in documented}
+    assert len(patterns) == len(documented) >= 8
+    for name in shading.SHIPPED_TABLES:
+        for channel in read_channels(exported / f"{name}.exr"):
+            matching = [pattern for pattern in patterns if re.fullmatch(pattern, channel)]
+            assert len(matching) == 1, channel
+            patterns[matching[0]] += 1
+    assert all(patterns.values()), patterns
+
+
+def test_exporting_twice_gives_the_same_bytes(exported, out):
+    for path in table_export.export_tables({"ltsh2": "ltsh2"}, out)["ltsh2"]:
+        assert path.read_bytes() == (exported / path.name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [("ltsh4", "ltsh4"), ("My table-2", "my_table_2"), ("a__b.", "a_b"), ("4k", "table_4k"), ("gl", "table_gl"),
+     ("LTSH", "table_ltsh"), ("ä", "table")],
+)  # fmt: skip
+def test_names_in_headers_are_identifiers(name, expected):
+    assert table_export.identifier(name) == expected
+
+
+def test_all_shipped_tables_are_the_default(capsys, out):
+    code, stdout, stderr = run(capsys, "tables", "export", "-o", out, "--quiet")
+    names = [f"{name}.{ending}" for name in shading.SHIPPED_TABLES for ending in ("exr", "h")]
+    assert (code, stderr) == (0, "") and stdout.splitlines() == [str(out / name) for name in names]
+    assert sorted(path.name for path in out.iterdir()) == sorted(names)
+
+
+def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
+    path = tmp_path / "My table.npz"
+    shutil.copy(ROOT / "tables" / "ltc.npz", path)
+    code, stdout, stderr = run(capsys, "tables", "export", "ltc", path, "ltc", "-o", out / "deep", "--json", "--quiet")
+    files = json.loads(stdout)["tables"]
+    assert (code, stderr) == (0, "") and list(files) == ["ltc", str(path)]
+    assert {Path(file).name for written in files.values() for file in written} == {
+        "ltc.exr", "ltc.h", "My table.exr", "My table.h"
+    } == {file.name for file in (out / "deep").iterdir()}  # fmt: skip
+    assert "my_table_integrate_polygon" in (out / "deep" / "My table.h").read_text(encoding="ascii")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["ltsh9", "-o", "OUT"], "table 'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4 or the path"),
+        (["reference", "-o", "OUT"], "'reference' is unknown"),
+        (["ltc"], "-o"),
+        (["ltc", "other/LTC.npz", "-o", "OUT"], "ltc and other/LTC.npz would get the same names"),
+        (["-o", "OUT", "--degree"], "--degree"),
+    ],
+)
+def test_wrong_arguments_are_misuse(capsys, out, arguments, complaint):
+    code, stdout, stderr = run(capsys, "tables", "export", *(out if word == "OUT" else word for word in arguments))
+    assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1] and not out.exists()
+
+
+def _assert_failure(result, complaint):
+    code, stdout, stderr = result
+    assert (code, stdout) == (1, "") and len(stderr.splitlines()) == 1 and complaint in stderr
+
+
+def test_a_broken_table_fails_before_anything_is_written(capsys, out, tmp_path):
+    path = tmp_path / "broken.npz"
+    path.write_bytes(b"")
+    _assert_failure(run(capsys, "tables", "export", "ltc", path, "-o", out, "--quiet"), f"lookup table {path}")
+    _assert_failure(run(capsys, "tables", "export", tmp_path / "no.npz", "-o", out, "--quiet"), "no such file")
+    assert not out.exists()
+
+
+def test_an_output_folder_that_is_a_file_fails(capsys, tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"kept")
+    for folder in (path, path / "below"):
+        _assert_failure(run(capsys, "tables", "export", "ltc", "-o", folder, "--quiet"), f"output folder {folder}")
+    assert path.read_bytes() == b"kept"
+
+
+def _full_disk(*arguments, **options):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _openexr_failure(self, name):
+    raise RuntimeError("Cannot write image file")
+
+
+@pytest.mark.parametrize(
+    ("owner", "attribute", "failure", "named"),
+    [(Path, "write_text", _full_disk, "ltc.h"), (OpenEXR.File, "write", _openexr_failure, "ltc.exr")],
+)
+def test_nothing_is_left_behind_when_writing_fails(capsys, out, monkeypatch, owner, attribute, failure, named):
+    monkeypatch.setattr(owner, attribute, failure)
+    result = run(capsys, "tables", "export", "ltc", "-o", out, "--quiet")
+    _assert_failure(result, f"{out / named}: cannot be written")
+    assert result[2].count("cannot be written") == 1 and list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["ltc.exr", "ltc.h"])
+def test_a_failure_keeps_what_was_there(capsys, out, name):
+    """A folder in the place of one file: neither is replaced."""
+    other = {"ltc.exr": "ltc.h", "ltc.h": "ltc.exr"}[name]
+    (out / name).mkdir(parents=True)
+    (out / other).write_bytes(b"old")
+    _assert_failure(run(capsys, "tables", "export", "ltc", "-o", out, "--quiet"), "a folder has that name")
+    assert (out / other).read_bytes() == b"old" and len(list(out.iterdir())) == 2
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """The add-on as Blender installs it: under another name, with the tables but not their scripts."""
+    folder = tmp_path_factory.mktemp("installed")
+    add_on = folder / "bl_ext" / "user_default" / "ltsh"
+    shutil.copytree(ROOT / "ltsh_addon", add_on / "ltsh_addon", ignore=shutil.ignore_patterns("__pycache__"))
+    (add_on / "tables").mkdir()
+    for path in (ROOT / "tables").glob("*.npz"):
+        shutil.copy(path, add_on / "tables")
+    return folder
+
+
+def _run_without_scipy(folder, package, *arguments):
+    code = f"import sys; sys.modules['scipy'] = None; from {package} import cli; sys.exit(cli.main(sys.argv[1:]))"
+    command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+
+
+def test_the_installed_add_on_exports_without_scipy(installed, exported, out):
+    package = "bl_ext.user_default.ltsh.ltsh_addon"
+    done = _run_without_scipy(installed, package, "tables", "export", "ltsh2", "-o", out, "--quiet")
+    assert (done.returncode, done.stderr) == (0, "")
+    for name in ("ltsh2.exr", "ltsh2.h"):
+        assert (out / name).read_bytes() == (exported / name).read_bytes()
+
+
+@pytest.mark.parametrize("action", ["fit", "validate"])
+def test_fit_and_validate_say_what_they_lack(installed, action):
+    done = _run_without_scipy(installed, "bl_ext.user_default.ltsh.ltsh_addon", "tables", action)
+    assert (done.returncode, done.stdout) == (2, "") and "need the source checkout" in done.stderr
+    done = _run_without_scipy(ROOT, "ltsh_addon", "tables", action)
+    assert (done.returncode, done.stdout) == (2, "") and "need scipy" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

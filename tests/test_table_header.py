@@ -1,0 +1,304 @@
+"""What the functions of exported headers compute, in C and in their GLSL branch (see header_harness)."""
+
+import header_harness
+import numpy as np
+import pytest
+
+from ltsh_addon import shading
+from ltsh_addon.shading.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
+from ltsh_addon.table_header import data_blocks
+
+pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
+
+EPS = float(np.finfo(np.float32).eps)
+ROOM = 8
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("headers")
+
+
+@pytest.fixture(scope="module")
+def tables(folder):
+    """The tables by name; their headers lie in `folder`."""
+    return header_harness.export(folder)
+
+
+@pytest.fixture(
+    scope="module", params=[(name, branch) for branch in ("c", "glsl") for name in header_harness.TABLES], ids="-".join
+)
+def compiled(request, folder, tables):
+    """(table, header) of every table in both branches."""
+    name, branch = request.param
+    table = tables[name]
+    if branch == "c":
+        return table, header_harness.compiled(folder / f"{name}.h", folder, name)
+    if header_harness.CXX_COMPILER is None:
+        pytest.skip("needs a C++ compiler")
+    data = np.concatenate(list(data_blocks(table).values()))
+    return table, header_harness.compiled_glsl_branch(folder / f"{name}.h", folder, name, data)
+
+
+def points(count: int, seed: int, lowest_roughness=0.0):
+    """cos_theta_o and roughness, float32, some of them at the ends of the range."""
+    generator = np.random.default_rng(seed)
+    cosine, roughness = generator.random(count), lowest_roughness + (1.0 - lowest_roughness) * generator.random(count)
+    cosine[:4], roughness[4:8] = (0.0, 1.0, 1e-3, 1.0 - 1e-6), (1.0, lowest_roughness, 1.0, lowest_roughness)
+    return cosine.astype(np.float32), roughness.astype(np.float32)
+
+
+def random_polygons(count: int, corners: int, seed: int) -> np.ndarray:
+    """Planar convex polygons (count, corners, 3) of any winding, float32, about half of them cut by the horizon.
+
+    Their planes keep a distance from the origin: else clipping makes edges that are half circles up to rounding, and no
+    float32 formula knows their direction.
+    """
+    generator = np.random.default_rng(seed)
+    tries = 4 * count
+    center = generator.normal(size=(tries, 1, 3))
+    center[..., 2] = generator.uniform(-0.3, 1.2, (tries, 1))
+    angle = np.sort(generator.random((tries, corners)) * 2.0 * np.pi, axis=1)[..., None]
+    first, second = generator.normal(size=(2, tries, 1, 3))
+    normal = np.cross(first, second)[:, 0]
+    distance = np.abs((normal * center[:, 0]).sum(axis=1)) / np.linalg.norm(normal, axis=1)
+    polygons = center + np.cos(angle) * first + np.sin(angle) * second
+    return polygons[distance > 0.2][:count].astype(np.float32)
+
+
+def half_circle_gaps(table, cosine, roughness, vertices):
+    """How far (P,) from a half circle the edges are, in rad, that the closed form meets after clipping and warping."""
+    lobe, gap = table.lookup(cosine, roughness), np.full(len(cosine), 2.0)
+    for index, polygon in split_at_horizon(vertices.transpose(2, 1, 0)):
+        part = lobe.take(index)
+        warped = part.to_original_domain(polygon)
+        pieces = [(np.arange(len(index)), warped)]
+        if part.tilt is not None:
+            sine, cosine_tilt = np.sin(part.tilt), np.cos(part.tilt)
+            x, y, z = warped
+            turned = np.stack([cosine_tilt * x - sine * z, y, sine * x + cosine_tilt * z])
+            pieces = split_at_horizon(turned)
+        for inner, piece in pieces:
+            shortest = np.linalg.norm(edge_sums(project_to_sphere(piece)), axis=0).min(axis=0)
+            gap[index[inner]] = np.minimum(gap[index[inner]], shortest)
+    return gap
+
+
+def quadrature(table, cosine, roughness, polygon, levels):
+    """Integral of `evaluate_lobe` over the part of one polygon (V, 3) above the horizon: a fan of flat triangles seen
+    from the origin, d omega = |det| / |p|^3 du dv, quartered `levels` times, midpoints; error of order 4^-levels."""
+    above = polygon[:, 2] > 0.0
+    if not above.any():
+        return 0.0
+    if not above.all():
+        polygon = clip_to_horizon(polygon.T[:, :, None])[:, :, 0].T
+    unit = polygon / np.linalg.norm(polygon, axis=1, keepdims=True)
+    # A fan from within: the triangles are far from half circles, at which quartering would stall.
+    apex = unit.sum(axis=0) / np.linalg.norm(unit.sum(axis=0))
+    fan = np.stack([np.broadcast_to(apex, unit.shape), unit, np.roll(unit, -1, axis=0)], axis=1)
+    for _ in range(levels):
+        a, b, c = fan[:, 0], fan[:, 1], fan[:, 2]
+        ab, bc, ca = (middle / np.linalg.norm(middle, axis=1, keepdims=True) for middle in (a + b, b + c, c + a))
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        fan = np.concatenate([np.stack(part, axis=1) for part in parts])
+    # Three points of degree 2 in each triangle.
+    nodes = np.full((3, 3), 1.0 / 6.0) + 0.5 * np.eye(3)
+    directions = nodes @ fan
+    length = np.linalg.norm(directions, axis=2)
+    measure = np.abs(np.linalg.det(fan))[:, None] / 6.0 / length**3
+    values = shading.evaluate_lobe(table, [cosine], [roughness], (directions / length[..., None]).reshape(1, -1, 3))
+    return float(values[0] @ measure.ravel())
+
+
+def test_the_quadrature_knows_a_solid_angle():
+    """A lobe without warp: alpha of 1/2, C = A = 1, B = 0 at normal incidence, so that D is D_orig."""
+    table = header_harness.synthetic_table("ltsh", 1)
+    table.warp[...] = (1.0, 0.0, 1.0)
+    table.coefficients[...] = (np.sqrt(4.0 * np.pi), 0.0, 0.0)
+    octant = np.eye(3)
+    assert quadrature(table, 1.0, np.sqrt(0.5), octant, 5) == pytest.approx(0.5 * np.pi, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", header_harness.TABLES)
+def test_the_numbers_come_back_bit_for_bit(folder, tables, name):
+    table = tables[name]
+    rows, columns = table.warp.shape[:2]
+    header = header_harness.compiled(folder / f"{name}.h", folder, name)
+    nodes = np.concatenate([table.warp, table.coefficients.reshape(rows, columns, -1)], axis=2)
+    others = (table.fresnel_ior, table.fresnel_weights, table.fresnel_curves, table.average_albedo)
+    expected = np.concatenate([np.ravel(part).astype(np.float32) for part in (nodes, *others)])
+    assert np.array_equal(header.data(len(expected)).view(np.uint32), expected.view(np.uint32))
+
+
+def test_lookups_agree(compiled):
+    """The position in the table, up to 63, has an error of a few eps, hence 1e-5 of what a channel spans."""
+    table, header = compiled
+    cosine, roughness = points(4000, seed=1)
+    for curve in range(len(table.fresnel_curves)):
+        found = header.call("lookup", cosine, roughness, curve, shape=(5 + header.coefficients,))
+        lobe = table.lookup(cosine.astype(float), roughness.astype(float))
+        tilt = np.zeros(len(cosine)) if lobe.tilt is None else lobe.tilt
+        expected = np.stack([lobe.xx, lobe.xz, lobe.yy, lobe.zz, tilt, *lobe.coefficients[curve]], axis=1)
+        assert (np.abs(found - expected) <= 1e-5 * np.abs(expected).max(axis=0)).all()
+
+
+def test_values_out_of_range_are_clamped(compiled):
+    _, header = compiled
+    outside, inside = ([-1.0, 2.0, np.nan, 0.5, 0.5], [0.0, 1.0, 0.0, 0.5, 0.5])
+    roughness, clamped = ([0.5, 0.5, 0.5, -3.0, np.inf], [0.5, 0.5, 0.5, 0.0, 1.0])
+    shape = (5 + header.coefficients,)
+    found = header.call("lookup", outside, roughness, 0, shape=shape)
+    assert np.array_equal(found, header.call("lookup", inside, clamped, 0, shape=shape))
+
+
+def test_dielectrics_agree(compiled):
+    """Weights and coefficients of size up to S add up with rounding errors of eps S each; the position among the
+    indices of refraction, up to 240, has an error of 240 eps of the step between neighbors."""
+    table, header = compiled
+    cosine, roughness = points(2000, seed=2)
+    low, high = table.fresnel_ior[[0, -1]]
+    ior = np.random.default_rng(3).uniform(low - 0.2, high + 0.2, 2000)
+    ior[: len(table.fresnel_ior)] = table.fresnel_ior
+    ior = ior.astype(np.float32)
+    found = header.call("dielectric", cosine, roughness, ior, shape=(header.coefficients,))
+    coefficients = table.lookup(cosine.astype(float), roughness.astype(float)).coefficients
+    weights = table.dielectric_weights(ior.astype(float))
+    expected = np.einsum("fp,fkp->pk", weights, coefficients)
+    scale = (np.abs(weights)[:, None] * np.abs(coefficients)).sum(axis=0).max()
+    assert np.abs(found - expected).max() <= 2e-5 * scale
+
+
+def test_fresnel_curves_and_average_albedos_agree(compiled):
+    """Linear interpolation at a position up to 256: errors of some 256 eps of the step between neighbors."""
+    table, header = compiled
+    share = np.random.default_rng(4).random(500).astype(np.float32)
+    share[:2] = 0.0, 1.0
+    for curve, values in enumerate(table.fresnel_curves):
+        expected = np.interp(share, np.linspace(0.0, 1.0, len(values)), values)
+        assert header.call("fresnel", share, curve) == pytest.approx(expected, abs=1e-5)
+        expected = np.interp(share, np.linspace(0.0, 1.0, len(table.warp)), table.average_albedo[:, curve])
+        assert header.call("average_albedo", share, curve) == pytest.approx(expected, abs=1e-5)
+
+
+def test_albedos_agree(compiled):
+    table, header = compiled
+    cosine, roughness = points(1000, seed=5)
+    albedo = table.lookup(cosine.astype(float), roughness.astype(float)).albedo()
+    for curve, expected in enumerate(albedo):
+        assert header.call("albedo", cosine, roughness, curve) == pytest.approx(expected, abs=2e-5)
+
+
+def test_lobes_agree(compiled):
+    """A lobe is 1 / alpha times narrower than a hemisphere, so that a rounding error of eps in the direction is a
+    relative error of eps / alpha of its value, or of eps / alpha of its size where the terms of the expansion cancel.
+    """
+    table, header = compiled
+    cosine, roughness = points(20000, seed=6, lowest_roughness=0.1)
+    directions = np.random.default_rng(7).normal(size=(20000, 3))
+    directions = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    found = header.call("lobe", cosine, roughness, directions)
+    exact = [array.astype(float) for array in (cosine, roughness, directions[:, None])]
+    expected = shading.evaluate_lobe(table, *exact)[:, 0]
+    size = np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    tolerance = 500.0 * EPS / roughness**2 * (np.abs(expected) + 0.01 * size)
+    assert (np.abs(found - expected) <= tolerance).all()
+    assert (found[directions[:, 2] <= 0.0] == 0.0).all() and np.abs(expected).max() > 0.1
+
+
+def test_clipped_polygons_agree(compiled):
+    """Corner by corner; a new corner carries the rounding of one quotient and one product."""
+    _, header = compiled
+    for corners in (3, 6):
+        vertices = random_polygons(300, corners, seed=40 + corners)
+        for polygon, found in zip(vertices, header.clip(vertices, ROOM), strict=True):
+            if not (polygon[:, 2] > 0.0).any():
+                assert len(found) == 0
+                continue
+            expected = clip_to_horizon(polygon.astype(float).T[:, :, None])[:, :, 0].T
+            assert found == pytest.approx(expected, abs=1e-6 * float(np.abs(polygon).max()))
+            assert (found[:, 2] >= 0.0).all()
+
+
+def test_corners_without_room_are_left_out(compiled):
+    _, header = compiled
+    vertices = np.random.default_rng(50).random((2, ROOM + 3, 3)).astype(np.float32)
+    assert all(
+        np.array_equal(found, given[:ROOM]) for found, given in zip(header.clip(vertices, ROOM), vertices, strict=True)
+    )
+
+
+def test_form_factors_agree(compiled):
+    """Errors of a few eps, or eps / gap where an edge ends `gap` > 0.01 short of a half circle."""
+    _, header = compiled
+    vertices = random_polygons(3000, 4, seed=51)
+    error = np.abs(header.call("form_factor", 4, vertices) - shading.clamped_form_factor(vertices.astype(float)))
+    assert error.max() < 5e-6 and np.quantile(error, 0.98) < 1e-6
+
+
+def test_local_frames_are_rotations_that_lay_the_view_direction_flat(compiled):
+    """Where view and normal are `angle` apart the tangent has an error of eps / angle, at most 1e-3."""
+    _, header = compiled
+    generator = np.random.default_rng(52)
+    normal, view = generator.normal(size=(2, 400, 3))
+    view[:100] = normal[:100] + np.geomspace(1e-8, 1.0, 100)[:, None] * view[:100]
+    view[100:103], normal[100:103] = np.eye(3), np.eye(3)
+    normal, view = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (normal, view))
+    vectors = np.stack([generator.normal(size=(400, 3)) for _ in range(3)])
+    local = [header.call("local", normal, view, v, shape=(3,)) for v in (normal, view, *vectors)]
+    assert local[0] == pytest.approx(np.tile([0.0, 0.0, 1.0], (400, 1)), abs=1e-3)
+    assert np.abs(local[1][:, 1]).max() < 1e-3 and local[1][:, 0].min() > -1e-3
+    assert local[1][:, 2] == pytest.approx((normal * view).sum(axis=1), abs=1e-6)
+    after, before = np.linalg.det(np.stack(local[2:], axis=1)), np.linalg.det(vectors.transpose(1, 0, 2))
+    assert after == pytest.approx(before, abs=1e-2)
+
+
+@pytest.mark.parametrize("corners", [3, 4, 5])
+def test_polygon_integrals_agree_with_the_add_on(compiled, corners):
+    """Against float64 on the same float32 input: the direction of an edge that ends `gap` short of a half circle has an
+    error of some eps / gap, which is the error of what the edge adds."""
+    table, header = compiled
+    cosine, roughness = points(2000, seed=8)
+    vertices = random_polygons(2000, corners, seed=9 + corners)
+    exact = [array.astype(float) for array in (cosine, roughness, vertices)]
+    tolerance = 20.0 * EPS / half_circle_gaps(table, *exact) * np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    found = header.call("integrate", cosine, roughness, corners, vertices)
+    assert (np.abs(found - shading.integrate_polygon(table, *exact)) <= tolerance).all()
+    signed = header.call("integral", cosine, roughness, 0, corners, vertices)
+    assert (np.abs(signed - shading.integrate_polygon(table, *exact, signed=True)) <= tolerance).all()
+    clipped = (vertices[..., 2] > 0.0).any(axis=1) & (vertices[..., 2] < 0.0).any(axis=1)
+    assert 0.2 < clipped.mean() < 0.8 and np.quantile(tolerance, 0.9) < 1e-3 * np.abs(signed).max()
+    assert (signed > 0.01).any() and (signed < -0.01).any() and (found >= 0.0).all()
+
+
+def test_polygon_integrals_agree_with_quadrature(compiled):
+    """Lobes of medium width. The error of the rule falls fourfold or faster per level: what is left is less than what
+    the last two levels changed."""
+    table, header = compiled
+    cosine, roughness = points(30, seed=20, lowest_roughness=0.6)
+    vertices = random_polygons(30, 4, seed=21)
+    found = np.abs(header.call("integral", cosine, roughness, 0, 4, vertices))
+    exact = list(zip(cosine, roughness, vertices.astype(float), strict=True))
+    levels = np.array([[abs(quadrature(table, *row, level)) for row in exact] for level in (3, 4, 5)])
+    change = np.abs(np.diff(levels, axis=0)).max(axis=0)
+    assert (np.abs(found - levels[-1]) <= change + 1e-5).all()
+    assert np.median(change) < 1e-4 and levels.max() > 0.1
+
+
+def test_a_polygon_over_the_whole_hemisphere_gives_the_albedo(compiled):
+    """Of every curve and with the sign of its winding, also where rounding takes the solid angle beyond 2 pi. The gap
+    at the horizon is at most 2e-3 rad wide: that share of the sphere is what is missing. LTC clips a second time, which
+    leaves an edge that ends about twice the height short of a half circle, with an error of some eps / height."""
+    table, header = compiled
+    generator = np.random.default_rng(31)
+    cosine, roughness = points(300, seed=30, lowest_roughness=0.5)
+    lowest = 1e-4 if table.family == "ltc" else 1e-9
+    angle = 0.5 * np.pi * np.arange(4) + generator.random((300, 1)) * 2.0 * np.pi
+    height = np.broadcast_to(np.geomspace(lowest, 1e-3, 300)[:, None], angle.shape)
+    vertices = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).astype(np.float32)
+    for curve in range(len(table.fresnel_curves)):
+        expected = header.call("albedo", cosine, roughness, curve)
+        tolerance = 0.02 * float(np.abs(table.coefficients[:, :, curve]).sum(axis=2).max())
+        found = header.call("integral", cosine, roughness, curve, 4, vertices)
+        assert found == pytest.approx(expected, abs=tolerance)
+        found = header.call("integral", cosine, roughness, curve, 4, vertices[:, ::-1])
+        assert found == pytest.approx(-expected, abs=tolerance)

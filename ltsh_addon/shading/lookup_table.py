@@ -102,15 +102,10 @@ class LookupTable:
         curves = total if curves is None else curves
         wanted = self._channels[: parameters + curves * count]
         channels = _interpolate(wanted, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
-        a, b, c = channels[0], channels[1], channels[2]
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
-        squared = cosine * cosine + WARP_REGULARIZATION**2 * alpha * alpha
         sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
         return Lobe(
-            xx=a * squared,
-            xz=a * b * np.sqrt(squared) * sine,
-            yy=c,
-            zz=2.0 * alpha,
+            *warp_entries(cosine, sine, alpha, *channels[:3]),
             tilt=channels[3] if parameters == 4 else None,
             coefficients=channels[parameters:].reshape(curves, count, -1),
         )
@@ -118,6 +113,13 @@ class LookupTable:
     def dielectric_weights(self, ior: np.ndarray) -> np.ndarray:
         """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
+
+
+def warp_entries(cosine, sine, alpha, a, b, c):
+    """Entries (xx, xz, yy, zz) of W at theta_o for the stored A, B, C. Callers give the sine too: in single precision
+    it does not follow from a cosine close to one."""
+    squared = cosine * cosine + (WARP_REGULARIZATION * alpha) ** 2
+    return a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha
 
 
 def _theta_coordinate(cosine):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from . import edge_loop
-from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
+from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
 
 # Sharper lobes amplify the rounding of directions too much for single precision: at this roughness 2 alpha = 0.02.
 SHARP_ROUGHNESS = 0.1
@@ -67,9 +67,7 @@ class RidgeTable:
         coordinate = 1.0 - np.sqrt(np.maximum(1.0 - theta * np.float32(2.0 / np.pi), np.float32(0.0)))
         values = _bilinear(channels, shape, roughness, coordinate, scratch)
         alpha = np.maximum(roughness * roughness, np.float32(MIN_ALPHA))
-        squared = cosine * cosine + np.float32(WARP_REGULARIZATION**2) * alpha * alpha
-        a, b, c = values[:3]
-        warp = np.stack([a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha])
+        warp = np.stack(warp_entries(cosine, sine, alpha, *values[:3]))
         count = len(self.parameters)
         weights = values[count:].reshape(-1, self.weights.shape[1], len(roughness))
         if many:

@@ -25,8 +25,10 @@ SEPARATE_IORS = 8
 def shade_diffuse(samples, lights, radiance, scratch):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     lights = [item for item in lights if item[0].affects_diffuse]
-    lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
-    bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
+    lit = np.nonzero(_any(samples.diffuse_albedo))[0]
+    bumped = np.zeros(len(lit), bool)
+    if samples.diffuse_normal is not samples.smooth_normal:
+        bumped = _any(samples.diffuse_normal != samples.smooth_normal)[lit]
     fragile = [[] for _ in lights]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
@@ -47,9 +49,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
     """As `shade_diffuse` for the specular lobes of `table`."""
     lights = [item for item in lights if item[0].affects_specular]
     ridges = ridge_table.prepare(table)
-    cosine = (samples.normal * samples.view).sum(axis=1)
-    reflective = samples.specular_f90.any(axis=1) | samples.specular_f0.any(axis=1) | (samples.dielectric > 0.0)
-    lit = reflective & (cosine > 0.0)
+    reflective = _any(samples.specular_f90) | _any(samples.specular_f0) | (samples.dielectric > 0.0)
+    lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
     fragile = [[] for _ in lights]
     for vectors, members, color_rows in _fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
@@ -65,6 +66,11 @@ def shade_specular(samples, lights, table, radiance, scratch):
     _add_double(samples, [np.nonzero(sharp)[0]], radiance, in_double, lights)
     for item, parts in zip(lights, fragile, strict=True):
         _add_double(samples, parts, radiance, in_double, [item])
+
+
+def _any(vectors):
+    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
+    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
 
 
 def _chunks(members):
@@ -181,8 +187,8 @@ def _fresnel_kinds(samples, members):
 
     `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
     """
-    metal = samples.specular_f90[members].any(axis=1) | samples.specular_f0[members].any(axis=1)
-    flat = (samples.specular_f90[members] == samples.specular_f0[members]).all(axis=1)
+    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members]
+    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members]
     dielectric = samples.dielectric[members] > 0.0
 
     def white(index):
@@ -260,7 +266,7 @@ def _lobe_rows(samples, index, ridges, vectors, scratch):
         rows.append(normal)
         clip_rows = (3, 2)
     geometric = samples.geometric_normal[index]
-    if (geometric != samples.normal[index]).any():
+    if samples.geometric_normal is not samples.normal and (geometric != samples.normal[index]).any():
         rows.append(np.ascontiguousarray(geometric.T, dtype=np.float32))
         clip_rows = (len(rows) - 1, *clip_rows)
     return np.stack(rows), clip_rows, weights

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -19,6 +20,22 @@ REFERENCE = "reference"
 FINE_ROUND_LIGHT_CORNERS = 64
 
 
+@dataclass(frozen=True)
+class LightOfEachSample:
+    """One light per sample, in place of an AreaLight for all; its corners are (V, P, 3)."""
+
+    center: np.ndarray  # (P, 3)
+    direction: np.ndarray  # (P, 3)
+    radiance: np.ndarray  # (P, 3)
+    affects_diffuse: bool = True
+    affects_specular: bool = True
+
+
+def _of(vector, index):
+    """The vector (3,) that is the same for all samples, or those of the samples `index`."""
+    return vector if vector.ndim == 1 else vector[index]
+
+
 def shade_diffuse(samples, lights, radiance):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     frame = _frame(samples.diffuse_normal, samples.view)
@@ -29,10 +46,10 @@ def shade_diffuse(samples, lights, radiance):
             continue
         for index, polygon in _visible_parts(samples, frame, light, corners, lit[~bumped]):
             irradiance = np.abs(form_factor(polygon))
-            radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * light.radiance
+            radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * _of(light.radiance, index)
         for index, polygon in _visible_parts(samples, frame, light, corners, lit[bumped], samples.smooth_normal):
             irradiance = _shadowed_form_factor(samples, frame, index, polygon)
-            radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * light.radiance
+            radiance[group, index] += irradiance[:, None] * samples.diffuse_albedo[index] * _of(light.radiance, index)
 
 
 def _shadowed_form_factor(samples, frame, index, polygon):
@@ -67,7 +84,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
             plain, schlick, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index, None] * dielectric
-            radiance[group, index] += reflected * light.radiance
+            radiance[group, index] += reflected * _of(light.radiance, index)
 
 
 def _reference_integrals(samples, cosine, frame, light, corners, candidates, error):
@@ -140,7 +157,8 @@ def _frame(normal, view):
 
 def _in_front(position, light, candidates):
     """Those candidate points that lie on the side to which the light shines."""
-    return candidates[((position[candidates] - light.center) * light.direction).sum(axis=1) > 0.0]
+    center, direction = _of(light.center, candidates), _of(light.direction, candidates)
+    return candidates[((position[candidates] - center) * direction).sum(axis=1) > 0.0]
 
 
 def _to_local(axes, vectors):
@@ -156,7 +174,8 @@ def _visible_parts(samples, frame, light, corners, candidates, second_normal=Non
     index = _in_front(samples.position, light, candidates)
     if len(index) == 0:
         return
-    offset = (corners[:, None, :] - samples.position[index]).transpose(2, 0, 1)
+    corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
+    offset = (corners - samples.position[index]).transpose(2, 0, 1)
     local = _to_local(frame[:, :, index], offset)
     parts = [(slice(None), local)]
     if second_normal is not None:

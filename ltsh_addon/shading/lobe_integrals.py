@@ -93,8 +93,8 @@ def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coeff
         return coefficients[:, 0] * _tilted_cosine_integral(warped, lobe.tilt)
     moments = integrals_on_sphere(partial(edge_integrals.moments, degree=table.degree), warped)
     weights = table.ridge_weights.astype(moments.dtype)
-    # Plain loops over K: no BLAS, so that a result does not depend on how many points share a batch.
-    ridge_moments = np.stack([_weighted_sum(row, moments) for row in weights])
+    # Not a matrix product: BLAS may give other bits to points that share a batch with others.
+    ridge_moments = np.einsum("kr,rp->kp", weights, moments)
     return np.stack([(vector * ridge_moments).sum(axis=0) for vector in coefficients])
 
 
@@ -106,14 +106,6 @@ def integrals_on_sphere(integral, vertices: np.ndarray) -> np.ndarray:
     if len(long):
         result[..., long] = integral(project_to_sphere(split_long_edges(vertices[:, :, long])))
     return result
-
-
-def _weighted_sum(weights, rows):
-    total = np.zeros_like(rows[0])
-    for weight, row in zip(weights, rows, strict=True):
-        if weight != 0.0:
-            total += weight * row
-    return total
 
 
 def _tilted_cosine_integral(warped, tilt):

@@ -41,8 +41,7 @@ def shade_diffuse(samples, lights, radiance, scratch):
             colors = _columns(samples.diffuse_albedo, index)[None]
             integrate = integrate or _Cosine(scratch)
             _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
-    for item, parts in zip(lights, fragile, strict=True):
-        _add_double(samples, parts, radiance, double_precision.shade_diffuse, [item])
+    _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
 
 
 def shade_specular(samples, lights, table, radiance, scratch):
@@ -63,9 +62,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
     def in_double(part, items, target):
         double_precision.shade_specular(part, items, table, target)
 
-    _add_double(samples, [np.nonzero(sharp)[0]], radiance, in_double, lights)
-    for item, parts in zip(lights, fragile, strict=True):
-        _add_double(samples, parts, radiance, in_double, [item])
+    _add_double(samples, np.nonzero(sharp)[0], lights, radiance, in_double)
+    _add_fragile(samples, lights, fragile, radiance, in_double)
 
 
 def _any(vectors):
@@ -82,16 +80,42 @@ def _columns(vectors, index):
     return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
 
 
-def _add_double(samples, parts, radiance, shade, lights):
-    """Add the light of `lights` at the samples `parts`, index arrays, by a function of `double_precision`."""
-    if not parts:
-        return
-    members = np.concatenate(parts)
+def _add_double(samples, members, lights, radiance, shade):
+    """Add the light of `lights` at the samples `members` (Q,) by a function of `double_precision`."""
     for start in range(0, len(members), DOUBLE_CHUNK):
         index = members[start : start + DOUBLE_CHUNK]
         target = np.zeros((len(radiance), len(index), 3))
         shade(samples.take(index), lights, target)
         radiance[:, index] += target.astype(np.float32)
+
+
+def _add_fragile(samples, lights, fragile, radiance, shade):
+    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all lights with equally
+    many corners in one batch, for there are few such samples."""
+    for count in sorted({len(corners) for _, _, corners in lights}):
+        chosen = [
+            (item, np.concatenate(parts))
+            for item, parts in zip(lights, fragile, strict=True)
+            if parts and len(item[2]) == count
+        ]
+        if not chosen:
+            continue
+        members = np.concatenate([index for _, index in chosen])
+        number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
+        group = np.array([item[1] for item, _ in chosen])[number]
+        corners = np.stack([item[2] for item, _ in chosen])
+        fields = {
+            name: np.stack([getattr(item[0], name) for item, _ in chosen])
+            for name in ("center", "direction", "radiance")
+        }
+        for start in range(0, len(members), DOUBLE_CHUNK):
+            part = slice(start, start + DOUBLE_CHUNK)
+            of = number[part]
+            light = double_precision.LightOfEachSample(**{name: values[of] for name, values in fields.items()})
+            target = np.zeros((1, len(of), 3))
+            shade(samples.take(members[part]), [(light, 0, corners[of].transpose(1, 0, 2))], target)
+            # A sample may be there for several lights.
+            np.add.at(radiance, (group[part], members[part]), target[0].astype(np.float32))
 
 
 def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch):

@@ -89,12 +89,12 @@ class _Queue:
         self._keep = keep
         self._left, self._total, self._done = deque(blocks), len(blocks), 0
         self._changed = threading.Condition()
-        self._stopped = False
+        self.stopped = False
 
     def next(self):
         """A block that nobody works on, or None."""
         with self._changed:
-            return self._left.popleft() if self._left and not self._stopped else None
+            return self._left.popleft() if self._left and not self.stopped else None
 
     def give_back(self, block):
         with self._changed:
@@ -115,7 +115,7 @@ class _Queue:
 
     def stop(self):
         with self._changed:
-            self._stopped = True
+            self.stopped = True
 
     def share(self) -> float:
         return self._done / self._total
@@ -139,6 +139,8 @@ class _Child:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 pass_fds=self._side.memory.inherited,
+                # Nothing here uses BLAS, whose threads take time to start.
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 # Ctrl-C goes to the parent alone, which ends the child; no console window on Windows.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
@@ -163,6 +165,8 @@ class _Child:
                 self._check(worker.receive(answers))
                 self._queue.done(block, *self._side.take(block))
         except (OSError, EOFError, ValueError, _ChildError) as error:
+            if self._queue.stopped:
+                return  # `end` has killed the process
             if block is not None:
                 # This process computes it instead, and meets the same error if the block is at fault.
                 self._queue.give_back(block)

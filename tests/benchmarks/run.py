@@ -165,7 +165,7 @@ def repeated(function, count):
 
 def processes(options):
     """One and two processes, and peak memory."""
-    count = 300_000 if options.quick else 1_000_000
+    count = 300_000 if options.quick else 2_000_000
     samples, lights = floor_scene(count, 8, "schlick")
     for name in ("ltc", "ltsh4"):
         heading(f"processes: {name}, Schlick, {count} samples, 8 lights")

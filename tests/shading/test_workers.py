@@ -94,12 +94,13 @@ def test_progress_is_reported_from_this_thread_and_reaches_one(started):
     assert threads == {threading.main_thread()}
 
 
-def test_cancelling_ends_the_children(started, children_only):
+def test_cancelling_ends_the_children(started, children_only, caplog):
     start = time.monotonic()
     with pytest.raises(Cancelled):
         shading.shade(random_samples(400), four_lights(), shading.REFERENCE, workers=3, progress=lambda _: False)
     assert len(started) == 2 and all_ended(started)
     assert time.monotonic() - start < 30.0
+    assert not caplog.records
 
 
 def test_an_error_ends_the_children(started):

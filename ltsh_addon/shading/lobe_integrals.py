@@ -93,8 +93,8 @@ def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coeff
         return coefficients[:, 0] * _tilted_cosine_integral(warped, lobe.tilt)
     moments = integrals_on_sphere(partial(edge_integrals.moments, degree=table.degree), warped)
     weights = table.ridge_weights.astype(moments.dtype)
-    # Not a matrix product: BLAS may give other bits to points that share a batch with others.
-    ridge_moments = np.einsum("kr,rp->kp", weights, moments)
+    # Not a matrix product: with BLAS the bits of a point may depend on how many points share its batch.
+    ridge_moments = sum(column[:, None] * row for column, row in zip(weights.T, moments, strict=True))
     return np.stack([(vector * ridge_moments).sum(axis=0) for vector in coefficients])
 
 

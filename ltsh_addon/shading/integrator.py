@@ -19,7 +19,7 @@ PASSES = ("specular", "diffuse")
 # A block is what one process takes at a time, and what is shaded between two calls of `progress`: a share of the
 # samples, within these limits.
 BLOCKS = 16
-BLOCK_LIMITS = (16384, 131072)
+BLOCK_LIMITS = (32768, 131072)
 REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 

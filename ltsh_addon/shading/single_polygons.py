@@ -9,8 +9,8 @@ import numpy as np
 from . import edge_loop, ridge_table
 from .light_polygons import integrate_visible
 
-# Corners per chunk: its arrays stay in the cache.
-CORNERS = 49152
+# Corners per chunk, as in `single_precision`.
+CORNERS = 98368
 
 
 def integrate(table, cosine, roughness, vertices, signed):

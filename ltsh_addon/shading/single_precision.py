@@ -14,8 +14,8 @@ import numpy as np
 from . import double_precision, edge_loop, ridge_table
 from .light_polygons import integrate_visible, local_corners
 
-# Samples and corners per chunk: large, for a call of numpy costs as much as some thousand elements; rows are not a multiple
-# of a page long, where the cache would hold few of them.
+# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
+# multiple of a page long, where the cache would hold few of them.
 CHUNK = 24592
 CORNERS = 4 * CHUNK
 DOUBLE_CHUNK = 4096

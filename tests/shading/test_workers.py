@@ -231,3 +231,45 @@ def test_the_package_may_have_another_name_in_the_parent():
     stream.seek(0)
     found = worker.receive(stream, "bl_ext.repository.ltsh.ltsh_addon")
     assert found.__module__ == "ltsh_addon.shading.brdf"
+
+
+RENAMED = """
+import importlib, sys, types
+for name in ("bl_ext", "bl_ext.user_default", "bl_ext.user_default.ltsh"):
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = []
+sys.modules["bl_ext.user_default.ltsh"].__path__ = [{root!r}]
+sys.path[:] = [entry for entry in sys.path if entry not in ("", {root!r})]
+package = "bl_ext.user_default.ltsh.ltsh_addon."
+shading, scene, workers, integrator = (
+    importlib.import_module(package + name) for name in ("shading", "scene", "shading.workers", "shading.integrator")
+)
+import numpy as np
+workers.SECONDS_WORTH_A_CHILD = 0.0
+integrator.BLOCK_LIMITS = (8, 8)
+by_children = []
+done = workers._Queue.done
+def counted(self, *arguments):
+    import threading
+    by_children.append(threading.current_thread() is not threading.main_thread())
+    done(self, *arguments)
+workers._Queue.done = counted
+up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
+position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
+samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)
+light = scene.AreaLight("Lamp", "RECTANGLE", (0, 0, 2), (1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 1, 1))
+import time
+one, two = (
+    shading.shade(samples, [light], "ltsh4", workers=count, progress=lambda _: time.sleep(0.2 * (count - 1))).combined
+    for count in (1, 2)
+)
+print(np.array_equal(one, two), any(by_children), "ltsh_addon" in sys.modules)
+"""
+
+
+def test_children_work_for_the_package_as_blender_loads_it():
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", RENAMED.format(root=str(ROOT))],
+        capture_output=True, text=True, timeout=120, check=False, cwd=Path(__file__).parent,
+    )  # fmt: skip
+    assert run.stdout.split() == ["True", "True", "False"], run.stderr

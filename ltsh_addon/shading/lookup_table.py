@@ -103,9 +103,8 @@ class LookupTable:
         wanted = self._channels[: parameters + curves * count]
         channels = _interpolate(wanted, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
-        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
         return Lobe(
-            *warp_entries(cosine, sine, alpha, *channels[:3]),
+            *warp_entries(cosine, alpha, *channels[:3]),
             tilt=channels[3] if parameters == 4 else None,
             coefficients=channels[parameters:].reshape(curves, count, -1),
         )
@@ -115,9 +114,11 @@ class LookupTable:
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
 
 
-def warp_entries(cosine, sine, alpha, a, b, c):
-    """Entries (xx, xz, yy, zz) of W at theta_o for the stored A, B, C. Callers give the sine too: in single precision
-    it does not follow from a cosine close to one."""
+def warp_entries(cosine, alpha, a, b, c, sine=None):
+    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast. In single precision the sine does not
+    follow from a cosine close to one: give it."""
+    if sine is None:
+        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
     squared = cosine * cosine + (WARP_REGULARIZATION * alpha) ** 2
     return a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha
 

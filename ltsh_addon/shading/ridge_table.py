@@ -67,7 +67,7 @@ class RidgeTable:
         coordinate = 1.0 - np.sqrt(np.maximum(1.0 - theta * np.float32(2.0 / np.pi), np.float32(0.0)))
         values = _bilinear(channels, shape, roughness, coordinate, scratch)
         alpha = np.maximum(roughness * roughness, np.float32(MIN_ALPHA))
-        warp = np.stack(warp_entries(cosine, sine, alpha, *values[:3]))
+        warp = np.stack(warp_entries(cosine, alpha, *values[:3], sine=sine))
         count = len(self.parameters)
         weights = values[count:].reshape(-1, self.weights.shape[1], len(roughness))
         if many:

@@ -8,6 +8,7 @@ degenerate polygons, and no Fresnel factor.
 
 import numpy as np
 
+from ltsh_addon.shading.lookup_table import MIN_ALPHA, warp_entries
 from ltsh_addon.shading.polygon import split_at_horizon
 
 CHUNK = 12288
@@ -33,17 +34,11 @@ class TextbookLtc:
         near = self.channels[:, corner] * (1 - v) + self.channels[:, corner + 1] * v
         far = self.channels[:, corner + columns] * (1 - v) + self.channels[:, corner + columns + 1] * v
         a, b, c, tilt, scale = near * (1 - u) + far * u
-        xx, xz, yy, zz = self.warp(cosine, roughness, a, b, c)
+        alpha = np.maximum(roughness * roughness, np.float32(MIN_ALPHA))
+        xx, xz, yy, zz = warp_entries(cosine, alpha, a, b, c)
         sin, cos = np.sin(tilt), np.cos(tilt)
         zero = np.zeros_like(a)
         return ((cos * xx, zero, cos * xz - sin * zz), (zero, yy, zero), (sin * xx, zero, sin * xz + cos * zz)), scale
-
-    @staticmethod
-    def warp(cosine, roughness, a, b, c):
-        from ltsh_addon.shading.lookup_table import MIN_ALPHA, warp_entries
-
-        sine = np.sqrt(np.maximum(1 - cosine * cosine, 0))
-        return warp_entries(cosine, sine, np.maximum(roughness * roughness, np.float32(MIN_ALPHA)), a, b, c)
 
     def integrate_polygon(self, cosine, roughness, vertices):
         """Integrals (P,) over polygons (P, V, 3)."""

@@ -9,8 +9,8 @@ import numpy as np
 from . import edge_loop, ridge_table
 from .light_polygons import integrate_visible
 
-# Corners per chunk, as in `single_precision`.
-CORNERS = 98368
+# Corners per chunk: a compromise between calls of numpy and arrays that stay in the cache.
+CORNERS = 49216
 
 
 def integrate(table, cosine, roughness, vertices, signed):

@@ -10,13 +10,15 @@ PYTEST_OPTIONS ?=
 # Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
 STRICT ?=
 
-.PHONY: help demo test lint tables lock clean test-3.13 test-3.11
+.PHONY: help demo test lint tables lock clean bench soak test-3.13 test-3.11
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    build the example scene, shade it, compare it with Cycles: out/demo/compare.png, report.json'
 	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
 	@echo 'make lint    ruff only'
+	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (5 minutes)'
+	@echo 'make soak    1e8 random integrals, 1e5 random polygons of each kind against quadrature (hours)'
 	@echo 'make tables  fit the lookup tables in tables/ again (long)'
 	@echo 'make lock    resolve requirements/*.in into the lock files; LOCK_OPTIONS=--upgrade takes newer versions'
 	@echo 'make clean   remove out/, build/ and caches (the environments in .venv stay)'
@@ -40,6 +42,12 @@ test-3.13 test-3.11: test-%:
 		status=$(if $(STRICT),1,0); \
 	fi; \
 	exit $$status
+
+bench:
+	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)
+
+soak:
+	@python=$$($(SETUP) python newest) && "$$python" tests/soak/soak.py $(SOAK_OPTIONS)
 
 tables:
 	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon tables fit

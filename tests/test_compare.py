@@ -170,8 +170,9 @@ def test_figures_against_the_reference_come_from_samples(child, tmp_path):
     even, odd = slice(0, None, 2), slice(1, None, 2)
     for index, expected in ((slice(None), row), (even, row["metals"]), (odd, row["dielectrics"])):
         error = np.linalg.norm((found - truth)[index]) / np.linalg.norm(truth[index])
-        assert expected["relative_l2"] == pytest.approx(error, rel=1e-9) and expected["pixels"] == len(truth[index])
-    assert report["passes"]["diffuse"]["techniques"]["ltc"]["against_reference"]["relative_l2"] < 1e-9
+        # Radiance is float32: rounding of 6e-8 in a difference of 7e-3.
+        assert expected["relative_l2"] == pytest.approx(error, rel=1e-4) and expected["pixels"] == len(truth[index])
+    assert report["passes"]["diffuse"]["techniques"]["ltc"]["against_reference"]["relative_l2"] < 1e-6
 
 
 def test_material_classes_part_metals_from_dielectrics():

@@ -95,27 +95,29 @@ class LookupTable:
     @cached_property
     def _channels(self) -> np.ndarray:
         rows, columns = self.warp.shape[:2]
-        return np.concatenate(
-            [self.warp.reshape(rows * columns, -1), self.coefficients.reshape(rows * columns, -1)], axis=1
-        )
+        parts = [self.warp.reshape(rows * columns, -1).T, self.coefficients.reshape(rows * columns, -1).T]
+        return np.concatenate(parts)
 
     @cached_property
     def ridge_weights(self) -> np.ndarray:
         """Matrix (K, K) from spherical harmonics coefficients to weights of the polygon's moments."""
         return ridge_matrix(self.degree)
 
-    def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray) -> Lobe:
-        """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1]."""
+    def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray, curves: int | None = None) -> Lobe:
+        """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1], with the
+        coefficients of the first `curves` Fresnel curves (None: all)."""
         cosine = np.clip(cos_theta_o, 0.0, 1.0)
         dtype = cosine.dtype
         roughness = np.clip(roughness, 0.0, 1.0).astype(dtype, copy=False)
-        channels = _interpolate(self._channels, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
-        parameters = self.warp.shape[2]
+        parameters, (total, count) = self.warp.shape[2], self.coefficients.shape[2:]
+        curves = total if curves is None else curves
+        wanted = self._channels[: parameters + curves * count]
+        channels = _interpolate(wanted, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
         return Lobe(
             *warp_entries(cosine, alpha, *channels[:3]),
             tilt=channels[3] if parameters == 4 else None,
-            coefficients=channels[parameters:].reshape(*self.coefficients.shape[2:], -1),
+            coefficients=channels[parameters:].reshape(curves, count, -1),
         )
 
     def average_albedos(self, roughness: np.ndarray) -> np.ndarray:
@@ -128,11 +130,13 @@ class LookupTable:
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
 
 
-def warp_entries(cosine, alpha, a, b, c):
-    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast."""
-    sine_squared = np.maximum(1.0 - cosine * cosine, 0.0)
-    squared = cosine * cosine + WARP_REGULARIZATION**2 * alpha * alpha * sine_squared
-    return a * squared, a * b * np.sqrt(squared * sine_squared), c, 2.0 * alpha
+def warp_entries(cosine, alpha, a, b, c, sine=None):
+    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast. In single precision the sine does not
+    follow from a cosine close to one: give it."""
+    if sine is None:
+        sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
+    squared = cosine * cosine + (WARP_REGULARIZATION * alpha * sine) ** 2
+    return a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha
 
 
 def _theta_coordinate(cosine):
@@ -155,19 +159,21 @@ def roughness_nodes(count: int) -> np.ndarray:
 
 
 def _interpolate(channels, shape, roughness, theta_coordinate):
-    """Channels (C, P) at roughness and theta coordinate in [0, 1], by bilinear interpolation."""
+    """Channels (C, P) at roughness and theta coordinate in [0, 1], by bilinear interpolation of channels (C, R * T)."""
     rows, columns = shape
-    row_position, column_position = roughness * (rows - 1), theta_coordinate * (columns - 1)
-    row = np.minimum(row_position.astype(np.int64), rows - 2)
-    column = np.minimum(column_position.astype(np.int64), columns - 2)
-    row_weight = (row_position - row)[:, None]
-    column_weight = (column_position - column)[:, None]
-    corner = row * columns + column
     dtype = roughness.dtype
-    near = channels[corner].astype(dtype) * (1.0 - column_weight) + channels[corner + 1] * column_weight
-    corner = corner + columns
-    far = channels[corner].astype(dtype) * (1.0 - column_weight) + channels[corner + 1] * column_weight
-    return np.ascontiguousarray((near * (1.0 - row_weight) + far * row_weight).T, dtype=dtype)
+    row_position, column_position = roughness * (rows - 1), theta_coordinate * (columns - 1)
+    row = np.minimum(row_position.astype(np.intp), rows - 2)
+    column = np.minimum(column_position.astype(np.intp), columns - 2)
+    row_weight = (row_position - row).astype(dtype)
+    column_weight = (column_position - column).astype(dtype)
+    corner = row * columns + column
+
+    def along_columns(first):
+        near, far = (np.take(channels, index, axis=1).astype(dtype, copy=False) for index in (first, first + 1))
+        return near * (1.0 - column_weight) + far * column_weight
+
+    return along_columns(corner) * (1.0 - row_weight) + along_columns(corner + columns) * row_weight
 
 
 def load_table(name_or_path: str | Path) -> LookupTable:

@@ -6,6 +6,8 @@ equal corners contributes exactly zero to every integral.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 
@@ -38,18 +40,108 @@ def _compact(slots: np.ndarray, used: np.ndarray) -> np.ndarray:
     return np.take_along_axis(slots, index[None], axis=1)
 
 
+# Up to this many corners a bit pattern tells which are above the horizon.
+PATTERN_CORNERS = 8
+DARK, WHOLE, SINGLE_RUN, SEVERAL_RUNS = range(4)
+
+
+@cache
+def _pattern_kinds(corners: int) -> np.ndarray:
+    """DARK, WHOLE, SINGLE_RUN or SEVERAL_RUNS (2^V,) by pattern, in which bit n is set where corner n is above."""
+    patterns = np.arange(2**corners)
+    following = (patterns >> 1) | ((patterns & 1) << (corners - 1))
+    crossings = np.array([bin(changes).count("1") for changes in patterns ^ following])
+    kinds = np.where(crossings == 2, SINGLE_RUN, SEVERAL_RUNS)
+    kinds[0], kinds[-1] = DARK, WHOLE
+    return kinds.astype(np.uint8)
+
+
+@cache
+def _run_corners(corners: int) -> np.ndarray:
+    """Corners (V + 3, 2^V) of clipped polygons by pattern: the last and the first above, the run above with its last
+    one repeated (V - 1 in all), the corners below next to the last and the first above."""
+    table = np.zeros((corners + 3, 2**corners), dtype=np.intp)
+    for first in range(corners):
+        for count in range(1, corners):
+            run = [(first + step) % corners for step in range(count)]
+            rows = [run[-1], run[0], *run, *run[-1:] * (corners - 1 - count)]
+            below = [(run[-1] + 1) % corners, (first - 1) % corners]
+            table[:, sum(1 << corner for corner in run)] = rows + below
+    return table
+
+
+def horizon_patterns(heights: np.ndarray) -> np.ndarray:
+    """Which of at most `PATTERN_CORNERS` corners are above the horizon, as bits (P,), from their heights (V, P)."""
+    above = (heights > 0.0).view(np.uint8)
+    result = above[0].copy()
+    for corner in range(1, len(above)):
+        result |= above[corner] << np.uint8(corner)
+    return result
+
+
+def clip_single_run(vertices: np.ndarray, patterns: np.ndarray, axis: int = 2) -> np.ndarray:
+    """As `clip_to_horizon` for polygons (C, V, P) whose corners above are one run, V + 1 corners each: cheaper.
+
+    All convex polygons that cross the horizon are of this kind. `patterns` (P,) as from `horizon_patterns`.
+    """
+    coordinates, corners, points = vertices.shape
+    index = np.take(_run_corners(corners), patterns, axis=1)
+    index *= points
+    index += np.arange(points)
+    gathered = np.take(vertices.reshape(coordinates, -1), index, axis=1)
+    result, below = gathered[:, :-2], gathered[:, -2:]
+    ends = result[:, :2]
+    below -= ends
+    below *= ends[axis] / -below[axis]
+    ends += below
+    ends[axis] = 0.0
+    return result
+
+
 def split_at_horizon(vertices: np.ndarray, axis: int = 2):
     """Yield (index (Q,), polygons (C, W, Q)) for the points that see a part of their polygon (C, V, P) where coordinate
     `axis` is positive: first those that see all of it, then those whose polygon is clipped."""
-    above = vertices[axis] > 0.0
-    whole = above.all(axis=0)
-    cut = above.any(axis=0) & ~whole
-    if whole.any():
-        index = np.nonzero(whole)[0]
-        yield index, vertices if whole.all() else vertices[:, :, index]
-    if cut.any():
-        index = np.nonzero(cut)[0]
-        yield index, clip_to_horizon(vertices[:, :, index], axis)
+    corners = vertices.shape[1]
+    if corners > PATTERN_CORNERS:
+        patterns, kinds = None, _kinds_of_many_corners(vertices[axis])
+    else:
+        patterns = horizon_patterns(vertices[axis])
+        kinds = _pattern_kinds(corners)[patterns]
+    for kind in (WHOLE, SINGLE_RUN, SEVERAL_RUNS):
+        index = np.nonzero(kinds == kind)[0]
+        if len(index) == 0:
+            continue
+        part = vertices if len(index) == len(kinds) else np.take(vertices, index, axis=2)
+        if kind == SINGLE_RUN:
+            part = clip_single_run(part, patterns[index], axis)
+        elif kind == SEVERAL_RUNS:
+            part = clip_to_horizon(part, axis)
+        yield index, part
+
+
+def _kinds_of_many_corners(heights):
+    above = heights > 0.0
+    return np.where(above.all(axis=0), WHOLE, np.where(above.any(axis=0), SEVERAL_RUNS, DARK))
+
+
+def split_long_edges(vertices: np.ndarray) -> np.ndarray:
+    """Polygons (3, V, P) with a corner added on every edge (3, 2 V, P): the point of the edge nearest to the origin.
+
+    An edge that passes by the origin closely is an arc of almost half a circle, whose plane is lost to rounding. With
+    this corner, itself rounded, all integrals are those of one and the same polygon.
+    """
+    following = np.roll(vertices, -1, axis=1)
+    along = following - vertices
+    squared = _dot(along, along)
+    squared = np.where(squared > 0.0, squared, 1.0)
+    # Written so that both directions of an edge give the same bits.
+    start, end = (np.clip(side / squared, 0.0, 1.0) for side in (_dot(following, along), -_dot(vertices, along)))
+    nearest = start * vertices + end * following
+    return np.stack([vertices, nearest], axis=2).reshape(3, -1, vertices.shape[2])
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def project_to_sphere(vertices: np.ndarray) -> np.ndarray:
@@ -82,6 +174,8 @@ def solid_angle(unit: np.ndarray) -> np.ndarray:
     total = edge_sums(unit)
     real = total[2] + one_plus_cosine(total)
     imaginary = unit[0] * total[1] - unit[1] * total[0]
+    # An edge between two corners at the point itself has no angle: factor 1, not 0.
+    real = np.where((real == 0.0) & (imaginary == 0.0), 1.0, real)
     product_real, product_imaginary = real[0], imaginary[0]
     for edge in range(1, unit.shape[1]):
         product_real, product_imaginary = (

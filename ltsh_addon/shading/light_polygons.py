@@ -1,0 +1,82 @@
+"""Polygons of area lights as seen from shading points, in single precision: local corners, horizons, parts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .polygon import split_at_horizon
+
+# Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
+MOSTLY_WHOLE = 0.6
+
+
+def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
+    """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
+
+    corners (V, 3) in the world; offset (3, P) from the points to the light's center.
+    """
+    coordinates, _, points = rows.shape
+    center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
+    result = scratch("corners", (coordinates, len(corners), points))
+    if light.is_round:
+        for number, corner in enumerate((corners - light.center).astype(np.float32)):
+            out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
+            np.add(center, out, out=result[:, number])
+        return result
+    # Corners 0 and 2 are opposite, and so are 1 and 3: half diagonals from the center.
+    for number in (0, 1):
+        half = ((corners[number] - corners[number + 2]) * 0.5).astype(np.float32)
+        out = _along(rows, half, scratch("axis", (coordinates, points)), scratch)
+        np.add(center, out, out=result[:, number])
+        np.subtract(center, out, out=result[:, number + 2])
+    return result
+
+
+def _along(rows, vector, out, scratch):
+    """Products (C, P) of rows (C, 3, P) with a vector (3,) or vectors (3, P)."""
+    product = scratch("product", out.shape)
+    np.multiply(rows[:, 0], vector[0], out=out)
+    for axis in (1, 2):
+        out += np.multiply(rows[:, axis], vector[axis], out=product)
+    return out
+
+
+def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
+    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of fragile points.
+
+    A point sees the part of its polygon where all coordinates `clip_rows` are positive, if it is `facing` (P,) it.
+    `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
+    """
+    whole = facing.copy()
+    partly = facing
+    for row in clip_rows:
+        whole &= np.minimum.reduce(corners[row], axis=0) > 0.0
+    seen_whole = np.count_nonzero(whole)
+    points = len(facing)
+    if seen_whole == points:
+        return integrate(corners, None)
+    for row in clip_rows:
+        partly = partly & (np.maximum.reduce(corners[row], axis=0) > 0.0)
+    cut = np.nonzero(partly & ~whole)[0]
+    values, fragile = np.zeros((count, points), np.float32), np.zeros(points, bool)
+    if seen_whole > MOSTLY_WHOLE * points:
+        found, mask = integrate(corners, None)
+        np.multiply(found, whole, out=values)
+        np.logical_and(mask, whole, out=fragile)
+    elif seen_whole:
+        index = np.nonzero(whole)[0]
+        values[:, index], fragile[index] = integrate(np.take(corners, index, axis=2), index)
+    if len(cut):
+        for index, polygons in _clipped(np.take(corners, cut, axis=2), clip_rows):
+            values[:, cut[index]], fragile[cut[index]] = integrate(polygons, cut[index])
+    return values, fragile
+
+
+def _clipped(corners, clip_rows):
+    """Yield (index, polygons) of the parts of polygons (C, V, P) where all coordinates `clip_rows` are positive."""
+    if not clip_rows:
+        yield np.arange(corners.shape[2]), corners
+        return
+    for outer, part in split_at_horizon(corners, clip_rows[0]):
+        for inner, polygons in _clipped(part, clip_rows[1:]):
+            yield outer[inner], polygons

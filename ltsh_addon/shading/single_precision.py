@@ -1,0 +1,297 @@
+"""The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
+
+The warp and, for "ltc", the tilt of the lobe are multiplied into the local frame of a sample once, for all lights: a
+light's corners come out of one product. What single precision cannot do is computed again in double precision, per
+block: points so close to a light's plane that an edge spans half a circle, tiny lights, sharp lobes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from . import double_precision, edge_loop, ridge_table
+from .light_polygons import integrate_visible, local_corners
+
+# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
+# multiple of a page long, where the cache would hold few of them.
+CHUNK = 24592
+CORNERS = 4 * CHUNK
+DOUBLE_CHUNK = 4096
+# With more different indices of refraction in a block the dielectric's weights are summed up per sample.
+SEPARATE_IORS = 8
+
+
+def shade_diffuse(samples, lights, radiance, scratch):
+    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+    lights = [item for item in lights if item[0].affects_diffuse]
+    lit = np.nonzero(_any(samples.diffuse_albedo))[0]
+    bumped = np.zeros(len(lit), bool)
+    if samples.diffuse_normal is not samples.smooth_normal:
+        bumped = _any(samples.diffuse_normal != samples.smooth_normal)[lit]
+    fragile = [[] for _ in lights]
+    for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
+        for index in _chunks(members):
+            rows = _normal_frame(_columns(samples.diffuse_normal, index))
+            clip_rows, integrate = (2,), None
+            if is_bumped:
+                smooth = _columns(samples.smooth_normal, index)
+                rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
+                integrate = _ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
+            colors = _columns(samples.diffuse_albedo, index)[None]
+            integrate = integrate or _Cosine(scratch)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+    _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
+
+
+def shade_specular(samples, lights, table, radiance, scratch):
+    """As `shade_diffuse` for the specular lobes of `table`."""
+    lights = [item for item in lights if item[0].affects_specular]
+    ridges = ridge_table.prepare(table)
+    reflective = _any(samples.specular_f90) | _any(samples.specular_f0) | (samples.dielectric > 0.0)
+    lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
+    sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
+    fragile = [[] for _ in lights]
+    for vectors, members, color_rows in _fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
+        for index in _chunks(members):
+            rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
+            integrate = _LobeIntegral(ridges, weights, scratch)
+            colors = color_rows(index)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+
+    def in_double(part, items, target):
+        double_precision.shade_specular(part, items, table, target)
+
+    _add_double(samples, np.nonzero(sharp)[0], lights, radiance, in_double)
+    _add_fragile(samples, lights, fragile, radiance, in_double)
+
+
+def _any(vectors):
+    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
+    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
+
+
+def _chunks(members):
+    return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
+
+
+def _columns(vectors, index):
+    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
+    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
+
+
+def _add_double(samples, members, lights, radiance, shade):
+    """Add the light of `lights` at the samples `members` (Q,) by a function of `double_precision`."""
+    for start in range(0, len(members), DOUBLE_CHUNK):
+        index = members[start : start + DOUBLE_CHUNK]
+        target = np.zeros((len(radiance), len(index), 3))
+        shade(samples.take(index), lights, target)
+        radiance[:, index] += target.astype(np.float32)
+
+
+def _add_fragile(samples, lights, fragile, radiance, shade):
+    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all lights with equally
+    many corners in one batch, for there are few such samples."""
+    for count in sorted({len(corners) for _, _, corners in lights}):
+        chosen = [
+            (item, np.concatenate(parts))
+            for item, parts in zip(lights, fragile, strict=True)
+            if parts and len(item[2]) == count
+        ]
+        if not chosen:
+            continue
+        members = np.concatenate([index for _, index in chosen])
+        number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
+        group = np.array([item[1] for item, _ in chosen])[number]
+        corners = np.stack([item[2] for item, _ in chosen])
+        fields = {
+            name: np.stack([getattr(item[0], name) for item, _ in chosen])
+            for name in ("center", "direction", "radiance")
+        }
+        for start in range(0, len(members), DOUBLE_CHUNK):
+            part = slice(start, start + DOUBLE_CHUNK)
+            of = number[part]
+            light = double_precision.LightOfEachSample(**{name: values[of] for name, values in fields.items()})
+            target = np.zeros((1, len(of), 3))
+            shade(samples.take(members[part]), [(light, 0, corners[of].transpose(1, 0, 2))], target)
+            # A sample may be there for several lights.
+            np.add.at(radiance, (group[part], members[part]), target[0].astype(np.float32))
+
+
+def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch):
+    """Add the light of all `lights` at the samples `index` (Q,) to radiance (G, P, 3).
+
+    rows (C, 3, Q) are the axes of the coordinates that `integrate` wants, colors (F, 3, Q) the reflectances of its
+    integrals. Points left to double precision are appended to `fragile`, per light.
+    """
+    position = np.ascontiguousarray(samples.position[index].T)
+    sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
+    for number, (light, group, corners) in enumerate(lights):
+        step = max(CORNERS // len(corners), 512)
+        for start in range(0, len(index), step):
+            part = slice(start, start + step)
+            offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
+            axes = rows[:, :, part]
+            polygons = local_corners(light, corners, offset, axes, scratch)
+            facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
+            of_part = partial(integrate, part)
+            found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
+            if redo.any():
+                found[:, redo] = 0.0
+                fragile[number].append(index[part][redo])
+            total = sums[group]
+            for channel in range(3):
+                total[:, channel, part] += found * np.float32(light.radiance[channel])
+    for group, total in sums.items():
+        radiance[group, index] += (colors * total).sum(axis=0).T
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _selected(values, part, index):
+    """Columns `index` (None: all) of the columns `part`, a slice, of values (..., Q)."""
+    values = values[..., part]
+    return values if index is None else np.take(values, index, axis=-1)
+
+
+class _Cosine:
+    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
+
+    def __init__(self, scratch):
+        self.scratch = scratch
+
+    def __call__(self, part, corners, index):
+        integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+        integral *= np.float32(-1.0 / np.pi)
+        return np.maximum(integral, np.float32(0.0))[None], fragile
+
+
+class _ShadowedCosine:
+    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+
+    def __init__(self, rows, bump_alpha2, scratch):
+        self.smooth = np.stack([_dot(row, rows[3]) for row in rows[:3]])
+        self.bump_alpha2, self.scratch = bump_alpha2, scratch
+
+    def __call__(self, part, corners, index):
+        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
+        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch)
+        direction = np.negative(integrals, out=integrals)
+        along = np.maximum(_dot(direction, smooth), np.float32(1e-15))
+        tangent2 = np.maximum(_dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
+        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
+        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
+        return values[None], fragile
+
+
+class _LobeIntegral:
+    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `_Cosine`."""
+
+    def __init__(self, ridges, weights, scratch):
+        self.ridges, self.weights, self.scratch = ridges, weights, scratch
+
+    def __call__(self, part, corners, index):
+        weights = _selected(self.weights, part, index)
+        if self.ridges.source.family == "ltc":
+            integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+            values = weights[:, 0] * integral
+            values *= np.float32(-1.0 / np.pi)
+        else:
+            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch)
+            products = np.multiply(weights, moments, out=self.scratch("weighted", weights.shape))
+            values = np.add.reduce(products, axis=1)
+            np.negative(values, out=values)
+        return np.maximum(values, np.float32(0.0), out=values), fragile
+
+
+def _fresnel_kinds(samples, members):
+    """Yield (vectors, members, colors): what part of the Fresnel terms the samples `members` need.
+
+    `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
+    """
+    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members]
+    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members]
+    dielectric = samples.dielectric[members] > 0.0
+
+    def white(index):
+        return _columns(samples.specular_f0, index)[None]
+
+    def schlick(index):
+        f0 = _columns(samples.specular_f0, index)
+        return np.stack([f0, _columns(samples.specular_f90, index) - f0])
+
+    def coat(index):
+        share = samples.dielectric[index].astype(np.float32)
+        return np.broadcast_to(share, (1, 3, len(index)))
+
+    def mixed(index):
+        return np.concatenate([schlick(index), coat(index)])
+
+    yield (0,), members[~dielectric & flat], white
+    yield (0, 1), members[~dielectric & ~flat], schlick
+    for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
+        yield (vector,), with_ior, coat
+    for vector, with_ior in _by_ior(samples.ior, members[dielectric & metal]):
+        yield (0, 1, vector), with_ior, mixed
+
+
+def _by_ior(ior, members):
+    """Yield (vector, members): the dielectric's weight vector, one per index of refraction where there are few."""
+    values = ior[members]
+    if len(members) == 0:
+        return
+    if values.min() == values.max():
+        yield ("dielectric", float(values[0])), members
+        return
+    distinct, number = np.unique(values, return_inverse=True)
+    if len(distinct) > SEPARATE_IORS:
+        yield "dielectric", members
+        return
+    for position, value in enumerate(distinct):
+        yield ("dielectric", float(value)), members[number == position]
+
+
+def _normal_frame(normal):
+    """Frames (3, 3, P) around normals (3, P), without a preferred tangent (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = np.copysign(np.float32(1.0), z)
+    a = np.float32(-1.0) / (sign + z)
+    b = x * y * a
+    tangent = np.stack([np.float32(1.0) + sign * x * x * a, sign * b, -sign * x])
+    return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
+
+
+def _lobe_rows(samples, index, ridges, vectors, scratch):
+    """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
+    normal, view = _columns(samples.normal, index), _columns(samples.view, index)
+    cosine = _dot(normal, view)
+    tangent = view - cosine * normal
+    sine = np.sqrt(_dot(tangent, tangent))
+    straight = np.nonzero(sine < 1e-6)[0]
+    if len(straight):
+        # The lobe is round there: any tangent serves.
+        tangent[:, straight] = _normal_frame(normal[:, straight])[0]
+    tangent /= np.where(sine < 1e-6, np.float32(1.0), sine)
+    bitangent = np.stack([
+        normal[1] * tangent[2] - normal[2] * tangent[1],
+        normal[2] * tangent[0] - normal[0] * tangent[2],
+        normal[0] * tangent[1] - normal[1] * tangent[0],
+    ])  # fmt: skip
+    roughness = samples.roughness[index].astype(np.float32)
+    angle = np.minimum(cosine, np.float32(1.0)), np.minimum(sine, np.float32(1.0))
+    warp, weights, tilt = ridges.fetch(vectors, *angle, roughness, samples.ior[index], scratch)
+    rows = [warp[0] * tangent + warp[1] * normal, warp[2] * bitangent, warp[3] * normal]
+    clip_rows = (2,)
+    if tilt is not None:
+        sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
+        rows[0], rows[2] = cos_tilt * rows[0] - sin_tilt * rows[2], sin_tilt * rows[0] + cos_tilt * rows[2]
+        rows.append(normal)
+        clip_rows = (3, 2)
+    geometric = samples.geometric_normal[index]
+    if samples.geometric_normal is not samples.normal and (geometric != samples.normal[index]).any():
+        rows.append(np.ascontiguousarray(geometric.T, dtype=np.float32))
+        clip_rows = (len(rows) - 1, *clip_rows)
+    return np.stack(rows), clip_rows, weights

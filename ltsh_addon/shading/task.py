@@ -1,0 +1,72 @@
+"""What is to be done with every block of samples: the same in this process and in a worker process."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..scene import AreaLight, SurfaceSamples
+from . import double_precision, single_precision
+from .lookup_table import LookupTable
+
+ROUND_LIGHT_CORNERS = 32
+# Double precision arrays of this many samples stay in the cache.
+DOUBLE_CHUNK = 4096
+# Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
+_SINGLE_COST, _DOUBLE_COST, _REFERENCE_COST = (10.0, 12.0), (100.0, 120.0), (20_000.0, 1000.0)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to do with every block of samples."""
+
+    lights: tuple[AreaLight, ...]
+    groups: tuple[str, ...]
+    table: LookupTable | str  # or REFERENCE
+    passes: tuple[str, ...]
+    single: bool
+
+    @property
+    def dtype(self):
+        """Type of the result."""
+        return np.dtype(np.float32 if self.single else np.float64)
+
+    @property
+    def is_reference(self) -> bool:
+        return isinstance(self.table, str)
+
+    @property
+    def has_error(self) -> bool:
+        """True where the result comes with an estimate of its error."""
+        return self.is_reference and "specular" in self.passes
+
+    def seconds(self, count: int) -> float:
+        """About how long `count` samples take one process."""
+        per_light, per_corner = _REFERENCE_COST if self.is_reference else _SINGLE_COST if self.single else _DOUBLE_COST
+        corners = sum(ROUND_LIGHT_CORNERS if light.is_round else 4 for light in self.lights)
+        return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
+
+    def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
+        prepared = [
+            (light, self.groups.index(light.group), light.polygon(ROUND_LIGHT_CORNERS)) for light in self.lights
+        ]
+        radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
+        error = np.zeros(len(samples)) if self.has_error else None
+        if self.single:
+            if "diffuse" in radiance:
+                single_precision.shade_diffuse(samples, prepared, radiance["diffuse"], scratch)
+            if "specular" in radiance:
+                single_precision.shade_specular(samples, prepared, self.table, radiance["specular"], scratch)
+            return radiance, error
+        for start in range(0, len(samples), DOUBLE_CHUNK):
+            chunk = slice(start, start + DOUBLE_CHUNK)
+            part = samples.take(chunk)
+            views = {name: values[:, chunk] for name, values in radiance.items()}
+            if "diffuse" in views:
+                double_precision.shade_diffuse(part, prepared, views["diffuse"])
+            if "specular" in views:
+                estimates = None if error is None else error[chunk]
+                double_precision.shade_specular(part, prepared, self.table, views["specular"], estimates)
+        return radiance, error

@@ -1,0 +1,86 @@
+"""What a worker process of `shade` runs, started by path: answers blocks of samples until its input ends.
+
+Messages are pickles with their length in front. The first one brings the search path and the shared memory,
+the second the task; each later one the layout of a block. The answer is None, or the text of an error.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import os
+import pickle
+import struct
+import sys
+import traceback
+from pathlib import Path
+
+PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+_LENGTH = struct.Struct("<Q")
+
+
+def send(stream, message) -> None:
+    """Write one message."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    stream.write(_LENGTH.pack(len(data)))
+    stream.write(data)
+    stream.flush()
+
+
+class _Unpickler(pickle.Unpickler):
+    """Finds the parent's modules under the name that the package has here: Blender loads it under another one."""
+
+    def __init__(self, stream, package):
+        super().__init__(stream)
+        self.package = package
+
+    def find_class(self, module, name):
+        if self.package and (module + ".").startswith(self.package + "."):
+            module = PACKAGE_FOLDER.name + module[len(self.package) :]
+        return super().find_class(module, name)
+
+
+def receive(stream, package: str = ""):
+    """Read one message from a parent that knows the package as `package`. EOFError: the other side is gone."""
+    header = stream.read(_LENGTH.size)
+    if len(header) < _LENGTH.size:
+        raise EOFError("the other process has ended")
+    (length,) = _LENGTH.unpack(header)
+    data = stream.read(length)
+    if len(data) < length:
+        raise EOFError("the other process has ended")
+    return _Unpickler(io.BytesIO(data), package).load()
+
+
+def _serve(commands, answers) -> None:
+    first = receive(commands)
+    # The parent's search path, so that numpy is the same one; running a script puts its own folder first.
+    sys.path[:] = [str(PACKAGE_FOLDER.parent), *first["path"]]
+    exchange = importlib.import_module(f"{PACKAGE_FOLDER.name}.shading.block_exchange")
+    task = receive(commands, first["package"])
+    side = exchange.ChildSide(task, first["handle"], first["size"])
+    send(answers, None)
+    while True:
+        message = receive(commands)
+        try:
+            side.shade(message)
+            answer = None
+        except Exception:
+            answer = traceback.format_exc()
+        send(answers, answer)
+
+
+def main() -> None:
+    """Serve the parent on standard input and output; what others print goes to the error output."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    try:
+        _serve(sys.stdin.buffer, answers)
+    except (EOFError, BrokenPipeError, KeyboardInterrupt):
+        pass
+    # Nothing is left to save; the parent may be gone and with it whoever reads what an orderly end would print.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Timing in rounds, and counting of what numpy writes."""
+
+import gc
+import time
+
+import numpy as np
+
+from ltsh_addon.shading import edge_loop
+
+
+def interleaved(cases, rounds=5):
+    """Median seconds of every case {name: function}, taken in turn so that a busy machine disturbs all alike."""
+    for function in cases.values():
+        function()
+    seconds = {name: [] for name in cases}
+    gc.disable()
+    for _ in range(rounds):
+        for name, function in cases.items():
+            start = time.perf_counter()
+            function()
+            seconds[name].append(time.perf_counter() - start)
+    gc.enable()
+    return {name: float(np.median(values)) for name, values in seconds.items()}
+
+
+def ratios(cases, base, rounds=5):
+    """(seconds, {name: median over the rounds of time / time of `base`})."""
+    for function in cases.values():
+        function()
+    times = {name: [] for name in cases}
+    for _ in range(rounds):
+        for name, function in cases.items():
+            start = time.perf_counter()
+            function()
+            times[name].append(time.perf_counter() - start)
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    return medians, {name: float(np.median(np.divide(times[name], times[base]))) for name in times}
+
+
+class _Counted(np.ndarray):
+    """Counts the elements that ufuncs write, or read where they reduce."""
+
+    elements = 0
+    calls = 0
+
+    def __array_ufunc__(self, ufunc, method, *inputs, out=None, **options):
+        plain = [np.asarray(value) if isinstance(value, np.ndarray) else value for value in inputs]
+        if out is not None:
+            options["out"] = tuple(np.asarray(value) for value in out)
+        result = getattr(ufunc, method)(*plain, **options)
+        _Counted.elements += plain[0].size if method == "reduce" else np.asarray(result).size
+        _Counted.calls += 1
+        if out is not None:
+            return out[0]
+        return result.view(_Counted) if isinstance(result, np.ndarray) else result
+
+
+class CountingScratch(edge_loop.Scratch):
+    """Arrays that count what is done to them."""
+
+    def _view(self, name, shape):
+        view = super()._view(name, shape).view(_Counted)
+        self._views[name, shape] = view
+        return view
+
+
+def elements_per_polygon(function, count):
+    """Array elements written per polygon, and calls of ufuncs, by function(scratch)."""
+    _Counted.elements = _Counted.calls = 0
+    function(CountingScratch())
+    return _Counted.elements / count, _Counted.calls

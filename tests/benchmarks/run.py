@@ -1,0 +1,270 @@
+"""What shading costs: `make bench`. Prints tables; every row is the median of interleaved runs.
+
+python tests/benchmarks/run.py [--large] [--no-cycles] [--quick] [SECTION ...]
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import measure  # noqa: E402
+from bench_scenes import floor_scene, random_polygons  # noqa: E402
+from textbook_ltc import TextbookLtc  # noqa: E402
+from zonal_harmonics import ZonalHarmonics  # noqa: E402
+
+from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.shading import edge_integrals, edge_loop, light_polygons, workers  # noqa: E402
+from ltsh_addon.shading.polygon import project_to_sphere, split_at_horizon  # noqa: E402
+
+TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
+CHUNK = 12288
+
+
+def heading(text):
+    print(f"\n{text}\n{'-' * len(text)}")
+
+
+def row(name, nanoseconds, ratio=None, note=""):
+    print(f"  {name:<34}{nanoseconds:>9.1f} ns{'' if ratio is None else f'{ratio:>8.2f} x'}  {note}")
+
+
+def polygons(options):
+    """`integrate_polygon` alone: lookup, clip and integral of one lobe per rectangle."""
+    count = 20_000 if options.quick else 100_000
+    for kind in ("whole", "mixed"):
+        heading(f"integrate_polygon, {count} rectangles, {kind}, float32: ns per polygon, ratio to our LTC")
+        data = random_polygons(count, kind)
+        cases = {"textbook LTC": partial(TextbookLtc(TABLES["ltc"]).integrate_polygon, *data)}
+        for name, table in TABLES.items():
+            cases[name] = partial(shading.integrate_polygon, table, *data)
+        for degree in (2, 4):
+            peer = ZonalHarmonics(degree)
+            cases[f"zonal harmonics N={degree} (peer)"] = partial(zonal, peer, TABLES[f"ltsh{degree}"], *data)
+        medians, ratio = measure.ratios(cases, "ltc", 3 if options.quick else 5)
+        for name, seconds in medians.items():
+            row(name, seconds / count * 1e9, ratio[name])
+        targets(ratio)
+        print(f"  peer, target >= 5 x ltsh4: {ratio['zonal harmonics N=4 (peer)'] / ratio['ltsh4']:.1f}")
+
+
+def targets(ratio):
+    print(f"  ltc, target <= 1.1 x textbook: {ratio['ltc'] / ratio['textbook LTC']:.2f}")
+    print(f"  ltsh2, target <= 1.3 x ltc: {ratio['ltsh2']:.2f}; ltsh4, target <= 2.0 x ltc: {ratio['ltsh4']:.2f}")
+
+
+def zonal(peer, table, cosine, roughness, vertices):
+    """As `integrate_polygon`, with the peer's integrals."""
+    result = np.zeros(len(cosine), np.float32)
+    for start in range(0, len(cosine), 4096):
+        part = slice(start, start + 4096)
+        lobe = table.lookup(cosine[part], roughness[part], curves=1)
+        for index, polygon in split_at_horizon(np.ascontiguousarray(vertices[part].transpose(2, 1, 0))):
+            chosen = lobe.take(index)
+            unit = project_to_sphere(chosen.to_original_domain(polygon))
+            result[part][index] = peer.integrate(unit, chosen.coefficients[0].astype(np.float32))
+    return np.abs(result)
+
+
+def shade(options):
+    """`shade` with four rectangles: frames, lookup, clip and integrals, one process."""
+    count = 50_000 if options.quick else 200_000
+    for fresnel, label in (("white", "F = 1"), ("schlick", "Schlick"), ("dielectric", "dielectric, one IOR"),
+                           ("both", "Schlick + dielectric")):  # fmt: skip
+        samples, lights = floor_scene(count, 4, fresnel)
+        heading(f"shade, {count} samples, 4 rectangles, specular, {label}: ns per sample and light")
+        cases = {}
+        if fresnel == "white":
+            cases["textbook LTC"] = partial(TextbookLtc(TABLES["ltc"]).shade, samples, lights)
+            cases["diffuse"] = partial(shading.shade, samples, lights, "ltc", passes=["diffuse"], workers=1)
+        for name, table in TABLES.items():
+            cases[name] = partial(specular, samples, lights, table)
+        medians, ratio = measure.ratios(cases, "ltc", 3 if options.quick else 5)
+        for name, seconds in medians.items():
+            row(name, seconds / count / 4 * 1e9, ratio[name])
+        if fresnel == "white":
+            targets(ratio)
+
+
+def specular(samples, lights, table, **options):
+    return shading.shade(samples, lights, table, passes=["specular"], **{"workers": 1, **options})
+
+
+def bounds(options):
+    """What bounds the ratios: numpy writes every intermediate result, so that elements written are time."""
+    heading(f"elements that numpy writes per rectangle and light (chunks of {CHUNK})")
+    _, _, vertices = random_polygons(CHUNK, "whole")
+    corners = np.ascontiguousarray(vertices.transpose(2, 1, 0))
+    kernels = {"ltc: integral": lambda scratch: edge_loop.cosine_integral(corners, scratch)}
+    for degree in (2, 4):
+        kernels[f"N={degree}: moments"] = lambda scratch, d=degree: edge_loop.moments(corners, d, scratch)
+    work, out = (np.ones((4, CHUNK), np.float32) for _ in range(2))
+    per_element = timed(repeated, partial(np.multiply, work, work, out=out), 200) / 200 / work.size
+    scratch = edge_loop.Scratch()
+    cases = {name: partial(repeated, partial(kernel, scratch), 10) for name, kernel in kernels.items()}
+    times = measure.interleaved(cases)
+    base = None
+    for name, kernel in kernels.items():
+        elements, calls = measure.elements_per_polygon(kernel, CHUNK)
+        base = base or elements
+        print(f"  {name:<18}{elements:>7.0f} elements{elements / base:>6.2f} x, {calls:>3} calls;"
+              f" at {per_element * 1e9:.3f} ns each {elements * per_element * 1e9:>6.1f} ns;"
+              f" measured {times[name] / 10 / CHUNK * 1e9:.1f} ns")  # fmt: skip
+    light = floor_scene(8, 1)[1][0]
+    rows = np.ones((3, 3, CHUNK), np.float32)
+    offset = np.ones((3, CHUNK), np.float32)
+    elements, calls = measure.elements_per_polygon(
+        lambda scratch: light_polygons.local_corners(light, light.polygon(), offset, rows, scratch), CHUNK
+    )
+    print(f"  {'corners of a light':<18}{elements:>7.0f} elements, {calls} calls, the same for all techniques")
+
+
+def growth(options):
+    """How time grows with edges, lights, degree and samples."""
+    count = 10_000 if options.quick else 40_000
+    heading(f"growth with edges: ltsh4, {count} polygons above the horizon, ns per polygon and per edge")
+    for corners in (3, 4, 6, 8, 16, 32, 64):
+        seconds = timed(shading.integrate_polygon, TABLES["ltsh4"], *random_polygons(count, "whole", corners))
+        row(f"{corners} edges", seconds / count * 1e9, note=f"{seconds / count / corners * 1e9:.1f} ns per edge")
+    heading(f"growth with lights: ltsh4, F = 1, {count} samples, ns per sample and light")
+    for lights in (1, 2, 4, 8, 16, 64):
+        seconds = timed(specular, *floor_scene(count, lights), TABLES["ltsh4"])
+        row(f"{lights} lights", seconds / count / lights * 1e9)
+    heading("growth with degree: moments of rectangles, ns per polygon")
+    corners = np.ascontiguousarray(random_polygons(CHUNK, "whole")[2].transpose(2, 1, 0))
+    scratch = edge_loop.Scratch()
+    unit = project_to_sphere(corners.astype(np.float64))
+    cases = {f"N={d}, float32": lambda d=d: edge_loop.moments(corners, d, scratch) for d in range(1, 5)}
+    cases |= {f"N={d}, float64": lambda d=d: edge_integrals.moments(unit, d) for d in range(1, 9)}
+    for name, seconds in measure.interleaved(cases, 3).items():
+        row(name, seconds / CHUNK * 1e9)
+    heading("growth with samples: ltsh4, F = 1, 4 lights, ns per sample and light")
+    sizes = [10_000, 100_000, *([] if options.quick else [1_000_000]), *([10_000_000] if options.large else [])]
+    for size in sizes:
+        seconds = timed(specular, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
+        row(f"{size:.0e} samples", seconds / size / 4 * 1e9, note=f"{seconds:.2f} s")
+
+
+def timed(function, *arguments, rounds=3):
+    """Median seconds of one call."""
+    return measure.interleaved({"": partial(function, *arguments)}, rounds)[""]
+
+
+def repeated(function, count):
+    for _ in range(count):
+        function()
+
+
+def processes(options):
+    """One and two processes, and peak memory."""
+    count = 300_000 if options.quick else 2_000_000
+    samples, lights = floor_scene(count, 8, "schlick")
+    for name in ("ltc", "ltsh4"):
+        heading(f"processes: {name}, Schlick, {count} samples, 8 lights")
+        found, cpu = {}, {}
+
+        def run(number, name=name, found=found, cpu=cpu):
+            before = cpu_seconds()
+            found[number] = specular(samples, lights, TABLES[name], workers=number).specular
+            cpu[number] = cpu_seconds() - before
+
+        medians, ratio = measure.ratios({n: partial(run, n) for n in (1, 2)}, 2, 3)
+        for number, seconds in medians.items():
+            row(f"{number} process{'es' if number > 1 else ''}", seconds / count / 8 * 1e9, note=f"{seconds:.2f} s")
+        same = np.array_equal(found[1], found[2])
+        print(f"  speed-up, target 1.8: {ratio[1]:.2f} at a load of {os.getloadavg()[0]:.1f}; same bits: {same}")
+        most = 2.0 * cpu[1] / cpu[2]
+        print(f"  processor time of two against one: {cpu[2] / cpu[1]:.2f}, which leaves a speed-up of {most:.2f}")
+    sizes = (500_000, 2_000_000, *((8_294_400,) if options.large else ()))
+    heading("peak memory beyond the samples: ltsh4, both passes, 8 lights, 1 and 2 processes")
+    for size in sizes[: 1 if options.quick else None]:
+        code = f"import run; run.peak_memory({size})"
+        subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True, timeout=600)
+
+
+def cpu_seconds():
+    """Processor time of this process and of its children that have ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def peak_memory(count):
+    """Print the peak of this process beyond what it has once the samples are there, and that of its child."""
+    samples, lights = floor_scene(count, 8, "schlick")
+    bytes_of_samples = sum(getattr(samples, name).nbytes for name in samples.__dataclass_fields__)
+    before = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    # What making the samples took for a while must not count.
+    Path("/proc/self/clear_refs").write_text("5")
+    children, start = [], workers.subprocess.Popen
+
+    def popen(*arguments, **options):
+        children.append(start(*arguments, **options))
+        return children[-1]
+
+    workers.subprocess.Popen = popen
+    peaks = {}
+
+    def look(_):
+        peaks.update({child.pid: peak_of(child.pid) for child in children})
+
+    text = []
+    for number in (1, 2):
+        shading.shade(samples, lights, "ltsh4", workers=number, progress=look)
+        text.append(f"{(peak_of('self') - before) / 2**20:.0f} MiB")
+    text[1] += f" and {max(peaks.values(), default=0) / 2**20:.0f} MiB in the child"
+    print(f"  {count} samples ({bytes_of_samples / 2**20:.0f} MiB): " + "; ".join(text), flush=True)
+
+
+def peak_of(pid):
+    """Largest resident size of a process in bytes."""
+    status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return 1024 * int(next(line for line in status if "VmHWM" in line).split()[1])
+
+
+def cycles(options):
+    """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
+    from equal_error import report
+
+    heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
+    report(64 if options.quick else 128)
+
+
+SECTIONS = {
+    "polygons": polygons,
+    "shade": shade,
+    "bounds": bounds,
+    "growth": growth,
+    "processes": processes,
+    "cycles": cycles,
+}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"default: all of {', '.join(SECTIONS)}")
+    parser.add_argument("--large", action="store_true", help="also 1e7 samples, and the memory of 3840 x 2160")
+    parser.add_argument("--quick", action="store_true", help="fewer samples and rounds")
+    parser.add_argument("--no-cycles", action="store_true", help="leave out what needs bpy")
+    options = parser.parse_args()
+    unknown = set(options.sections) - set(SECTIONS)
+    if unknown:
+        parser.error(f"unknown sections {', '.join(sorted(unknown))}; expected some of {', '.join(SECTIONS)}")
+    start = time.perf_counter()
+    print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
+          f"load {os.getloadavg()[0]:.1f}, children run on {workers.interpreter()}")  # fmt: skip
+    for name in options.sections or SECTIONS:
+        if not (name == "cycles" and options.no_cycles):
+            SECTIONS[name](options)
+    print(f"\n{time.perf_counter() - start:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

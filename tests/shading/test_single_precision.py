@@ -1,0 +1,200 @@
+"""The float32 path of `shade` against the float64 path, and its parts against their double precision counterparts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
+from test_lobe_robustness import oriented
+
+from ltsh_addon import shading
+from ltsh_addon.shading import edge_integrals, edge_loop, ridge_table, single_precision
+from ltsh_addon.shading.lookup_table import LookupTable
+from ltsh_addon.shading.polygon import project_to_sphere
+
+# What `shade` promises for radiance 1.
+PROMISED = 2e-5
+table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+
+
+def white_lights(lights):
+    return [replace(light, radiance=np.ones(3)) for light in lights]
+
+
+def all_kinds_of_samples(count, seed):
+    """Every Fresnel kind, all roughness, bump maps, geometric normals that differ, in one set."""
+    samples = random_samples(count, seed, lowest_roughness=0.0)
+    generator = np.random.default_rng(seed + 1)
+    kind = np.arange(count) % 4
+    metal = np.where(kind[:, None] < 3, 1.0, 0.0) * np.ones(3)
+    f0 = np.where(kind[:, None] == 0, metal, 0.5 * metal)
+    bent = unit(samples.normal + 0.2 * generator.normal(size=(count, 3)))
+    flat = (generator.random(count) < 0.5)[:, None]
+    return replace(
+        samples,
+        specular_f0=f0,
+        specular_f90=metal,
+        dielectric=np.where(kind >= 2, 0.7, 0.0),
+        geometric_normal=np.where(flat, samples.normal, bent),
+        smooth_normal=np.where(flat, samples.diffuse_normal, bent),
+        bump_alpha2=0.3 * generator.random(count),
+        diffuse_albedo=generator.random((count, 3)),
+    )
+
+
+def assert_close(samples, lights, name):
+    single = shading.shade(samples, lights, name, workers=1)
+    double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
+    for part in shading.PASSES:
+        found, expected = getattr(single, part), getattr(double, part)
+        assert found.dtype == np.float32 and expected.dtype == np.float64
+        assert np.isfinite(found).all() and (found >= 0.0).all()
+        error = np.abs(found - expected).max(axis=(0, 2))
+        worst = error.argmax()
+        assert error[worst] < PROMISED, (part, samples.take(slice(worst, worst + 1)))
+    return double
+
+
+@table_names
+def test_single_precision_keeps_its_promise(name):
+    double = assert_close(all_kinds_of_samples(6000, seed=1), white_lights(four_lights()), name)
+    assert double.specular.max() > 0.5 and double.diffuse.max() > 0.1
+
+
+@table_names
+def test_lights_at_hostile_places_keep_the_promise(name):
+    """Touching the surface, standing on it, edge-on, crossing the horizon, tiny, huge, far away and at the point."""
+    samples = all_kinds_of_samples(400, seed=2)
+    samples = replace(samples, position=samples.position * np.array([1.0, 1.0, 0.0]))
+    lights = [
+        area_light(center=(0, 0, 1e-6)),
+        area_light(center=(0, 0, 0.5), half_u=(0, 0, 0.5), half_v=(0, 1, 0)),
+        area_light(center=(0, 0, 0.2), half_u=(0, 0, 0.5), half_v=(1, 0.3, 0)),
+        area_light(center=(0.2, 0.1, 1.0), half_u=(1e-3, 0, 0), half_v=(0, -1e-3, 0)),
+        area_light(center=(0.2, 0.1, 1.0), half_u=(1e3, 0, 0), half_v=(0, -1e3, 0)),
+        area_light(center=(0, 0, 1e4), half_u=(2e3, 0, 0), half_v=(0, -2e3, 0)),
+        area_light(shape="DISK", center=(0.5, 0, 0.3), half_u=(1, 0, 0.4), half_v=(0, -1, 0)),
+    ]
+    for light in lights:
+        assert_close(samples, white_lights([light]), name)
+
+
+@table_names
+def test_a_scene_far_from_the_origin_keeps_the_promise(name):
+    """Positions are subtracted in double precision."""
+    samples, lights = all_kinds_of_samples(500, seed=3), white_lights(four_lights())
+    shift = np.array([1e6, -2e6, 3e5])
+    moved = replace(samples, position=samples.position + shift)
+    assert_close(moved, [replace(light, center=light.center + shift) for light in lights], name)
+
+
+@table_names
+def test_many_indices_of_refraction_give_what_single_ones_give(name):
+    samples = replace(all_kinds_of_samples(300, seed=4), roughness=np.full(300, 0.4))
+    lights = white_lights(four_lights())
+    few = replace(samples, ior=np.where(np.arange(300) % 2 == 0, 1.45, 1.8))
+    assert_close(few, lights, name)
+    # The first is another one for each of more samples than are kept apart: the same values by the other way.
+    many = replace(few, ior=few.ior + np.where(np.arange(300) < 150, 0.0, 1e-3 * np.arange(300)))
+    apart = shading.shade(few, lights, name, workers=1).specular[:, :150]
+    together = shading.shade(many, lights, name, workers=1).specular[:, :150]
+    assert len(np.unique(many.ior)) > single_precision.SEPARATE_IORS
+    assert np.abs(apart - together).max() < 2e-6
+
+
+def test_looking_straight_down_needs_no_tangent():
+    view = unit(np.array([1e-9, 0.0, 1.0]))
+    fields = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": 0.3}
+    for sample in (single_sample(view=view, **fields), single_sample(view=(0, 0, 1), **fields)):
+        assert_close(sample, white_lights([area_light(center=(0.4, 0.2, 2.0))]), "ltsh4")
+
+
+@pytest.mark.parametrize("corners", [3, 4, 5, 12, 32, 64])
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_edge_loop_gives_the_moments(degree, corners):
+    """Regular polygons around random directions: rounding of 6e-8 per edge, of moments up to 20."""
+    polygons = regular_polygons(corners, 300, seed=degree)
+    moments, fragile = edge_loop.moments(polygons, degree, edge_loop.Scratch())
+    expected = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), degree)
+    assert moments.dtype == np.float32
+    assert fragile.mean() < 0.2
+    assert np.abs(moments - expected)[:, ~fragile].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
+
+
+def test_edge_loop_gives_the_integrals_of_the_direction():
+    polygons = regular_polygons(6, 300, seed=9)
+    expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))
+    found, fragile = edge_loop.vector_irradiance(polygons, edge_loop.Scratch())
+    height, _ = edge_loop.cosine_integral(polygons, edge_loop.Scratch())
+    assert np.abs(found - expected)[:, ~fragile].max() < 1e-6
+    assert np.abs(height - expected[2])[~fragile].max() < 1e-6
+
+
+def regular_polygons(corners, count, seed):
+    """Polygons (3, V, P) in float32 around random directions above the horizon, of 0.03 to 0.5 rad."""
+    generator = np.random.default_rng(seed)
+    center = unit(generator.normal(size=(count, 3)) * np.array([0.5, 0.5, 0.0]) + np.array([0.0, 0.0, 1.0]))
+    square = oriented(generator, count, np.zeros((count, 3)), 0.5)
+    u = square[:, 1] - square[:, 0]
+    u -= (u * center).sum(axis=1, keepdims=True) * center
+    u, v = unit(u)[:, None], unit(np.cross(center, u))[:, None]
+    size = 10.0 ** generator.uniform(-1.5, -0.3, size=(count, 1, 1))
+    angle = 2.0 * np.pi * np.arange(corners) / corners
+    polygons = center[:, None] + size * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
+    return np.ascontiguousarray(polygons.transpose(2, 1, 0), dtype=np.float32)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1e-4])
+def test_polygons_that_single_precision_cannot_do_are_reported(gap):
+    """A plane that passes by the point, and a polygon of 1e-4 rad."""
+    wall = np.array([[-1.0, gap, 0.0], [1.0, gap, 0.0], [1.0, gap, 2.0], [-1.0, gap, 2.0]])
+    tiny = np.array([[0.0, 0.0, 1.0], [1e-4, 0.0, 1.0], [1e-4, 1e-4, 1.0], [0.0, 1e-4, 1.0]])
+    fine = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
+    polygons = np.stack([wall, tiny, fine]).transpose(2, 1, 0).astype(np.float32)
+    for _, fragile in (
+        edge_loop.moments(polygons, 4, edge_loop.Scratch()),
+        edge_loop.cosine_integral(polygons, edge_loop.Scratch()),
+    ):
+        assert fragile.tolist() == [True, True, False]
+
+
+@table_names
+def test_premultiplied_weights_are_the_coefficients_lobe_integrals_use(name):
+    table = shading.load_table(name)
+    generator = np.random.default_rng(6)
+    cosine, roughness = generator.random((2, 200)).astype(np.float32)
+    sine = np.sqrt(1.0 - cosine.astype(float) ** 2).astype(np.float32)
+    curves = tuple(range(table.coefficients.shape[2]))
+    warp, weights, tilt = ridge_table.prepare(table).fetch(
+        curves, cosine, sine, roughness, np.ones(200), edge_loop.Scratch()
+    )
+    lobe = table.lookup(cosine.astype(float), roughness.astype(float))
+    for row, expected in zip(warp, (lobe.xx, lobe.xz, lobe.yy, lobe.zz), strict=True):
+        assert np.abs(row - expected).max() < 3e-6 * np.abs(expected).max()
+    expected = lobe.coefficients
+    if tilt is None:
+        expected = np.einsum("fkp,kr->frp", expected, table.ridge_weights)
+    else:
+        assert np.abs(tilt - lobe.tilt).max() < 1e-5
+    assert np.abs(weights - expected).max() < 1e-5 * np.abs(expected).max()
+    assert isinstance(table, LookupTable) and ridge_table.prepare(table) is ridge_table.prepare(table)
+
+
+def test_degrees_beyond_the_fast_path_are_shaded_in_double():
+    table = shading.load_table("ltsh2")
+    rows, columns, curves, _ = table.coefficients.shape
+    wider = np.zeros((rows, columns, curves, 28))
+    wider[..., :6] = table.coefficients
+    same = replace(table, degree=6, coefficients=wider)
+    samples, lights = all_kinds_of_samples(60, seed=7), white_lights(four_lights())
+    found = shading.shade(samples, lights, same, workers=1)
+    expected = shading.shade(samples, lights, table, workers=1, dtype=np.float64)
+    assert found.specular.dtype == np.float32
+    assert np.abs(found.specular - expected.specular).max() < 1e-6
+    with pytest.raises(ValueError, match="degree 6, the single precision path goes up to 4"):
+        ridge_table.prepare(same)
+
+
+def test_other_types_are_refused():
+    with pytest.raises(ValueError, match="dtype is int64, expected float32 or float64"):
+        shading.shade(random_samples(3), four_lights(), dtype=np.int64)

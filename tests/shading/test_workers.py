@@ -1,0 +1,275 @@
+"""Worker processes of `shade`: the same bits, no orphans, and the work goes on where they fail."""
+
+import io
+import os
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from surface_scenes import four_lights, random_samples
+
+from ltsh_addon import shading
+from ltsh_addon.scene import Cancelled
+from ltsh_addon.shading import block_exchange, integrator, shared_block, worker, workers
+
+ROOT = Path(__file__).resolve().parents[2]
+TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
+
+
+@pytest.fixture(autouse=True)
+def short_tasks_for_children(monkeypatch):
+    """Children start for any task; blocks are small."""
+    monkeypatch.setattr(workers, "SECONDS_WORTH_A_CHILD", 0.0)
+    for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
+        monkeypatch.setattr(integrator, name, (17, 17))
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The child processes that were started."""
+    found = []
+    original = subprocess.Popen
+
+    def popen(*arguments, **options):
+        found.append(original(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(workers.subprocess, "Popen", popen)
+    return found
+
+
+@pytest.fixture
+def children_only(monkeypatch, started):
+    """This process takes no block as long as a child that was started lives."""
+    original = workers._Queue.next
+
+    def patient(self):
+        here = threading.current_thread() is threading.main_thread()
+        return None if here and any(process.poll() is None for process in started) else original(self)
+
+    monkeypatch.setattr(workers._Queue, "next", patient)
+
+
+def all_ended(processes):
+    return all(process.returncode is not None for process in processes)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("technique", TECHNIQUES)
+def test_workers_do_not_change_one_bit(technique, dtype, started, children_only):
+    """All blocks come from children, against all blocks from this process."""
+    samples = replace(random_samples(90, seed=6), bump_alpha2=np.full(90, 0.1))
+    one = shading.shade(samples, four_lights(), technique, workers=1, dtype=dtype)
+    assert not started
+    three = shading.shade(samples, four_lights(), technique, workers=3, dtype=dtype)
+    assert len(started) == 2 and all_ended(started)
+    for name in ("specular", "diffuse", "quadrature_error"):
+        found, expected = getattr(three, name), getattr(one, name)
+        assert (found is None) == (expected is None)
+        assert found is None or (found.dtype == expected.dtype and np.array_equal(found, expected)), name
+
+
+@pytest.mark.parametrize("part", shading.PASSES)
+def test_single_passes_travel_too(part, started, children_only):
+    samples = random_samples(60, seed=7)
+    one, two = (shading.shade(samples, four_lights(), "ltsh2", passes=[part], workers=count) for count in (1, 2))
+    assert len(started) == 1
+    assert np.array_equal(getattr(one, part), getattr(two, part))
+
+
+def test_progress_is_reported_from_this_thread_and_reaches_one(started):
+    seen, threads = [], set()
+
+    def progress(share):
+        seen.append(share)
+        threads.add(threading.current_thread())
+
+    shading.shade(random_samples(200, seed=1), four_lights(), "ltc", workers=2, progress=progress)
+    assert seen == sorted(seen) and seen[-1] == 1.0 and len(seen) > 2
+    assert threads == {threading.main_thread()}
+
+
+def test_cancelling_ends_the_children(started, children_only, caplog):
+    start = time.monotonic()
+    with pytest.raises(Cancelled):
+        shading.shade(random_samples(400), four_lights(), shading.REFERENCE, workers=3, progress=lambda _: False)
+    assert len(started) == 2 and all_ended(started)
+    assert time.monotonic() - start < 30.0
+    assert not caplog.records
+
+
+def test_an_error_ends_the_children(started):
+    def fail(_):
+        raise RuntimeError("window closed")
+
+    with pytest.raises(RuntimeError, match="window closed"):
+        shading.shade(random_samples(400), four_lights(), "ltc", workers=3, progress=fail)
+    assert len(started) == 2 and all_ended(started)
+
+
+def test_a_child_that_dies_costs_nothing_but_time(started, children_only, caplog):
+    """The processes are killed as soon as some blocks are done; this one takes over."""
+    samples = random_samples(300, seed=2)
+
+    def kill(share):
+        if share > 0.0:
+            for process in started:
+                process.kill()
+
+    expected = shading.shade(samples, four_lights(), "ltc", workers=1)
+    found = shading.shade(samples, four_lights(), "ltc", workers=2, progress=kill)
+    assert np.array_equal(found.combined, expected.combined)
+    assert "worker process ended early" in caplog.text
+
+
+@pytest.mark.parametrize("python", ["/no/such/python3", ""])
+def test_without_an_interpreter_this_process_does_it_all(python, monkeypatch, caplog):
+    samples = random_samples(60, seed=3)
+    expected = shading.shade(samples, four_lights(), "ltc", workers=1)
+    monkeypatch.setattr(sys, "executable", python)
+    found = shading.shade(samples, four_lights(), "ltc", workers=2)
+    assert np.array_equal(found.combined, expected.combined)
+    assert ("cannot be started" in caplog.text) == bool(python)
+
+
+@pytest.mark.parametrize(("path", "found"), [("/a/python3.13", True), ("/b/blender", False), ("", False)])
+def test_only_a_python_runs_children(path, found, monkeypatch):
+    monkeypatch.setattr(sys, "executable", path)
+    assert workers.interpreter() == (path if found else None)
+
+
+def test_few_samples_stay_in_this_process(monkeypatch, started):
+    monkeypatch.setattr(workers, "SECONDS_WORTH_A_CHILD", 0.5)
+    shading.shade(random_samples(1000), four_lights(), "ltsh4", workers=8)
+    assert not started
+
+
+PARENT = """
+import sys, time
+sys.path[:0] = [{root!r}, {tests!r}]
+from surface_scenes import four_lights, random_samples
+from ltsh_addon import shading
+from ltsh_addon.shading import integrator, workers
+workers.SECONDS_WORTH_A_CHILD = 0.0
+integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
+original = workers.subprocess.Popen
+def popen(*arguments, **options):
+    process = original(*arguments, **options)
+    print(process.pid, flush=True)
+    return process
+workers.subprocess.Popen = popen
+shading.shade(random_samples(100000), four_lights(), "reference", workers=2)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_children_of_a_killed_parent_end():
+    code = PARENT.format(root=str(ROOT), tests=str(Path(__file__).parent))
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    with parent:
+        child = int(parent.stdout.readline())
+        time.sleep(1.0)
+        assert is_running(child)
+        parent.kill()
+    deadline = time.monotonic() + 20.0
+    while is_running(child) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not is_running(child)
+
+
+def is_running(pid):
+    """True for processes that are there and not zombies, which only wait to be reaped by whoever inherits them."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_shared_blocks_hold_arrays_side_by_side():
+    layout, size = shared_block.layout_of({"a": ((3, 2), np.float64), "b": ((5,), np.float32), "c": ((0, 3), np.int8)})
+    block = shared_block.SharedBlock(size)
+    ours, theirs = block.arrays(layout), shared_block.arrays_in(shared_block.attach(block.handle, size), layout)
+    for number, name in enumerate("abc"):
+        ours[name][...] = number + 1
+    for number, name in enumerate("abc"):
+        assert (theirs[name] == number + 1).all()
+        assert theirs[name].shape == ours[name].shape and theirs[name].dtype == ours[name].dtype
+    block.close()
+
+
+def test_a_normal_that_stands_for_another_is_sent_once():
+    samples = random_samples(20)
+    task = integrator._task(samples, tuple(four_lights()), "ltc", ("specular",), np.float32)
+    side = block_exchange.ParentSide(task, samples, 20)
+    assert side.same == {"geometric_normal": "normal"}
+    assert not {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"} & set(side.sent)
+    side.close()
+
+
+def test_messages_survive_the_way_and_an_end_is_noticed():
+    stream = io.BytesIO()
+    for message in ({"a": 1}, None, list(range(1000))):
+        worker.send(stream, message)
+    stream.seek(0)
+    assert [worker.receive(stream) for _ in range(3)] == [{"a": 1}, None, list(range(1000))]
+    with pytest.raises(EOFError):
+        worker.receive(stream)
+
+
+def test_the_package_may_have_another_name_in_the_parent():
+    """Blender loads it as bl_ext.user_default.ltsh.ltsh_addon."""
+    stream = io.BytesIO()
+    data = b"cbl_ext.repository.ltsh.ltsh_addon.shading.brdf\nschlick_curve\n."
+    stream.write(worker._LENGTH.pack(len(data)) + data)
+    stream.seek(0)
+    found = worker.receive(stream, "bl_ext.repository.ltsh.ltsh_addon")
+    assert found.__module__ == "ltsh_addon.shading.brdf"
+
+
+RENAMED = """
+import importlib, sys, types
+for name in ("bl_ext", "bl_ext.user_default", "bl_ext.user_default.ltsh"):
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = []
+sys.modules["bl_ext.user_default.ltsh"].__path__ = [{root!r}]
+sys.path[:] = [entry for entry in sys.path if entry not in ("", {root!r})]
+package = "bl_ext.user_default.ltsh.ltsh_addon."
+shading, scene, workers, integrator = (
+    importlib.import_module(package + name) for name in ("shading", "scene", "shading.workers", "shading.integrator")
+)
+import numpy as np
+workers.SECONDS_WORTH_A_CHILD = 0.0
+integrator.BLOCK_LIMITS = (8, 8)
+by_children = []
+done = workers._Queue.done
+def counted(self, *arguments):
+    import threading
+    by_children.append(threading.current_thread() is not threading.main_thread())
+    done(self, *arguments)
+workers._Queue.done = counted
+up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
+position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
+samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)
+light = scene.AreaLight("Lamp", "RECTANGLE", (0, 0, 2), (1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 1, 1))
+import time
+one, two = (
+    shading.shade(samples, [light], "ltsh4", workers=count, progress=lambda _: time.sleep(0.2 * (count - 1))).combined
+    for count in (1, 2)
+)
+print(np.array_equal(one, two), any(by_children), "ltsh_addon" in sys.modules)
+"""
+
+
+def test_children_work_for_the_package_as_blender_loads_it():
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", RENAMED.format(root=str(ROOT))],
+        capture_output=True, text=True, timeout=120, check=False, cwd=Path(__file__).parent,
+    )  # fmt: skip
+    assert run.stdout.split() == ["True", "True", "False"], run.stderr

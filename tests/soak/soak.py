@@ -1,0 +1,202 @@
+"""Long checks of the integrals: `make soak`. Random evaluations must be finite and not negative, and random polygons of
+every kind must agree with quadrature.
+
+python tests/soak/soak.py [--evaluations N] [--polygons N] [--seed S]
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "shading")]
+
+import test_lobe_robustness as hostile  # noqa: E402
+
+from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.shading.polygon import split_at_horizon  # noqa: E402
+
+TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
+BATCH = 50_000
+# Pieces per edge, and order of the rule in each, tried in turn.
+REFINEMENTS = ((3, 10), (4, 16), (6, 24), (10, 32), (20, 40))
+# Absolute, against quadrature: float64 on generic and on hard sets, float32 on all.
+GENERIC, HARD, SINGLE = 1e-8, 1e-7, 2e-5
+# Of tiny polygons in float32, unless the lobe is a thousand times darker there than elsewhere.
+RELATIVE = 1e-4
+
+
+def evaluate(count, generator):
+    """`count` integrals over hostile polygons, all tables, both precisions: finite and not negative."""
+    done, start, shown = 0, time.perf_counter(), 0.0
+    while done < count:
+        for kind in hostile.HOSTILE:
+            polygons = kind(generator, BATCH)
+            cosine, roughness = hostile.setting(generator, BATCH)
+            for name, table in TABLES.items():
+                # Single precision is what shades; double precision is its oracle and five times slower.
+                for dtype in (np.float32,) * 4 + (np.float64,):
+                    values = shading.integrate_polygon(table, cosine, roughness, polygons.astype(dtype))
+                    wrong = ~(np.isfinite(values) & (values >= 0.0))
+                    if wrong.any():
+                        first = np.nonzero(wrong)[0][0]
+                        raise SystemExit(
+                            f"{name} {kind.__name__} {np.dtype(dtype)}: {values[first]} at cos_theta_o "
+                            f"{cosine[first]!r}, roughness {roughness[first]!r}, {polygons[first].tolist()}"
+                        )
+                    done += BATCH
+                    cosine, roughness = np.roll(cosine, 1), np.roll(roughness, 1)
+        seconds = time.perf_counter() - start
+        if seconds - shown > 10.0 or done >= count:
+            shown = seconds
+            print(f"  {done:.2e} of {count:.0e} evaluations, {seconds:.0f} s", flush=True)
+
+
+def generic(generator, count):
+    """Squares of 0.03 to 1 around random directions, above the horizon."""
+    return _lifted(_squares(generator, count, 10.0 ** generator.uniform(-1.5, 0.0, size=(count, 1, 1))))
+
+
+def tiny(generator, count):
+    return _lifted(_squares(generator, count, 1e-4))
+
+
+def _squares(generator, count, size):
+    center = hostile.unit(generator.normal(size=(count, 3)) + np.array([0.0, 0.0, 0.7]))
+    return hostile.oriented(generator, count, center, size)
+
+
+def _lifted(polygons):
+    lift = np.maximum(0.01 - polygons[..., 2].min(axis=1), 0.0)
+    return polygons + np.array([0.0, 0.0, 1.0]) * lift[:, None, None]
+
+
+def huge(generator, count):
+    """Ceilings at 0.001 to 1 of their size."""
+    height = 10.0 ** generator.uniform(-3.0, 0.0, size=(count, 1, 1))
+    shift = generator.uniform(-0.8, 0.8, size=(count, 1, 3)) * np.array([1.0, 1.0, 0.0])
+    return hostile.SQUARE + shift + height * np.array([0.0, 0.0, 1.0])
+
+
+def crossing(generator, count):
+    """Cut by the horizon at any angle."""
+    return _squares(generator, count, 10.0 ** generator.uniform(-0.5, 0.5, size=(count, 1, 1)))
+
+
+def grazing(generator, count):
+    """Planes that pass by the point at 1e-3 to 1e-1 of their size, cut by the horizon."""
+    polygons = hostile.oriented(generator, count, np.zeros((count, 3)), 1.0)
+    u = polygons[:, 1] - polygons[:, 0]
+    normal = hostile.unit(np.cross(u, polygons[:, 2] - polygons[:, 1]))[:, None]
+    gap = 10.0 ** generator.uniform(-3.0, -1.0, size=(count, 1, 1))
+    return polygons + u[:, None] * generator.uniform(-1.0, 1.0, size=(count, 1, 1)) + gap * normal
+
+
+def repeated(generator, count):
+    """A corner twice and one on the edge between its neighbors: hexagons that are rectangles."""
+    polygons = generic(generator, count)
+    middle = 0.5 * (polygons[:, 1] + polygons[:, 2])
+    return np.concatenate([polygons[:, :2], middle[:, None], polygons[:, 2:3], polygons[:, 2:]], axis=1)
+
+
+SETS = {
+    generic: GENERIC, tiny: HARD, huge: HARD, crossing: HARD, grazing: HARD, repeated: GENERIC,
+}  # fmt: skip
+
+
+def against_quadrature(count, generator):
+    """`count` polygons of each set, smooth lobes of every table, against a rule that refines until it agrees."""
+    for kind, limit in SETS.items():
+        worst, start = {np.float64: 0.0, np.float32: 0.0}, time.perf_counter()
+        relative, certain = 0.0, 0
+        for first in range(0, count, 500):
+            size = min(500, count - first)
+            polygons = kind(generator, size).astype(np.float32)
+            cosine, roughness = generator.random(size).astype(np.float32), generator.uniform(0.4, 1.0, size)
+            roughness = roughness.astype(np.float32)
+            table = TABLES[("ltsh2", "ltsh4")[first // 500 % 2]]
+            expected, sure = quadrature(table, cosine, roughness, polygons.astype(np.float64), 0.1 * limit)
+            certain += sure.sum()
+            for dtype in worst:
+                found = shading.integrate_polygon(table, cosine, roughness, polygons.astype(dtype), signed=True)
+                error = np.abs(found - expected)[sure]
+                worst[dtype] = max(worst[dtype], error.max(initial=0.0))
+                if dtype == np.float32 and kind is tiny:
+                    scale = np.abs(expected)[sure]
+                    relative = max(relative, (error / np.maximum(scale, 1e-3 * scale.max())).max())
+        text = f"  {kind.__name__:<9} {count} polygons, {certain / count:.1%} of them certain: "
+        text += f"float64 {worst[np.float64]:.1e} (limit {limit:.0e}), float32 {worst[np.float32]:.1e} ({SINGLE:.0e})"
+        text += f", relative {relative:.1e} ({RELATIVE:.0e})" if kind is tiny else ""
+        print(f"{text}, {time.perf_counter() - start:.0f} s", flush=True)
+        if worst[np.float64] > limit or worst[np.float32] > SINGLE or relative > RELATIVE:
+            raise SystemExit(f"{kind.__name__}: beyond the limit")
+
+
+def quadrature(table, cosine, roughness, polygons, agreement):
+    """Signed integrals (P,) of the lobes over polygons (P, V, 3), and the mask (P,) where they two rules agree.
+
+    Fans of triangles from the polygon's mean direction, every edge cut into pieces; in each Gauss-Legendre collapsed
+    to the triangle. Both are refined until two rules differ by less than `agreement`.
+    """
+    values, sure = np.zeros(len(polygons)), np.ones(len(polygons), bool)
+    for index, part in split_at_horizon(np.ascontiguousarray(polygons.transpose(2, 1, 0))):
+        part = part.transpose(2, 1, 0)
+        open_points = np.arange(len(index))
+        last = np.full(len(index), np.inf)
+        for pieces, order in REFINEMENTS:
+            at = index[open_points]
+            found = _fan(table, cosine[at], roughness[at], part[open_points], pieces, order)
+            values[at] = found
+            agree = np.abs(found - last[open_points]) < agreement
+            last[open_points] = found
+            open_points = open_points[~agree]
+            if len(open_points) == 0:
+                break
+        sure[index[open_points]] = False
+    return values, sure
+
+
+def _fan(table, cosine, roughness, polygons, pieces, order):
+    nodes, weights = np.polynomial.legendre.leggauss(order)
+    nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights
+    unit = polygons / np.linalg.norm(polygons, axis=2, keepdims=True)
+    apex = hostile.unit(unit.mean(axis=1))
+    cosine, roughness = cosine.astype(float), roughness.astype(float)
+    result = np.zeros(len(polygons))
+    for corner in range(polygons.shape[1]):
+        a, b = polygons[:, corner], polygons[:, (corner + 1) % polygons.shape[1]]
+        if np.array_equal(a, b):
+            continue
+        for piece in range(pieces):
+            # The cosine spacing of the pieces is dense at the ends, where edges near half a circle turn fast.
+            low, high = (0.5 - 0.5 * np.cos(np.pi * step / pieces) for step in (piece, piece + 1))
+            start, end = (hostile.unit(a + share * (b - a)) for share in (low, high))
+            volume = (np.cross(start, end) * apex).sum(axis=1)
+            for along, along_weight in zip(nodes, weights, strict=True):
+                edge = start + along * (end - start)
+                points = apex[:, None] + nodes[:, None] * (edge - apex)[:, None]
+                length = np.linalg.norm(points, axis=2)
+                lobe = shading.evaluate_lobe(table, cosine, roughness, points / length[..., None])
+                result += along_weight * volume * (lobe * weights * nodes / length**3).sum(axis=1)
+    return result
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--evaluations", type=float, default=1e8)
+    parser.add_argument("--polygons", type=float, default=1e5)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    generator = np.random.default_rng(options.seed)
+    print(f"random polygons against quadrature, seed {options.seed}")
+    against_quadrature(int(options.polygons), generator)
+    print("random evaluations: finite and not negative")
+    evaluate(int(options.evaluations), generator)
+    print("passed")
+
+
+if __name__ == "__main__":
+    main()

@@ -2,13 +2,13 @@
 
 The squared error of a point is a sum of four terms, all relative to the true lobe:
 
-- the squared L2 error over the upper hemisphere;
+- the squared L2 error over the upper hemisphere, where directions in which the fitted lobe is negative count
+  1 + NEGATIVE_WEIGHT times;
 - LIGHT_WEIGHT times the squared error of what a renderer computes, integrals over lights: soft windows of three widths,
   spread evenly over the hemisphere. An L2 norm alone sells the tail of the lobe for a little at the peak, but a light
   is often seen in the tail alone;
 - ALBEDO_WEIGHT times the squared error of the albedo;
-- NEGATIVE_WEIGHT times the square of what the mass of the directions where the lobe is negative exceeds NEGATIVE_SHARE
-  by: a little of it does no harm, and a tail that oscillates around the truth costs nothing where lights are wide.
+- EXCESS_WEIGHT times the square of what the negative mass, relative to the albedo, has above NEGATIVE_SHARE.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ from .projection import Points, warped_basis
 
 # An error below this one is good enough: points count by 1 / max(error, ERROR_FLOOR).
 ERROR_FLOOR = 2e-3
-LIGHT_WEIGHT = 0.25
+LIGHT_WEIGHT = 0.4
 ALBEDO_WEIGHT = 9.0
-NEGATIVE_WEIGHT = 100.0
-NEGATIVE_SHARE = 0.006
+NEGATIVE_WEIGHT = 2.0
+NEGATIVE_SHARE = 0.008
+EXCESS_WEIGHT = 50.0
 WINDOWS = 40
 WINDOW_WIDTHS = np.radians([8.0, 16.0, 28.0])
 
@@ -71,17 +72,17 @@ def _linearize(family, points, values, derivatives):
     # Missing: of every curve for the right-hand side, of F = 1 for the error
     targets = points.lobes.copy()
     targets[..., 0] -= lobe
-    weights = points.quadrature / (points.quadrature * points.lobes[..., 0] ** 2).sum(axis=1)[:, None]
+    weights = points.quadrature * (1.0 + NEGATIVE_WEIGHT * (lobe < 0.0))
+    weights /= (points.quadrature * points.lobes[..., 0] ** 2).sum(axis=1)[:, None]
     misses = np.matmul(functionals, targets)
     albedo_row = _albedo_row(family, points, warp, coefficients)
     albedo_misses = points.albedo / points.albedo[:, :1]
     albedo_misses[:, 0] -= np.einsum("pd,pd->p", albedo_row[:, family.parameters :], coefficients)
-    negative_row = np.where(lobe < 0.0, points.quadrature, 0.0) / points.albedo[:, :1]
-    negative_miss = np.maximum(-(negative_row * lobe).sum(axis=1) - NEGATIVE_SHARE, 0.0)
-    negative_row *= (negative_miss > 0.0)[:, None]
     squared = (weights * targets[..., 0] ** 2).sum(axis=1) + scales * (misses[..., 0] ** 2).sum(axis=1)
-    squared += ALBEDO_WEIGHT * albedo_misses[:, 0] ** 2 + NEGATIVE_WEIGHT * negative_miss**2
-    error = np.sqrt(squared)
+    excess_row = np.where(lobe < 0.0, points.quadrature, 0.0) / points.albedo[:, :1]
+    excess = np.maximum(-(excess_row * lobe).sum(axis=1) - NEGATIVE_SHARE, 0.0)
+    excess_row *= (excess > 0.0)[:, None]
+    error = np.sqrt(squared + ALBEDO_WEIGHT * albedo_misses[:, 0] ** 2 + EXCESS_WEIGHT * excess**2)
     if not derivatives:
         return error, None, None
     importance = 1.0 / np.maximum(error, ERROR_FLOOR)
@@ -91,8 +92,8 @@ def _linearize(family, points, values, derivatives):
     rows = [(np.matmul(functionals, jacobian), scales, misses)]
     rows.append((albedo_row[:, None], (ALBEDO_WEIGHT * importance)[:, None], albedo_misses[:, None]))
     if points.lobes.shape[2] == 1:
-        slopes = np.matmul(negative_row[:, None], jacobian)
-        rows.append((slopes, (NEGATIVE_WEIGHT * importance)[:, None], negative_miss[:, None, None]))
+        slopes = np.matmul(excess_row[:, None], jacobian)
+        rows.append((slopes, (EXCESS_WEIGHT * importance)[:, None], excess[:, None, None]))
     for row in rows:
         more = _normal(*row)
         matrices, right = matrices + more[0], right + more[1]

@@ -14,7 +14,7 @@ import numpy as np
 
 from .linearization import linearize
 
-ITERATIONS = 4
+ITERATIONS = 3
 FIRST_DAMPING = 1e-3
 
 

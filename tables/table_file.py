@@ -55,6 +55,7 @@ def settings(family, model, size) -> dict:
         "albedo_weight": linearization.ALBEDO_WEIGHT,
         "negative_weight": linearization.NEGATIVE_WEIGHT,
         "negative_share": linearization.NEGATIVE_SHARE,
+        "excess_weight": linearization.EXCESS_WEIGHT,
         "light_weight": linearization.LIGHT_WEIGHT,
         "error_floor": linearization.ERROR_FLOOR,
     }

@@ -68,10 +68,10 @@ def draw_lobes():
             radius = np.sign(lobe) * np.sqrt(np.abs(lobe))
             axis.plot(directions[:, 0] * radius, directions[:, 2] * radius, color=COLORS[name], lw=1.0, label=name)
         axis.set_title(f"roughness {roughness}, theta_o {theta:.0f} deg", fontsize=9)
+        axis.axhline(0.0, color="0.5", lw=0.6)
         axis.set_aspect("equal")
-        axis.set_xticks([])
-        axis.set_yticks([])
-    axes[0].legend(fontsize=7, frameon=False)
+        axis.axis("off")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 

@@ -236,7 +236,7 @@ def test_the_installed_add_on_exports_without_scipy(installed, exported, out):
 @pytest.mark.parametrize("action", ["fit", "validate"])
 def test_fit_and_validate_say_what_they_lack(installed, action):
     done = _run_without_scipy(installed, "bl_ext.user_default.ltsh.ltsh_addon", "tables", action)
-    assert (done.returncode, done.stdout) == (2, "") and "need the source checkout" in done.stderr
+    assert (done.returncode, done.stdout) == (2, "") and "needs the source checkout" in done.stderr
     done = _run_without_scipy(ROOT, "ltsh_addon", "tables", action)
-    assert (done.returncode, done.stdout) == (2, "") and "need scipy" in done.stderr
+    assert (done.returncode, done.stdout) == (2, "") and "needs scipy" in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -85,6 +85,9 @@ def _task(samples, lights, technique, passes, dtype) -> Task:
     table = technique
     if isinstance(technique, str | Path) and technique != REFERENCE:
         table = load_table(technique)
+    if not isinstance(table, str) and table.family == "ltsh":
+        # Workers get this matrix with the table: LAPACK need not give the same last bits in every process.
+        _ = table.ridge_weights
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     lights = tuple(light for light in lights if np.cross(light.half_u, light.half_v).any())
     fast = not isinstance(table, str) and table.degree <= edge_loop.MAX_DEGREE

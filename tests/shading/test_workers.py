@@ -74,6 +74,19 @@ def test_workers_do_not_change_one_bit(technique, dtype, started, children_only)
         assert found is None or (found.dtype == expected.dtype and np.array_equal(found, expected)), name
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_workers_use_the_matrix_of_this_process(dtype, started, children_only):
+    """The moment weights come from LAPACK, whose last bits may differ between processes: here by much more."""
+    table = shading.load_table("ltsh4")
+    table.__dict__["ridge_weights"] = 1.01 * table.ridge_weights
+    samples = random_samples(40, seed=9)
+    one = shading.shade(samples, four_lights(), table, passes=["specular"], workers=1, dtype=dtype)
+    three = shading.shade(samples, four_lights(), table, passes=["specular"], workers=3, dtype=dtype)
+    assert len(started) == 2 and np.array_equal(one.specular, three.specular)
+    plain = shading.shade(samples, four_lights(), "ltsh4", passes=["specular"], workers=1, dtype=dtype)
+    assert not np.array_equal(one.specular, plain.specular)
+
+
 @pytest.mark.parametrize("part", shading.PASSES)
 def test_single_passes_travel_too(part, started, children_only):
     samples = random_samples(60, seed=7)

@@ -18,7 +18,8 @@ _TERMS_PER_LINE = 3
 
 def lobe_functions(table: LookupTable) -> str:
     """Moments of polygons and their weights, values and albedos of lobes, for the table's family and degree."""
-    return (_expansion_functions(table) if table.family == "ltsh" else _COSINE_FUNCTIONS) + "\n" + _INTEGRATE
+    functions = _expansion_functions(table) if table.family == "ltsh" else _COSINE_FUNCTIONS
+    return functions.replace("@LOBE_HEAD@\n", _LOBE_HEAD) + "\n" + _INTEGRATE
 
 
 def _expansion_functions(table) -> str:
@@ -100,6 +101,19 @@ def _legendre_value(l, m, legendre) -> str:  # noqa: E741
     return f"{first} - {float_literal((l + m - 1) / (l - m))} * {legendre[l - 2, m]}"
 
 
+_LOBE_HEAD = """\
+/* The lobe, BRDF times cosine in sr^-1, at a unit direction; 0 below the horizon. */
+LTSH_FUNCTION float @prefix@_evaluate_lobe(
+    ltsh_warp warp, @prefix@_coefficients coefficients, ltsh_vec3 direction)
+{
+    if (!(direction.z > 0.0f)) {
+        return 0.0f;
+    }
+    ltsh_vec3 toward = ltsh_warped(warp, direction);
+    float size = LTSH_SQRT(ltsh_dot(toward, toward));
+    ltsh_vec3 unit = ltsh_unit(toward);
+"""
+
 _EXPANSION_FUNCTIONS = """\
 /* Weights of the moments of a polygon: once per coefficient vector, for any number of lights. */
 LTSH_FUNCTION @prefix@_weights @prefix@_moment_weights(@prefix@_coefficients coefficients)
@@ -125,16 +139,7 @@ LTSH_FUNCTION @prefix@_moments @prefix@_polygon_moments(ltsh_warp warp, ltsh_pol
     return moments;
 }
 
-/* The lobe, BRDF times cosine in sr^-1, at a unit direction; 0 below the horizon. */
-LTSH_FUNCTION float @prefix@_evaluate_lobe(
-    ltsh_warp warp, @prefix@_coefficients coefficients, ltsh_vec3 direction)
-{
-    if (!(direction.z > 0.0f)) {
-        return 0.0f;
-    }
-    ltsh_vec3 toward = ltsh_warped(warp, direction);
-    float size = LTSH_SQRT(ltsh_dot(toward, toward));
-    ltsh_vec3 unit = ltsh_unit(toward);
+@LOBE_HEAD@
 @EXPANSION_LINES@
     return original * (warp.xx / size) * (warp.yy / size) * (warp.zz / size);
 }
@@ -164,16 +169,7 @@ LTSH_FUNCTION @prefix@_moments @prefix@_polygon_moments(ltsh_warp warp, ltsh_pol
     return moments;
 }
 
-/* The lobe, BRDF times cosine in sr^-1, at a unit direction; 0 below the horizon. */
-LTSH_FUNCTION float @prefix@_evaluate_lobe(
-    ltsh_warp warp, @prefix@_coefficients coefficients, ltsh_vec3 direction)
-{
-    if (!(direction.z > 0.0f)) {
-        return 0.0f;
-    }
-    ltsh_vec3 toward = ltsh_warped(warp, direction);
-    float size = LTSH_SQRT(ltsh_dot(toward, toward));
-    ltsh_vec3 unit = ltsh_unit(toward);
+@LOBE_HEAD@
     float toward_axis = LTSH_SIN(warp.tilt) * unit.x + LTSH_COS(warp.tilt) * unit.z;
     float original = coefficients.values[0] * ltsh_larger(toward_axis, 0.0f) * @ONE_OVER_PI@;
     return original * (warp.xx / size) * (warp.yy / size) * (warp.zz / size);

@@ -167,9 +167,10 @@ def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:
 def material_classes(samples: SurfaceSamples) -> dict[str, np.ndarray]:
     """Masks (P,) of the samples whose specular lobe is mostly a metal's, or mostly a dielectric's."""
     metal = samples.specular_f90.max(axis=1, initial=0.0)
+    dielectric = samples.dielectric.max(axis=1, initial=0.0)
     return {
-        "metals": (metal > samples.dielectric) & (metal > 0.0),
-        "dielectrics": (samples.dielectric >= metal) & (samples.dielectric > 0.0),
+        "metals": (metal > dielectric) & (metal > 0.0),
+        "dielectrics": (dielectric >= metal) & (dielectric > 0.0),
     }
 
 

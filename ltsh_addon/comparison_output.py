@@ -25,9 +25,11 @@ SAMPLE_LAYERS = {
     "roughness": "V",
     "specular_f0": "RGB",
     "specular_f90": "RGB",
-    "dielectric": "V",
+    "specular_dip": "RGB",
+    "dielectric": "RGB",
     "ior": "V",
     "diffuse_albedo": "RGB",
+    "receiver": "V",
 }
 
 
@@ -66,7 +68,7 @@ class Comparison:
     def _film_of(self, result) -> Film:
         if result.subset is None:
             return self.film
-        return Film(self.film.width, self.film.height, self.film.pixel[result.subset], self.film.sub_samples)
+        return self.film.take(result.subset)
 
     def _mask(self, result) -> np.ndarray:
         """Pixels (H, W) that see a surface and, for a subset, were evaluated."""
@@ -196,9 +198,12 @@ class Comparison:
             for name, result in self.results.items():
                 error = self.images[name, pass_name] - mean
                 layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
+        # Of a surface with several lobes its first.
+        first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
+        film = self.film.take(first)
         for field, letters in SAMPLE_LAYERS.items():
-            values = getattr(self.extraction.samples, field)
-            layers[f"samples.{field}"] = imaging.Layer(self.film.image(values), letters)
+            values = getattr(self.extraction.samples, field)[first]
+            layers[f"samples.{field}"] = imaging.Layer(film.image(values), letters)
         layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
         return layers
 

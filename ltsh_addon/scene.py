@@ -16,7 +16,8 @@ class Cancelled(Exception):
     """A long computation was stopped on request."""
 
 
-AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")
+AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # of Blender's area lights
+LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, "POLYGON")
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,13 @@ class AreaLight:
     """A one-sided, uniformly emitting, flat area light.
 
     The surface is ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE and
-    s^2 + t^2 <= 1 for DISK and ELLIPSE.
+    s^2 + t^2 <= 1 for DISK and ELLIPSE. That of a POLYGON is inside `corners`, in the plane of center, half_u and
+    half_v, which say how far it reaches. A `spread` below pi focuses the light as in Cycles: the radiance is multiplied
+    by max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
     """
 
     name: str
-    shape: str  # one of AREA_LIGHT_SHAPES
+    shape: str  # one of LIGHT_SHAPES
     center: np.ndarray  # (3,) m
     half_u: np.ndarray  # (3,) m
     half_v: np.ndarray  # (3,) m
@@ -37,17 +40,33 @@ class AreaLight:
     group: str = ""
     affects_diffuse: bool = True
     affects_specular: bool = True
+    corners: np.ndarray | None = None  # (V, 3) m, simple polygon, counterclockwise seen from the lit side; POLYGON only
+    spread: float = np.pi  # rad, full angle of the cone into which the light shines
+    receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
 
     def __post_init__(self):
-        if self.shape not in AREA_LIGHT_SHAPES:
-            raise ValueError(
-                f"light {self.name!r}: shape is {self.shape!r}, expected one of {', '.join(AREA_LIGHT_SHAPES)}"
-            )
+        if self.shape not in LIGHT_SHAPES:
+            raise ValueError(f"light {self.name!r}: shape is {self.shape!r}, expected one of {', '.join(LIGHT_SHAPES)}")
         for name in ("center", "half_u", "half_v", "direction", "radiance"):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"light {self.name!r}: {name} is {value!r}, expected three finite numbers")
             object.__setattr__(self, name, value)
+        if (self.shape == "POLYGON") != (self.corners is not None):
+            found = "left out" if self.corners is None else "given"
+            raise ValueError(
+                f"light {self.name!r}: shape {self.shape} and corners {found}, "
+                "expected corners for POLYGON and for no other shape"
+            )
+        if self.corners is not None:
+            corners = np.asarray(self.corners, dtype=np.float64)
+            if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3 or not np.isfinite(corners).all():
+                raise ValueError(f"light {self.name!r}: corners {corners!r}, expected (V, 3) finite numbers, V >= 3")
+            object.__setattr__(self, "corners", corners)
+        if not 0.0 < self.spread <= np.pi + 1e-6:
+            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
+        if self.receivers is not None:
+            object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
 
     @property
     def is_round(self) -> bool:
@@ -59,6 +78,8 @@ class AreaLight:
 
         A disk or ellipse becomes a regular polygon of `round_vertices` corners, stretched to the area of the ellipse.
         """
+        if self.corners is not None:
+            return self.corners
         if self.is_round:
             angle = 2.0 * np.pi * np.arange(round_vertices) / round_vertices
             step = 2.0 * np.pi / round_vertices
@@ -71,16 +92,22 @@ class AreaLight:
         return corners[::-1] if mirrored else corners
 
 
+# Fields of SurfaceSamples with one number per sample; all others are vectors or colors.
+SCALAR_FIELDS = ("roughness", "ior", "bump_alpha2", "receiver")
+
+
 @dataclass(frozen=True)
 class SurfaceSamples:
     """P surface points with all that shading needs. Vectors are unit, in world space; last axis is space or color.
 
     The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
-    ``f0 + (f90 - f0) (1 - c)^5  +  dielectric * F_d(c, ior)``, c = cosine of the half angle, F_d the exact unpolarized
-    reflectance of a dielectric. `diffuse_albedo` already includes what the specular layer takes away. As in Cycles the
-    specular lobe ends at the horizons of both the shading and the geometric normal, and a bump-mapped diffuse lobe at
-    the horizon of the smooth normal; toward that it is shadowed by 2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)),
-    theta_i the angle of the light from the smooth normal (Estevez, Lecocq and Stein 2019).
+    ``f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6 + dielectric F_d(c, ior)``, c = cosine of the half angle, F_d the
+    exact unpolarized reflectance of a dielectric; negative terms may stand for a tint, the sum is never negative. A
+    surface with several lobes has one sample for each. `diffuse_albedo` already includes what the specular layer takes
+    away. As in Cycles the specular lobe ends at the horizons of both the shading and the geometric normal, and a
+    bump-mapped diffuse lobe at the horizon of the smooth normal; toward that it is shadowed by
+    2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)), theta_i the angle of the light from the smooth normal (Estevez,
+    Lecocq and Stein 2019).
     """
 
     position: np.ndarray  # (P, 3) m
@@ -90,27 +117,32 @@ class SurfaceSamples:
     roughness: np.ndarray  # (P,) in [0, 1]
     specular_f0: np.ndarray  # (P, 3)
     specular_f90: np.ndarray  # (P, 3)
-    dielectric: np.ndarray  # (P,) weight of the dielectric lobe
+    dielectric: np.ndarray  # (P, 3) weight of the dielectric lobe; (P,) is taken for all colors
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
     geometric_normal: np.ndarray | None = None  # (P, 3); left out: `normal`
     smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
     bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
+    specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0
+    receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; left out: 0
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
         defaults = {
             "geometric_normal": self.normal,
             "smooth_normal": self.diffuse_normal,
-            "bump_alpha2": np.zeros(count),
+            "bump_alpha2": np.broadcast_to(0.0, (count,)),
+            "specular_dip": np.broadcast_to(0.0, (count, 3)),
+            "receiver": np.broadcast_to(0, (count,)),
         }
         for name, value in defaults.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
+        if np.ndim(self.dielectric) == 1:
+            object.__setattr__(self, "dielectric", np.broadcast_to(np.asarray(self.dielectric)[:, None], (count, 3)))
         for field in fields(self):
             value = np.asarray(getattr(self, field.name))
-            vector = field.name not in ("roughness", "dielectric", "ior", "bump_alpha2")
-            expected = (count, 3) if vector else (count,)
+            expected = (count,) if field.name in SCALAR_FIELDS else (count, 3)
             if value.shape != expected:
                 raise ValueError(f"surface samples: {field.name} has shape {value.shape}, expected {expected}")
             object.__setattr__(self, field.name, value)
@@ -146,23 +178,28 @@ class SurfaceSamples:
 @dataclass(frozen=True)
 class Film:
     """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
-    `sub_samples` samples, of which those that hit nothing are absent."""
+    `sub_samples` samples, of which those that hit nothing are absent. Where a surface has several lobes, `first` (P,)
+    is true for one sample of each hit; left out: for all."""
 
     width: int
     height: int
     pixel: np.ndarray  # (P,) integers
     sub_samples: int = 1
+    first: np.ndarray | None = None  # (P,) bool
+
+    def take(self, index) -> Film:
+        """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
+        first = None if self.first is None else self.first[index]
+        return replace(self, pixel=self.pixel[index], first=first)
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Image (H, W) or (H, W, C), row 0 on top, of per-sample `values` (P,) or (P, C)."""
         values = np.asarray(values, dtype=np.float64)
         columns = values.reshape(values.shape[0], int(np.prod(values.shape[1:])))
         count = self.width * self.height
-        image = np.stack(
-            [np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1
-        )
+        image = np.stack([np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1)
         return (image / self.sub_samples).reshape(self.height, self.width, *values.shape[1:])
 
     def coverage(self) -> np.ndarray:
         """Share (H, W) of each pixel's sub-samples that hit a surface."""
-        return self.image(np.ones(self.pixel.shape[0]))
+        return self.image(np.ones(self.pixel.shape[0]) if self.first is None else self.first)

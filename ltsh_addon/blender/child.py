@@ -177,7 +177,13 @@ def _run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
         errors="replace",
         cwd=folder,
         # The user's preferences and start-up files have no say in the result.
-        env={**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user"), "PYTHONUNBUFFERED": "1"},
+        # Blender leaves its own temporary folder behind when it is ended: ours goes with all that is in it.
+        env={
+            **os.environ,
+            **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder)),
+            "BLENDER_USER_RESOURCES": str(folder / "user"),
+            "PYTHONUNBUFFERED": "1",
+        },
         # Ctrl-C goes to the parent alone, which ends the child.
         start_new_session=True,
     )

@@ -6,13 +6,13 @@ from dataclasses import fields
 
 import numpy as np
 
-from ..scene import SurfaceSamples
+from ..scene import SCALAR_FIELDS, SurfaceSamples
 from . import edge_loop, shared_block
 
 # Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
 _ONLY_DIFFUSE = {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"}
 _ONLY_SPECULAR = {
-    "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "dielectric", "ior",
+    "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
 }  # fmt: skip
 
 
@@ -29,7 +29,8 @@ class ParentSide:
         self.sent, self.same, first = [], {}, {}
         for field in fields(samples):
             values = getattr(samples, field.name)
-            if field.name in unread:
+            # What is left out counts as 0 on the other side.
+            if field.name in unread or _is_zero_everywhere(values):
                 continue
             # A normal that stands for another is the same array: sent once.
             if id(values) in first:
@@ -87,8 +88,7 @@ class ChildSide:
         values.update({name: values[other] for name, other in message["same"].items()})
         for field in fields(SurfaceSamples):
             if field.name not in values:
-                vector = field.name in _ONLY_DIFFUSE | _ONLY_SPECULAR and field.name not in _SCALARS
-                values[field.name] = np.broadcast_to(0.0, (count, 3) if vector else (count,))
+                values[field.name] = np.broadcast_to(0.0, (count,) if field.name in SCALAR_FIELDS else (count, 3))
         found, estimates = self.task.shade(SurfaceSamples(**values), self.scratch)
         for name, radiance in found.items():
             arrays[f"out {name}"][:] = radiance
@@ -96,4 +96,6 @@ class ChildSide:
             arrays["error"][:] = estimates
 
 
-_SCALARS = {"roughness", "dielectric", "ior", "bump_alpha2"}
+def _is_zero_everywhere(values) -> bool:
+    """True for one zero that stands for all elements, as `SurfaceSamples` has it for what is left out."""
+    return values.size > 0 and not any(values.strides) and not values.flat[0]

@@ -66,7 +66,8 @@ def shade_specular(samples, lights, table, radiance, error=None):
     """As `shade_diffuse` for the specular lobes; `table` or REFERENCE, which adds its estimates to error (P,)."""
     cosine = (samples.normal * samples.view).sum(axis=1)
     frame = _frame(samples.normal, samples.view)
-    reflective = samples.specular_f90.any(axis=1) | samples.specular_f0.any(axis=1) | (samples.dielectric > 0.0)
+    terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip, samples.dielectric)
+    reflective = np.any([term.any(axis=1) for term in terms], axis=0)
     lit = np.nonzero((cosine > 0.0) & reflective)[0]
     cosine = np.clip(cosine, 0.0, 1.0)
     lobe = None
@@ -81,14 +82,15 @@ def shade_specular(samples, lights, table, radiance, error=None):
             visible = _visible_parts(samples, frame, light, corners, lit, samples.geometric_normal)
             parts = ((index, _table_integrals(table, lobe.take(index), polygon)) for index, polygon in visible)
         for index, integrals in parts:
-            plain, schlick, dielectric = integrals[..., None]
+            plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
-            reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index, None] * dielectric
-            radiance[group, index] += reflected * _of(light.radiance, index)
+            reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
+            reflected -= samples.specular_dip[index] * dip
+            radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
 def _reference_integrals(samples, cosine, frame, light, corners, candidates, error):
-    """Yield (index, integrals (3, Q)) by quadrature; round lights are exact ellipses. Adds to `error`."""
+    """Yield (index, integrals (4, Q)) by quadrature; round lights are exact ellipses. Adds to `error`."""
     batches = []
     if light.is_round:
         candidates, whole, local = _uncut_ellipses(samples, frame, light, candidates)
@@ -125,18 +127,18 @@ def _ellipse_extent(normal, offset, light):
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
-    """Lobes with three coefficient vectors: F = 1, (1 - c)^5 and the dielectric of each sample's IOR."""
-    if not (samples.dielectric > 0.0).any():
-        lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype), curves=2)
+    """Lobes with four coefficient vectors: F = 1, (1 - c)^5, c (1 - c)^6 and the dielectric of each sample's IOR."""
+    if not samples.dielectric.any():
+        lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype), curves=3)
         return lobe.with_coefficients(np.concatenate([lobe.coefficients, np.zeros_like(lobe.coefficients[:1])]))
     lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype))
     weights = table.dielectric_weights(samples.ior)
     dielectric = sum(weight * vector for weight, vector in zip(weights, lobe.coefficients, strict=True))
-    return lobe.with_coefficients(np.stack([lobe.coefficients[0], lobe.coefficients[1], dielectric]))
+    return lobe.with_coefficients(np.stack([*lobe.coefficients[:3], dielectric]))
 
 
 def _table_integrals(table, lobe, polygon):
-    """Integrals (3, P), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
+    """Integrals (4, P), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
     signed = polygon_integrals(table, lobe, polygon, lobe.coefficients)
     return np.maximum(-signed, 0.0)
 

@@ -124,18 +124,18 @@ class EllipseBoundary:
 
 
 def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
-    """Integrals (3, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
+    """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
     `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
-    cos_theta_o (P,). The three rows have the Fresnel factor 1, (1 - c)^5 and that of a dielectric of relative `ior`
-    (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6; the
-    estimate is the last difference. Lights must be convex.
+    cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
+    `ior` (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6;
+    the estimate is the last difference. Lights must be convex.
     """
     warp = _limit_warp(cos_theta_o, np.maximum(alpha, MIN_ALPHA))
     boundary = make_boundary(warp)
     apex = boundary.apex()
     count = len(cos_theta_o)
-    result, error = np.zeros((3, count)), np.full(count, np.inf)
+    result, error = np.zeros((4, count)), np.full(count, np.inf)
     open_points = np.arange(count)
     for level, order in enumerate(_ORDERS):
         batch = max(_BATCH // (boundary.pieces * order[0] * order[1]), 1)
@@ -168,7 +168,7 @@ def _peak_or_mean(inside, unit):
 
 
 def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior):
-    """Integrals (3, P) with fixed Gauss-Legendre orders."""
+    """Integrals (4, P) with fixed Gauss-Legendre orders."""
     points, measure = boundary.nodes(order[0])
     wedge = _dot(measure, apex[:, None])  # (B, P)
     wedge = wedge * np.sign(wedge.sum(axis=0))
@@ -181,9 +181,11 @@ def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior):
     warped = [near * apex[axis] + far * points[axis][:, None] for axis in range(3)]
     values, half = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
     values *= weight
-    schlick = (values * brdf.schlick_curve(half)).sum(axis=(0, 1))
+    schlick = values * brdf.schlick_curve(half)
+    dip = (schlick * (half * (1.0 - half))).sum(axis=(0, 1))
+    schlick = schlick.sum(axis=(0, 1))
     dielectric = (values * brdf.dielectric_reflectance(half, np.maximum(ior, 1.0))).sum(axis=(0, 1))
-    return np.stack([values.sum(axis=(0, 1)), schlick, dielectric])
+    return np.stack([values.sum(axis=(0, 1)), schlick, dip, dielectric])
 
 
 def _unit_interval(count):

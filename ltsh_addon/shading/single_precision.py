@@ -49,7 +49,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
     """As `shade_diffuse` for the specular lobes of `table`."""
     lights = [item for item in lights if item[0].affects_specular]
     ridges = ridge_table.prepare(table)
-    reflective = _any(samples.specular_f90) | _any(samples.specular_f0) | (samples.dielectric > 0.0)
+    terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
+    reflective = np.logical_or.reduce([_any(term) for term in terms])
     lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
     fragile = [[] for _ in lights]
@@ -143,8 +144,13 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
             total = sums[group]
             for channel in range(3):
                 total[:, channel, part] += found * np.float32(light.radiance[channel])
+    signed = (colors < 0.0).any()
     for group, total in sums.items():
-        radiance[group, index] += (colors * total).sum(axis=0).T
+        reflected = (colors * total).sum(axis=0)
+        if signed and all((light.radiance >= 0.0).all() for light, its_group, _ in lights if its_group == group):
+            # Terms that cancel in the Fresnel factor may leave a rest below zero.
+            np.maximum(reflected, np.float32(0.0), out=reflected)
+        radiance[group, index] += reflected.T
 
 
 def _dot(a, b):
@@ -212,9 +218,10 @@ def _fresnel_kinds(samples, members):
 
     `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
     """
-    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members]
-    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members]
-    dielectric = samples.dielectric[members] > 0.0
+    dipped = _any(samples.specular_dip)[members]
+    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members] | dipped
+    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
+    dielectric = _any(samples.dielectric)[members]
 
     def white(index):
         return _columns(samples.specular_f0, index)[None]
@@ -223,19 +230,21 @@ def _fresnel_kinds(samples, members):
         f0 = _columns(samples.specular_f0, index)
         return np.stack([f0, _columns(samples.specular_f90, index) - f0])
 
-    def coat(index):
-        share = samples.dielectric[index].astype(np.float32)
-        return np.broadcast_to(share, (1, 3, len(index)))
+    def f82(index):
+        return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
 
-    def mixed(index):
-        return np.concatenate([schlick(index), coat(index)])
+    def coat(index):
+        return _columns(samples.dielectric, index)[None]
 
     yield (0,), members[~dielectric & flat], white
-    yield (0, 1), members[~dielectric & ~flat], schlick
+    yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
+    yield (0, 1, 2), members[~dielectric & dipped], f82
     for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
         yield (vector,), with_ior, coat
-    for vector, with_ior in _by_ior(samples.ior, members[dielectric & metal]):
-        yield (0, 1, vector), with_ior, mixed
+    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
+        first = f82 if 2 in own else schlick
+        for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
+            yield (*own, vector), with_ior, lambda index, first=first: np.concatenate([first(index), coat(index)])
 
 
 def _by_ior(ior, members):

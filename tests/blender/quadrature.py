@@ -42,8 +42,9 @@ def ggx(directions, samples):
     value = np.where(lit, distribution * smith / (4.0 * cos_o), 0.0)
     schlick = (1.0 - cos_d[..., None]) ** 5
     f0, f90 = samples.specular_f0[:, None], samples.specular_f90[:, None]
-    dielectric = samples.dielectric[:, None] * dielectric_fresnel(cos_d, samples.ior[:, None])
-    return value[..., None] * (f0 + (f90 - f0) * schlick + dielectric[..., None])
+    dip = samples.specular_dip[:, None] * (cos_d * (1.0 - cos_d) ** 6)[..., None]
+    dielectric = samples.dielectric[:, None] * dielectric_fresnel(cos_d, samples.ior[:, None])[..., None]
+    return value[..., None] * (f0 + (f90 - f0) * schlick - dip + dielectric)
 
 
 def dielectric_fresnel(cosine, ior):

@@ -17,13 +17,15 @@ GAUSS = np.polynomial.legendre.leggauss(160)
 
 
 def ggx_color(cosine, roughness, light_directions, ior):
-    """Textbook GGX times cosine at unit directions (S, 3) for the Fresnel factors 1, (1 - c)^5, dielectric: (3, S)."""
+    """Textbook GGX times cosine at unit directions (S, 3) for the Fresnel factors 1, (1 - c)^5, c (1 - c)^6,
+    dielectric: (4, S)."""
     view = textbook.view_direction(cosine)
     lobe = textbook.ggx_brdf(view, light_directions, roughness**2) * light_directions[:, 2]
     half = view + light_directions
     half_cosine = np.clip((half @ view) / np.linalg.norm(half, axis=1), 0.0, 1.0)
     dielectric = 0.5 * sum(textbook.fresnel_amplitudes(half_cosine, ior))
-    return lobe * np.stack([np.ones_like(lobe), (1.0 - half_cosine) ** 5, dielectric])
+    missing = 1.0 - half_cosine
+    return lobe * np.stack([np.ones_like(lobe), missing**5, half_cosine * missing**6, dielectric])
 
 
 def over_area(cosine, roughness, ior, center, half_u, half_v, round_light):

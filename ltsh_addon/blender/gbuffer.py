@@ -15,6 +15,7 @@ AOV_PREFIX = "ltsh_"
 AOVS = {
     "hit": "VALUE",  # 1 where a surface was hit
     "lobe": "VALUE",  # one of LOBES
+    "receiver": "VALUE",  # `AreaLight.receivers`
     "correct_normal": "VALUE",  # 1 where Cycles bends specular normals (use_bump_map_correction)
     "position": "COLOR",
     "incoming": "COLOR",  # towards the camera
@@ -160,6 +161,7 @@ def _samples_of(values: dict[str, np.ndarray]) -> SurfaceSamples:
         diffuse_albedo=values["albedo"],
         geometric_normal=true_normal,
         smooth_normal=smooth_normal,
+        receiver=np.rint(values["receiver"]).astype(np.int32),
         bump_alpha2=np.where(corrected, bump_alpha2(normal, smooth_normal), 0.0),
     )
 

@@ -31,6 +31,8 @@ NEUTRAL_PRINCIPLED = {
     "Sheen Weight": 0.0,
     "Thin Film Thickness": 0.0,
 }
+# Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
+RECEIVER_PROPERTY = "ltsh_receiver"
 NEUTRAL_GLOSSY = {"Anisotropy": 0.0}
 NEUTRAL_DIFFUSE = {"Roughness": 0.0}
 
@@ -123,11 +125,15 @@ def give_default_material(objects: list):
     return material
 
 
-def inject_aovs(materials: list, report: MaterialReport) -> None:
-    """Make every material write the quantities of `gbuffer.AOVS`; cut transparency, volumes and light from emission."""
+def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str] = frozenset()) -> None:
+    """Make every material write the quantities of `gbuffer.AOVS`; cut transparency and volumes.
+
+    Materials light nothing, but for those with a full name in `emitters`, of whose emission nothing is said either.
+    """
     for material in materials:
         ensure_nodes(material)
-        material.cycles.emission_sampling = "NONE"
+        if material.name_full not in emitters:
+            material.cycles.emission_sampling = "NONE"
         _inject_into(material, report)
 
 
@@ -222,6 +228,9 @@ def _add_aovs(tree, node, lobe: str, sockets: dict, material) -> None:
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
     _aov(tree, "hit", 1.0)
     _aov(tree, "lobe", LOBES[lobe])
+    receiver = tree.nodes.new("ShaderNodeAttribute")
+    receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
+    _aov(tree, "receiver", receiver.outputs["Fac"])
     _aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
     _aov(tree, "position", geometry.outputs["Position"])
     _aov(tree, "incoming", geometry.outputs["Incoming"])

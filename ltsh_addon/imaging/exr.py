@@ -65,10 +65,7 @@ def write_channels(
     planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
     _check_planes(planes)
     OpenEXR = _openexr()
-    header = {str(key): str(value) for key, value in (metadata or {}).items()}
-    reserved = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version"}
-    if clash := reserved & header.keys():
-        raise ValueError(f"metadata {sorted(clash)[0]!r}: that name belongs to the EXR format itself, use another one")
+    header = check_metadata(metadata)
     header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with replacing(path) as temporary:
         try:
@@ -77,6 +74,15 @@ def write_channels(
         except RuntimeError as error:
             # "Cannot open image file "NAME". Reason." names the temporary file; only the reason is of use.
             raise OSError(str(error).replace(f'"{temporary}"', "").strip()) from error
+
+
+def check_metadata(metadata: Mapping[str, str] | None) -> dict[str, str]:
+    """`metadata` as strings; raises ValueError for names that belong to the format."""
+    header = {str(key): str(value) for key, value in (metadata or {}).items()}
+    reserved = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version"}
+    if clash := reserved & header.keys():
+        raise ValueError(f"metadata {sorted(clash)[0]!r}: that name belongs to the EXR format itself, use another one")
+    return header
 
 
 def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:

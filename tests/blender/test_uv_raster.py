@@ -1,0 +1,216 @@
+"""Texels of UV maps: against point-in-triangle tests, polygon clipping, and the texels that Cycles bakes."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+
+from ltsh_addon.blender.uv_raster import NUDGE, UvTriangles, barycentric_of_nearest
+
+WIDTH, HEIGHT = 61, 47
+
+
+def cross(u, v):
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def random_triangles(count=200, size=0.08, seed=0):
+    """Triangles in and around the unit square, in either winding."""
+    generator = np.random.default_rng(seed)
+    return generator.uniform(-0.3, 1.3, (count, 1, 2)) + size * generator.normal(size=(count, 3, 2))
+
+
+def inside(corners, points):
+    """Whether points (Q, 2) are inside triangles (T, 3, 2): (Q, T)."""
+    sides = [
+        cross(corners[:, (k + 1) % 3] - corners[:, k], points[:, None] - corners[:, k])
+        for k in range(3)
+    ]  # fmt: skip
+    return np.all(np.array(sides) > 0, axis=0) | np.all(np.array(sides) < 0, axis=0)
+
+
+def centers():
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    return np.stack([x.ravel(), y.ravel()], axis=-1)
+
+
+def test_covered_are_the_texels_whose_center_is_inside_and_the_last_triangle_wins():
+    triangles = UvTriangles.in_tile(random_triangles(), WIDTH, HEIGHT)
+    found = triangles.texels(0, HEIGHT)
+    expected = inside(triangles.corners, centers() + NUDGE)
+    assert np.array_equal(found.index, np.flatnonzero(expected.any(axis=1)))
+    last = expected.shape[1] - 1 - np.argmax(expected[:, ::-1], axis=1)
+    assert np.array_equal(found.triangle, last[found.index])
+    assert found.overlaps == expected.sum() - expected.any(axis=1).sum() > 0
+
+
+def test_barycentric_weights_give_the_center_back():
+    triangles = UvTriangles.in_tile(random_triangles(seed=1), WIDTH, HEIGHT)
+    found = triangles.texels(0, HEIGHT)
+    point = np.einsum("qk,qkc->qc", found.barycentric, triangles.corners[found.triangle])
+    # The center is inside, or outside by what Blender moves its sampling points.
+    assert np.abs(point - centers()[found.index]).max() < 2.3e-3
+    assert found.barycentric.min() >= 0.0 and np.abs(found.barycentric.sum(axis=1) - 1.0).max() < 1e-12
+
+
+@pytest.mark.parametrize("conservative", [False, True])
+def test_blocks_of_rows_join_to_the_whole(conservative):
+    triangles = UvTriangles.in_tile(random_triangles(seed=2), WIDTH, HEIGHT)
+    whole = triangles.texels(0, HEIGHT, conservative)
+    rows = (0, 1, 2, 20, HEIGHT)
+    parts = [triangles.texels(a, b - a, conservative) for a, b in zip(rows[:-1], rows[1:], strict=True)]
+    index = np.concatenate([part.index + first * WIDTH for part, first in zip(parts, rows[:-1], strict=True)])
+    assert np.array_equal(index, whole.index)
+    assert np.array_equal(np.concatenate([part.triangle for part in parts]), whole.triangle)
+    assert np.array_equal(np.concatenate([part.barycentric for part in parts]), whole.barycentric)
+
+
+def clipped_area(triangle, x, y):
+    """Area of a triangle (3, 2) inside the unit square at (x, y), by clipping it at four lines."""
+    polygon = [tuple(corner) for corner in triangle]
+    for axis, sign, limit in ((0, 1, x), (0, -1, x + 1), (1, 1, y), (1, -1, y + 1)):
+        result = []
+        for a, b in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+            da, db = sign * (a[axis] - limit), sign * (b[axis] - limit)
+            if da >= 0:
+                result.append(a)
+            if (da > 0 > db) or (da < 0 < db):
+                result.append(tuple(a[k] + da / (da - db) * (b[k] - a[k]) for k in (0, 1)))
+        polygon = result
+        if not polygon:
+            return 0.0
+    return 0.5 * abs(sum(cross(np.array(a), np.array(b)) for a, b in zip(polygon, polygon[1:] + polygon[:1])))  # noqa: B905
+
+
+def test_conservative_texels_are_those_a_triangle_touches():
+    # Slivers thinner than a texel, most of which cover no center.
+    generator = np.random.default_rng(4)
+    start, along = generator.uniform(0.1, 0.9, (60, 1, 2)), generator.normal(size=(60, 1, 2)) * 0.15
+    thin = generator.normal(size=(60, 1, 2)) * 0.002
+    triangles = UvTriangles.in_tile(np.concatenate([start, start + along, start + thin], axis=1), WIDTH, HEIGHT)
+    touched = {
+        y * WIDTH + x
+        for triangle in triangles.corners
+        for x in range(max(0, int(triangle[:, 0].min())), min(WIDTH, int(triangle[:, 0].max()) + 1))
+        for y in range(max(0, int(triangle[:, 1].min())), min(HEIGHT, int(triangle[:, 1].max()) + 1))
+        if clipped_area(triangle, x, y) > 1e-12
+    }
+    found = triangles.texels(0, HEIGHT, conservative=True)
+    assert set(found.index.tolist()) == touched
+    assert len(touched) > 3 * len(triangles.texels(0, HEIGHT).index)
+
+
+def test_the_nearest_point_of_a_triangle_is_the_nearest_of_many_points_of_it():
+    generator = np.random.default_rng(5)
+    corners, points = generator.normal(size=(40, 3, 2)), 2.0 * generator.normal(size=(40, 2))
+    corners[:4, 2] = corners[:4, 1]  # without area
+    weights = barycentric_of_nearest(corners, points)
+    distance = np.linalg.norm(np.einsum("qk,qkc->qc", weights, corners) - points, axis=1)
+    grid = np.array([(i, j, 60 - i - j) for i in range(61) for j in range(61 - i)]) / 60.0
+    others = np.linalg.norm(np.einsum("gk,qkc->qgc", grid, corners) - points[:, None], axis=2).min(axis=1)
+    assert weights.min() >= 0.0 and np.allclose(weights.sum(axis=1), 1.0)
+    # No point of the grid is nearer, and the nearest of the grid is at most one step of it away.
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    assert (distance <= others + 1e-12).all() and (others - distance <= longest / 60.0).all()
+
+
+def test_triangles_without_area_or_number_cover_nothing():
+    uv = np.array([[(0.1, 0.1), (0.9, 0.9), (0.5, 0.5)], [(0.2, 0.2)] * 3, [(np.nan, 0.0), (1.0, 0.0), (0.0, 1.0)]])
+    triangles = UvTriangles.in_tile(uv, 16, 16)
+    assert len(triangles.texels(0, 16).index) == 0
+    assert len(triangles.texels(0, 16, conservative=True).index) == 0
+
+
+# -- against Cycles ---------------------------------------------------------------------------------------------------
+
+
+def sphere():
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32)
+
+
+def cube():
+    bpy.ops.mesh.primitive_cube_add()
+
+
+def suzanne():
+    bpy.ops.mesh.primitive_monkey_add()
+    bpy.context.object.modifiers.new("Subdivision", "SUBSURF").render_levels = 2
+
+
+def two_tiles():
+    """A plane over the tiles 1001 and 1002, in a small rotation."""
+    bpy.ops.mesh.primitive_plane_add()
+    uv = bpy.context.object.data.uv_layers.active.uv
+    for loop, (u, v) in enumerate([(0.07, 0.11), (1.93, 0.05), (1.9, 0.93), (0.1, 0.88)]):
+        uv[loop].vector = (u, v)
+
+
+def baked_coverage(ob, size, folder, tiles=(1001,)):
+    """Texels (tiles, size, size) that Cycles bakes, row 0 at the bottom."""
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples = 1
+    material = bpy.data.materials.new("White")
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    emission, output = tree.nodes.new("ShaderNodeEmission"), tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(emission.outputs[0], output.inputs[0])
+    image = bpy.data.images.new("Bake", size, size, alpha=True, float_buffer=True, tiled=len(tiles) > 1)
+    for number in tiles[1:]:
+        image.tiles.new(number)
+    for tile in image.tiles:
+        image.tiles.active = tile
+        with bpy.context.temp_override(edit_image=image):
+            if len(tiles) > 1:
+                bpy.ops.image.tile_fill(color=(0, 0, 0, 0), width=size, height=size, float=True, alpha=True)
+    if len(tiles) == 1:
+        image.pixels.foreach_set(np.zeros(size * size * 4, np.float32))
+    node = tree.nodes.new("ShaderNodeTexImage")
+    node.image, tree.nodes.active = image, node
+    ob.data.materials.clear()
+    ob.data.materials.append(material)
+    bpy.ops.object.bake(type="EMIT", margin=0, use_clear=False)
+    found = []
+    image.file_format = "OPEN_EXR"
+    name = "bake.<UDIM>.exr" if len(tiles) > 1 else "bake.exr"
+    image.filepath_raw = str(folder / name)
+    image.save()
+    for number in tiles:
+        saved = bpy.data.images.load(str(folder / name.replace("<UDIM>", str(number))))
+        pixels = np.empty(size * size * 4, np.float32)
+        saved.pixels.foreach_get(pixels)
+        found.append(pixels.reshape(size, size, 4)[..., 0] > 0.5)
+    return np.array(found)
+
+
+def uv_triangles_of(ob):
+    """Triangles (T, 3, 2) of the active UV map with the modifiers of a render applied."""
+    evaluated = ob.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    mesh = evaluated.to_mesh()
+    mesh.calc_loop_triangles()
+    uv, loops = np.empty(2 * len(mesh.loops), np.float32), np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.uv_layers.active.uv.foreach_get("vector", uv)
+    mesh.loop_triangles.foreach_get("loops", loops)
+    triangles = uv.reshape(-1, 2)[loops].reshape(-1, 3, 2)
+    evaluated.to_mesh_clear()
+    return triangles
+
+
+@pytest.mark.parametrize("size", [256, 1024])
+@pytest.mark.parametrize("make", [sphere, cube, suzanne, two_tiles])
+def test_covered_texels_are_those_that_cycles_bakes(tmp_path, make, size):
+    scene_parts.empty_scene()
+    make()
+    ob = bpy.context.object
+    for modifier in ob.modifiers:
+        modifier.levels = modifier.render_levels
+    tiles = (1001, 1002) if make is two_tiles else (1001,)
+    baked = baked_coverage(ob, size, tmp_path, tiles)
+    for number, coverage in zip(tiles, baked, strict=True):
+        triangles = UvTriangles.in_tile(uv_triangles_of(ob), size, size, (number - 1001, 0))
+        ours = np.zeros(size * size, bool)
+        ours[triangles.texels(0, size).index] = True
+        assert coverage.any()
+        assert np.count_nonzero(ours.reshape(size, size) != coverage) == 0

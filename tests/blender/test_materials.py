@@ -171,7 +171,8 @@ def test_without_material_the_surface_is_cycles_default(tmp_path, plane_scene, s
     glossy = gbuffer.read_layer(untouched, names["specular_color"], "RGB").any()
     surface, _ = plane_scene(tmp_path)
     assert np.abs(surface.diffuse_albedo - expected).max() < EXACT and expected.min() > 0.5
-    assert not surface.specular_f90.any() and np.all(surface.dielectric == float(glossy))
+    # Multiple scattering adds less than a percent to a dielectric.
+    assert not surface.specular_f90.any() and np.allclose(surface.dielectric, float(glossy), atol=0.02)
 
 
 def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path, plane_scene):

@@ -96,6 +96,34 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         )
 
 
+@dataclass(frozen=True)
+class BakeJob:
+    """What to take from which file for a bake; None means as in the file."""
+
+    scene: Path
+    objects: tuple[str, ...] | str  # names, "selected" or "all"
+    uv: str | None
+    width: int
+    height: int
+    block_rows: int
+    view: tuple[float, float, float] | str  # a position, "camera" or "above"
+    camera: str | None
+    frame: int | None
+    cycles_samples: int
+    passes: tuple[str, ...]  # of Cycles
+
+
+def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
+    """Meshes, materials, maps and Cycles' bake of a .blend as files in `folder`; the manifest.
+
+    Raises as `extract` does.
+    """
+    scene = Path(job.scene).absolute()
+    _check_readable(scene)
+    with _termination_as_exception():
+        return _run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
+
+
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
     """Build the example scene and save it as the .blend `path`, at once or not at all."""
     path = Path(path).absolute()

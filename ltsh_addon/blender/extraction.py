@@ -51,7 +51,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     warnings.extend(inventory.warnings)
     if not inventory.lights:
         raise SceneError(
-            f"scene {scene.name!r}: no area light that renders, found {_describe_lights(scene)}; add an area light"
+            f"scene {scene.name!r}: no area light that renders, found {describe_lights(scene)}; add an area light"
         )
     default = give_default_material(bare)
     report = MaterialReport()
@@ -61,7 +61,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     return inventory
 
 
-def _describe_lights(scene) -> str:
+def describe_lights(scene) -> str:
     lights = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
     return "lights " + ", ".join(lights) if lights else "no lights at all"
 
@@ -94,7 +94,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "camera": camera.name,
         "width": width,
         "height": height,
-        "lights": [_light_record(light) for light in inventory.lights],
+        "lights": [light_record(light) for light in inventory.lights],
         "warnings": warnings,
         "samples": samples,
         "reference": reference,
@@ -103,7 +103,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
     }
 
 
-def _light_record(light) -> dict:
+def light_record(light) -> dict:
     record = dict(vars(light))
     for name in ("center", "half_u", "half_v", "direction", "radiance"):
         record[name] = record[name].tolist()

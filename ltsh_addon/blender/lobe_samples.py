@@ -31,11 +31,12 @@ class Hits:
     true_normal: np.ndarray  # (P, 3)
     corrected: np.ndarray  # (P,) bool: specular normals are bent
     receiver: np.ndarray  # (P,) integers
-    diffuse_albedo: np.ndarray  # (P, 3) of all lobes together
+    diffuse_albedo: np.ndarray | None  # (P, 3) of all lobes together; None: as estimated from each lobe's own
 
     def take(self, index) -> Hits:
         """The hits at `index`."""
-        return Hits(**{item.name: getattr(self, item.name)[index] for item in fields(self)})
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
 
 
 @dataclass
@@ -87,7 +88,9 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
         roughness=joined["roughness"],
         **dict(zip(SPECULAR_FIELDS, specular, strict=True)),
         ior=joined["ior"],
-        diffuse_albedo=_split(hits.diffuse_albedo, joined["diffuse"], index),
+        diffuse_albedo=joined["diffuse"]
+        if hits.diffuse_albedo is None
+        else _split(hits.diffuse_albedo, joined["diffuse"], index),
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,

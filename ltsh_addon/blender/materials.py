@@ -78,7 +78,7 @@ def give_default_material(objects: list):
 
 
 @dataclass(frozen=True)
-class _Lobes:
+class MaterialLobes:
     """The lobes of one material: those of its leaves that have one, and what each writes."""
 
     material: object
@@ -97,7 +97,7 @@ def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str
         emitter = material.name_full in emitters
         if not emitter:
             material.cycles.emission_sampling = "NONE"
-        lobes = _lobes_of(material, emitter, report)
+        lobes = lobes_of(material, emitter, report)
         if lobes is not None:
             found.append(lobes)
             _write_hit(material)
@@ -109,7 +109,7 @@ def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str
             write_lobe(lobes.leaves[slot].tree, slot, lobes.values[slot], names)
 
 
-def _lobes_of(material, emitter: bool, report: MaterialReport) -> _Lobes | None:
+def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes | None:
     """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface."""
 
     def warn(message):
@@ -118,7 +118,7 @@ def _lobes_of(material, emitter: bool, report: MaterialReport) -> _Lobes | None:
     tree = material.node_tree
     output = material_output(tree)
     if output is None:
-        return _Lobes(material, (), ())
+        return MaterialLobes(material, (), ())
     volume = live_link(output.inputs["Volume"])
     if volume is not None:
         tree.links.remove(volume)
@@ -138,7 +138,7 @@ def _lobes_of(material, emitter: bool, report: MaterialReport) -> _Lobes | None:
             share = {} if is_constant(leaf.weight, 1.0) else {"weight": leaf.weight}
             pairs.append((leaf, {**values, **share}))
     pairs = _largest(pairs, warn)
-    return _Lobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
+    return MaterialLobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
 
 
 def _largest(pairs: list, warn) -> list:

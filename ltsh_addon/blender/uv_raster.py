@@ -13,6 +13,8 @@ import numpy as np
 # side. The same here, for the same texels.
 NUDGE = (0.001, 0.002)
 _NO_ROW = 1 << 40
+# How far a triangle may stick out of its tile, in tiles: rounding, and no texel.
+TILE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -231,3 +233,25 @@ def _nearest_on_sides(corners, points):
 
 def _cross(u, v):
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+
+def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
+    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the share of the area
+    of the UV map that is in none of them.
+
+    Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
+    """
+    uv = np.asarray(uv, dtype=np.float64)
+    area = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
+    solid = np.isfinite(area) & (area > 0.0)
+    uv, area = uv[solid], area[solid]
+    column, row = np.moveaxis(np.floor(uv.mean(axis=1)).astype(np.int64), -1, 0)
+    origin = np.stack([column, row], axis=-1)[:, None]
+    within = np.all((uv >= origin - TILE_TOLERANCE) & (uv <= origin + 1.0 + TILE_TOLERANCE), axis=(1, 2))
+    numbered = (column >= 0) & (column < 10) & (row >= 0)
+    if (within & numbered).all():
+        return sorted(set((1001 + column + 10 * row).tolist())), 0.0
+    touching = (uv.min(axis=1) < 1.0).all(axis=1) & (uv.max(axis=1) > 0.0).all(axis=1)
+    inside = within & (column == 0) & (row == 0)
+    return ([1001] if touching.any() else []), float(1.0 - area[inside].sum() / area.sum())

@@ -36,6 +36,8 @@ def _perform(job: dict, folder: Path) -> dict:
         _progress("build scene", 0.0)
         _module("demo_scene").build(Path(job["path"]))
         return {}
+    if job["task"] == "bake":
+        return _module("bake_extraction").extract_bake(job, folder, _progress)
     return _module("extraction").extract(job, folder, _progress)
 
 

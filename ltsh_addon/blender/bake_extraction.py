@@ -1,0 +1,169 @@
+"""The child's task for a bake: lights, and for every object its mesh, materials, maps and Cycles' bake, as files."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+
+from . import extraction, render_settings
+from .child import SceneError
+from .cycles_reference import remove_occlusion
+from .inventory import rendered_surfaces, with_render_depsgraph
+from .lights import collect_lights
+from .material_maps import MaterialPlan
+from .materials import MaterialReport, ensure_nodes, give_default_material, lobes_of, objects_without_material
+from .texel_bake import (
+    Block,
+    ObjectBake,
+    ObjectError,
+    check_object,
+    chosen_objects,
+    read_mesh,
+    save_block,
+    view_of,
+)
+from .uv_raster import tiles_of
+
+
+def extract_bake(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `child.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
+    started, warnings = time.monotonic(), []
+    progress("open scene", 0.0)
+    extraction.open_scene(Path(job["scene"]), warnings)
+    scene = bpy.context.scene
+    if job["frame"] is not None:
+        scene.frame_set(job["frame"])
+    camera = _camera(scene, job)
+    view_layer = render_settings.choose_view_layer(scene, warnings)
+    objects = chosen_objects(scene, view_layer, job["objects"])
+    render_settings.neutralize(scene, view_layer, camera, warnings)
+    render_settings.prepare_surfaces(warnings)
+    inventory, meshes, problems = _inspect(scene, objects, job)
+    warnings.extend(inventory.warnings)
+    if not inventory.lights:
+        raise SceneError(
+            f"scene {scene.name!r}: no area light that renders, found {extraction.describe_lights(scene)}; "
+            "add an area light"
+        )
+    plans = _material_plans([ob for ob in objects if ob.name in meshes], warnings)
+    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    view = view_of(scene, job["view"], camera, bent=job["cycles_samples"] > 0)
+    _look_from(scene, camera, job)
+    remove_occlusion()
+    records = []
+    for number, ob in enumerate(objects):
+        record = {"name": ob.name, "problem": problems.get(ob.name)}
+        if record["problem"] is None:
+            try:
+                folder_of_object = folder / f"object_{number}"
+                record |= _object(scene, ob, meshes[ob.name], plans[ob.name], job, folder_of_object, progress)
+            except (ObjectError, RuntimeError) as error:
+                record["problem"] = " ".join(str(error).split())
+        records.append(record)
+    return {
+        "blender_version": bpy.app.version_string,
+        "frame": scene.frame_current,
+        "lights": [extraction.light_record(light) for light in inventory.lights],
+        "warnings": warnings,
+        "view": vars(view),
+        "camera": camera.name if job["view"] == "camera" else "",
+        "objects": records,
+        "seconds": time.monotonic() - started,
+    }
+
+
+def _camera(scene, job):
+    """The camera of the view, or one that only stands where a render needs one."""
+    if job["view"] == "camera":
+        return render_settings.choose_camera(scene, job["camera"])
+    camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return camera
+
+
+def _look_from(scene, camera, job) -> None:
+    """Make Cycles' bake see the surfaces as `view_of` does."""
+    scene.render.bake.view_from = "ABOVE_SURFACE" if job["view"] == "above" else "ACTIVE_CAMERA"
+    if not isinstance(job["view"], str):
+        camera.location = job["view"]
+    bpy.context.view_layer.update()
+
+
+def _inspect(scene, objects, job):
+    """Lights, the mesh and UV map of every object by name, and what is wrong with the others by name."""
+
+    def visit(depsgraph):
+        meshes, problems = {}, {}
+        for ob in objects:
+            try:
+                check_object(ob)
+                meshes[ob.name] = read_mesh(ob, depsgraph, job["uv"])
+            except ObjectError as error:
+                problems[ob.name] = str(error)
+        # Asked for here, where the depsgraph is that of a render.
+        rendered = {surface.original.name_full for surface in rendered_surfaces(depsgraph)}
+        for ob in objects:
+            if ob.name in meshes and ob.name_full not in rendered:
+                problems[ob.name] = f"object {ob.name!r} is not rendered: its collection is excluded or hidden"
+                del meshes[ob.name]
+        return collect_lights(depsgraph), meshes, problems
+
+    return with_render_depsgraph(scene, visit)
+
+
+def _material_plans(objects, warnings) -> dict[str, list[MaterialPlan]]:
+    """For every object by name the plans of its material slots."""
+    give_default_material(objects_without_material(objects))
+    report, made = MaterialReport(), {}
+
+    def plan(material):
+        if material.name_full not in made:
+            ensure_nodes(material)
+            material.cycles.emission_sampling = "NONE"
+            lobes = lobes_of(material, False, report)
+            values = lobes.values if lobes is not None else ()
+            trees = tuple(leaf.tree for leaf in lobes.leaves) if lobes is not None else ()
+            made[material.name_full] = MaterialPlan(material, values, trees)
+        return made[material.name_full]
+
+    plans = {ob.name: [plan(slot.material) for slot in ob.material_slots] for ob in objects}
+    warnings.extend(report.lines())
+    return plans
+
+
+def _object(scene, ob, mesh_and_uv, plans, job, folder, progress) -> dict:
+    """Write what belongs to one object into `folder`; its record."""
+    mesh, uv_name = mesh_and_uv
+    folder.mkdir(parents=True, exist_ok=True)
+    mesh.save(folder / "mesh.npz")
+    distinct = list({id(plan): plan for plan in plans}.values())
+    record = {"folder": folder.name, "uv": uv_name, "materials": [plan.record() for plan in plans], "maps": False}
+    record["maps"] = any(plan.count for plan in distinct)
+    if not record["maps"] and not job["cycles_samples"]:
+        return record
+    bake = ObjectBake(scene, ob, uv_name, distinct)
+    try:
+        blocks = [Block(*values) for values in blocks_of(mesh.uv, job["width"], job["height"], job["block_rows"])]
+        for number, block in enumerate(blocks):
+            progress(f"bake {ob.name}", number / len(blocks))
+            if record["maps"]:
+                save_block(folder / f"maps_{block.name}.npy", bake.maps(block))
+            if job["cycles_samples"]:
+                for kind in job["passes"]:
+                    halves = bake.radiance(block, kind, max(1, job["cycles_samples"] // 2))
+                    save_block(folder / f"cycles_{kind}_{block.name}.npy", halves)
+    finally:
+        bake.close()
+    return record
+
+
+def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, int, int, int, int]]:
+    """(tile, first row, rows, width, height) of every block of every UDIM tile in use."""
+    return [
+        (tile, first, min(block_rows, height - first), width, height)
+        for tile in tiles_of(uv)[0]
+        for first in range(0, height, block_rows)
+    ]

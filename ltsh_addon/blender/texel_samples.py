@@ -1,0 +1,142 @@
+"""From a mesh, its materials and the texels that its triangles cover to surface samples. Needs no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..scene import SurfaceSamples
+from .aovs import LOBE_AOVS
+from .lobe_samples import Hits, samples_of_lobes
+from .shading_normals import unit
+from .uv_raster import Texels
+
+# Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
+SMALLEST_BAKED_COSINE = 0.2
+
+
+@dataclass(frozen=True)
+class TexelMesh:
+    """Triangles of one evaluated object in world space."""
+
+    corners: np.ndarray  # (T, 3, 3) m
+    normals: np.ndarray  # (T, 3, 3) unit, as shaded, custom normals included
+    uv: np.ndarray  # (T, 3, 2)
+    material: np.ndarray  # (T,) number of the material
+
+    def save(self, path) -> None:
+        """Write an .npz."""
+        np.savez(path, **{item.name: getattr(self, item.name) for item in fields(self)})
+
+    @classmethod
+    def load(cls, path) -> TexelMesh:
+        """Read what `save` wrote."""
+        with np.load(Path(path)) as data:
+            return cls(**{item.name: data[item.name] for item in fields(cls)})
+
+
+@dataclass(frozen=True)
+class BakeView:
+    """From where a surface is seen: `kind` "above" (along its normal), "point" (from a position) or "direction" (from
+    afar, unit vector towards the viewer). `bent` as Cycles' bake has it, see SMALLEST_BAKED_COSINE."""
+
+    kind: str
+    vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bent: bool = False
+
+    def towards(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Unit vectors (P, 3) from positions (P, 3) with normals (P, 3) towards the viewer."""
+        if self.kind == "above":
+            return normal
+        vector = np.array(self.vector, dtype=np.float64)
+        view = unit(vector - position) if self.kind == "point" else np.broadcast_to(vector, position.shape)
+        if not self.bent:
+            return view
+        cosine = np.sum(view * normal, axis=-1, keepdims=True)
+        return np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(view - normal * (cosine - SMALLEST_BAKED_COSINE)))
+
+
+@dataclass(frozen=True)
+class BakeMaterial:
+    """What one material writes: `aovs.LOBE_AOVS` for each of its lobes. A value is a number, a color, or where it
+    varies the name of its map and the map's channels."""
+
+    corrected: bool
+    lobes: tuple[dict, ...]
+
+    @classmethod
+    def of(cls, record: dict) -> BakeMaterial:
+        """From what JSON makes of it."""
+        return cls(record["corrected"], tuple(record["lobes"]))
+
+
+def texel_samples(
+    mesh: TexelMesh,
+    materials: list[BakeMaterial],
+    texels: Texels,
+    read_map,
+    view: BakeView,
+    receiver: int = 0,
+) -> tuple[SurfaceSamples, np.ndarray]:
+    """Samples (S) of texels (Q) and the texel (S,), 0 to Q - 1, of each; those of a texel follow one another.
+
+    read_map(name) returns the baked map of that name at the texels, (Q, 3).
+    """
+    triangle, weights = texels.triangle, texels.barycentric
+    position = _interpolated(mesh.corners, triangle, weights)
+    smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
+    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
+    true_normal = unit(np.cross(sides[:, 0], sides[:, 1]))[triangle]
+    flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
+    true_normal = np.where(flipped, -true_normal, true_normal)
+    number = mesh.material[triangle]
+    corrected = np.array([material.corrected for material in materials], dtype=bool)
+    hits = Hits(
+        position=position,
+        view=view.towards(position, smooth_normal),
+        smooth_normal=smooth_normal,
+        true_normal=true_normal,
+        corrected=corrected[number],
+        receiver=np.full(len(position), receiver),
+        diffuse_albedo=None,
+    )
+    return samples_of_lobes(hits, _lobes(materials, number, read_map))
+
+
+def _interpolated(values, triangle, weights):
+    """Values (T, 3, C) at the points with barycentric weights (Q, 3) of triangles (Q,)."""
+    return sum(values[triangle, corner] * weights[:, corner, None] for corner in range(3))
+
+
+def _lobes(materials, number, read_map) -> list[dict[str, np.ndarray]]:
+    """For each slot its quantities at texels of materials `number` (Q,)."""
+    maps = {}
+
+    def channel(name):
+        if name not in maps:
+            maps[name] = np.asarray(read_map(name), dtype=np.float64)
+        return maps[name]
+
+    slots = []
+    for slot in range(max((len(material.lobes) for material in materials), default=0)):
+        names = {name for material in materials if len(material.lobes) > slot for name in material.lobes[slot]}
+        values = {}
+        for name in names | {"kind"}:
+            kind, neutral = LOBE_AOVS[name]
+            shape = (len(number), 3) if kind == "COLOR" else (len(number),)
+            values[name] = np.zeros(shape) + (0.0 if neutral is None else neutral)
+            for which, material in enumerate(materials):
+                if len(material.lobes) <= slot or name not in material.lobes[slot]:
+                    continue
+                at = np.flatnonzero(number == which)
+                value = material.lobes[slot][name]
+                if isinstance(value, dict):
+                    found = channel(value["map"])[at]
+                    value = found if kind == "COLOR" else found[:, value["channel"]]
+                elif kind == "COLOR":
+                    value = np.asarray(value)[:3]
+                values[name][at] = value
+        slots.append(values)
+    return slots

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from . import compare, imaging, shading
-from .imaging.exr_rows import writing_rows
-from .imaging.margin import nearest_covered
+from .bake_errors import ErrorPictures, ErrorSums
+from .bake_planes import Planes
+from .bake_resume import finished_tiles, job_key, job_metadata
 from .scene import AreaLight, Cancelled, SurfaceSamples
 
 BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
@@ -42,44 +44,40 @@ class BakeOptions:
     frame: int | None = None
     camera: str | None = None
     cycles_samples: int = 0  # 0: no Cycles bake and no error
-
-
-@dataclass
-class _Result:
-    """What is found out about one tile of one object."""
-
-    covered: int = 0
-    overlaps: int = 0
-    seconds: float = 0.0
-    files: list[str] = field(default_factory=list)
+    resume: bool = False  # keep what the same job has finished
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
-    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), return the report.
+    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json and
+    timing.json; return the report with the times as "seconds".
 
-    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Raises
-    SceneError, TableError, OSError, Cancelled, ValueError.
+    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
+    but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
     """
     from .blender import child
 
     start = time.perf_counter()
     _check(options)
     tables = compare.prepare(options)
+    child.check_readable(options.scene)
+    key = job_key(options)
+    finished = finished_tiles(options.output, key) if options.resume else {}
     with tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        manifest = child.extract_bake(_job(options), folder, progress=progress)
+        manifest = child.extract_bake(_job(options, finished), folder, progress=progress)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         stems = _file_stems([record["name"] for record in manifest["objects"]])
-        records = []
+        records, seconds = [], {"blender": manifest["seconds"]}
         for record, stem in zip(manifest["objects"], stems, strict=True):
             if record["problem"] is None:
                 baker = _ObjectBaker(options, tables, lights, manifest, record, folder / record["folder"])
-                records.append(baker.bake(stem, progress))
+                records.append(baker.bake(stem, key, finished, seconds, progress))
                 shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
-    document["seconds"]["total"] = time.perf_counter() - start
     imaging.write_json(options.output / "report.json", document)
-    return document
+    seconds["total"] = time.perf_counter() - start
+    imaging.write_json(options.output / "timing.json", {"seconds": seconds})
+    return {**document, "seconds": seconds}
 
 
 def _check(options: BakeOptions) -> None:
@@ -95,7 +93,7 @@ def _block_rows(options) -> int:
     return max(1, min(options.height, BLOCK_TEXELS // options.width))
 
 
-def _job(options):
+def _job(options, finished):
     from .blender import child
 
     shaded = tuple(name for name in ("specular", "diffuse") if name in _shaded_passes(options))
@@ -111,6 +109,7 @@ def _job(options):
         frame=options.frame,
         cycles_samples=options.cycles_samples,
         passes=shaded,
+        finished=tuple(finished),
     )
 
 
@@ -153,21 +152,25 @@ class _ObjectBaker:
             self.compared = ()
         self._sample, self._raster = texel_samples.texel_samples, uv_raster.UvTriangles
 
-    def bake(self, stem: str, progress) -> dict:
-        """Write the files of the object; its record for the report."""
+    def bake(self, stem: str, key: str, finished: dict, seconds: dict, progress) -> dict:
+        """Write the files of the object that are not `finished`; its record for the report."""
         result = {"name": self.record["name"], "uv": self.record["uv"], "outside": self.outside, "tiles": {}}
         for tile in self.tiles:
             name = stem if len(self.tiles) == 1 else f"{stem}.{tile}"
             path = self.options.output / f"{name}.exr"
-            result["tiles"][str(tile)] = {"file": path.name, **self._tile(tile, path, progress)}
+            start = time.perf_counter()
+            record = finished.get((self.record["name"], tile)) or self._tile(tile, path, key, progress)
+            seconds[path.name] = time.perf_counter() - start
+            # The order of a record that was read back.
+            result["tiles"][str(tile)] = {"file": path.name, **json.loads(json.dumps(record, sort_keys=True))}
         return result
 
-    def _tile(self, tile, path, progress):
+    def _tile(self, tile, path, key, progress):
         options = self.options
         width, height, rows = options.width, options.height, _block_rows(options)
         triangles = self._raster.in_tile(self.mesh.uv, width, height, ((tile - 1001) % 10, (tile - 1001) // 10))
-        result, start = _Result(), time.perf_counter()
-        planes = _Planes(self.folder / f"planes_{tile}", self.channels(), width, height)
+        covered, overlaps, errors = 0, 0, ErrorSums()
+        planes = Planes(self.folder / f"planes_{tile}", self.channels(), width, height)
         firsts = range(0, height, rows)
         for number, first in enumerate(firsts):
 
@@ -179,15 +182,16 @@ class _ObjectBaker:
                 raise Cancelled("the bake was stopped")
             count = min(rows, height - first)
             texels = triangles.texels(first, count, options.conservative)
-            result.covered += len(texels.index)
-            result.overlaps += texels.overlaps
-            planes.put(first, count, texels.index, self._block(tile, first, texels, report))
-        planes.write(path, options.margin, self._metadata(tile))
-        return {
-            "texels": result.covered,
-            "overlapping_texels": result.overlaps,
-            "seconds": time.perf_counter() - start,
-        }
+            covered += len(texels.index)
+            overlaps += texels.overlaps
+            planes.put(first, count, texels.index, self._block(tile, first, texels, errors, report))
+        record = {"texels": covered, "overlapping_texels": overlaps}
+        pictures = None
+        if self.compared:
+            pictures = ErrorPictures(width, height, path, list(self.tables), list(self.compared))
+            record |= {"pictures": pictures.names, "errors": errors.report()}
+        planes.write(path, options.margin, self._metadata(tile) | job_metadata(key, record), pictures)
+        return record
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR but for the coverage."""
@@ -200,7 +204,7 @@ class _ObjectBaker:
             layers += [f"error_{name}.{pass_name}" for name in self.tables]
         return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
 
-    def _block(self, tile, first, texels, report) -> dict[str, np.ndarray]:
+    def _block(self, tile, first, texels, errors, report) -> dict[str, np.ndarray]:
         """Values (Q,) of the channels at the texels (Q) of a block."""
         maps = None
         if self.record["maps"]:
@@ -224,24 +228,26 @@ class _ObjectBaker:
                     ]
                 for suffix, image in groups:
                     _put(values, f"{name}.{pass_name}{suffix}", image)
-        self._compare(tile, first, texels, values)
+        self._compare(tile, first, texels, values, errors)
         return values
 
-    def _compare(self, tile, first, texels, values) -> None:
+    def _compare(self, tile, first, texels, values, errors) -> None:
         """Add Cycles' bake of the same texels, and what the techniques have more than it."""
         halves = {}
-        for pass_name in self.compared:
-            if pass_name == "combined":
-                halves[pass_name] = halves["specular"] + halves["diffuse"]
-                continue
+        for pass_name in _shaded_passes(self.options) if self.compared else ():
             baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
             halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
-        for pass_name, (a, b) in halves.items():
+        if "combined" in self.compared:
+            halves["combined"] = halves["specular"] + halves["diffuse"]
+        for pass_name in self.compared:
+            a, b = halves[pass_name]
             mean = 0.5 * (a + b)
+            errors.add_halves(pass_name, a, b)
             for image, pixels in (("cycles", mean), ("cycles_A", a), ("cycles_B", b)):
                 _put(values, f"{image}.{pass_name}", pixels)
             for name in self.tables:
                 shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
+                errors.add(name, pass_name, shaded, a, b)
                 _put(values, f"error_{name}.{pass_name}", shaded - mean)
 
     def _passes(self, samples: SurfaceSamples, texel, count, table, progress) -> dict[str, np.ndarray]:
@@ -289,54 +295,6 @@ def _summed(radiance, texel, count):
     return np.add.reduceat(radiance, first, axis=1)
 
 
-class _Planes:
-    """Channels of an image as files, so that only some rows of them need be in memory. Row 0 is below."""
-
-    def __init__(self, folder: Path, names: list[str], width: int, height: int):
-        folder.mkdir()
-        self.names, self.shape = names, (height, width)
-        self.coverage = np.zeros((height, width), dtype=bool)
-        self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(names)}
-        self._files = {name: path.open("w+b") for name, path in self._paths.items()}
-
-    def put(self, first: int, count: int, index, values) -> None:
-        """Rows from `first`: `values` by channel at the texels `index`."""
-        width = self.shape[1]
-        self.coverage[first : first + count].reshape(-1)[index] = True
-        for name, file in self._files.items():
-            rows = np.zeros(count * width, np.float32)
-            rows[index] = values[name]
-            file.seek(4 * first * width)
-            file.write(rows.tobytes())
-
-    def _rows(self, name, first, last):
-        file, width = self._files[name], self.shape[1]
-        file.seek(4 * first * width)
-        return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
-
-    def write(self, path: Path, margin: int, metadata) -> None:
-        """Write the EXR with the margin filled, and close the files."""
-        height, width = self.shape
-        rows = max(1, BLOCK_TEXELS // width)
-        with writing_rows(path, [*self.names, "coverage.hit.V"], width, height, metadata) as writer:
-            for top in range(height, 0, -rows):
-                bottom = max(top - rows, 0)
-                low, high = max(bottom - margin, 0), min(top + margin, height)
-                target, source = nearest_covered(self.coverage[low:high], margin)
-                inside = (target >= (bottom - low) * width) & (target < (top - low) * width)
-                target, source = target[inside] - (bottom - low) * width, source[inside]
-                block = {"coverage.hit.V": self.coverage[bottom:top][::-1].astype(np.float32)}
-                for name in self.names:
-                    around = self._rows(name, low, high)
-                    plane = around[bottom - low : top - low].copy()
-                    plane.reshape(-1)[target] = around.reshape(-1)[source]
-                    block[name] = plane[::-1]
-                writer.write(block)
-        for name, file in self._files.items():
-            file.close()
-            self._paths[name].unlink()
-
-
 def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     warnings = list(manifest["warnings"])
@@ -359,5 +317,4 @@ def _report(options, manifest, records) -> dict:
         "problems": problems,
         "warnings": warnings,
         "versions": compare.versions(manifest["blender_version"]),
-        "seconds": {"blender": manifest["seconds"]},
     }

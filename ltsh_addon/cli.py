@@ -14,9 +14,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from . import __version__
-from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, known_technique, prepare, shade_scene
-from .progress_bar import ProgressBar
+from . import __version__, cli_bake
+from . import argument_values as values
+from .compare import DEFAULT_TECHNIQUES, Options, compare_scene, prepare, shade_scene
+from .progress_bar import ProgressBar, say
 from .scene import Cancelled
 from .shading import PASSES, SHIPPED_TABLES, TableError
 
@@ -24,15 +25,9 @@ EXAMPLES = """examples:
   %(prog)s demo -o out/demo
   %(prog)s compare room.blend -o out/room --resolution 960x540 --cycles-samples 1024
   %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
+  %(prog)s bake room.blend -o out/room --object Floor --size 2048 --error
 """
 DEMO_RESOLUTION = (480, 270)
-# Blender's own limits: of a side of the picture in pixels, and of frames.
-SMALLEST_SIDE, LARGEST_SIDE = 4, 65536
-LAST_FRAME = 1048574
-
-
-class _Misuse(Exception):
-    """The arguments do not make sense together."""
 
 
 def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None) -> int:
@@ -44,7 +39,7 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
     bar = ProgressBar(sys.stderr, quiet=options.quiet)
     try:
         return options.run(options, bar, open_file)
-    except _Misuse as error:
+    except values.Misuse as error:
         return _fail(program, bar, error, 2)
     except (TableError, OSError, ValueError, ImportError, Cancelled, MemoryError) as error:
         return _fail(program, bar, error, 1)
@@ -62,7 +57,7 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
 
 def _fail(program, bar, error, code) -> int:
     bar.finish()
-    _print(f"{program}: {' '.join(str(error).split()) or type(error).__name__}", sys.stderr)
+    say(f"{program}: {' '.join(str(error).split()) or type(error).__name__}", sys.stderr)
     return code
 
 
@@ -86,6 +81,7 @@ def _parser(program: str) -> argparse.ArgumentParser:
     _add_scene(shade)
     _add_common(shade, cycles=False)
     shade.set_defaults(run=_shade)
+    cli_bake.add(commands.add_parser("bake", help="bake lighting and errors into the texels of UV maps"))
     _add_tables(commands.add_parser("tables", help="fit, validate or export the lookup tables"))
     return parser
 
@@ -98,7 +94,8 @@ def _add_tables(parser):
         script.add_argument("arguments", nargs="*")
         script.set_defaults(run=_run_table_script, quiet=False)
     export = actions.add_parser("export", help="an EXR and a C, C++ and GLSL header of each, for other engines")
-    export.add_argument("names", nargs="*", type=_table, metavar="TABLE", help="or a path (.npz); default: all shipped")
+    export.add_argument("names", nargs="*", type=values.table, metavar="TABLE",
+                        help="or a path (.npz); default: all shipped")  # fmt: skip
     export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
     export.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
     export.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -112,82 +109,27 @@ def _add_scene(parser):
 def _add_common(parser, *, cycles, resolution="as in the file"):
     parser.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the results")
     names = ",".join(DEFAULT_TECHNIQUES)
-    parser.add_argument("--techniques", type=_techniques, default=DEFAULT_TECHNIQUES, help=f"default: {names}")
-    parser.add_argument("--passes", type=_passes, default=PASSES, help=f"default: {','.join(PASSES)}")
-    parser.add_argument("--resolution", type=_resolution, metavar="WxH", help=f"default: {resolution}")
-    parser.add_argument("--aa", type=_positive, default=1, metavar="N", help="sub-samples per pixel; 1: pixel centers")
-    parser.add_argument("--frame", type=_frame, metavar="F", help="default: the file's current frame")
+    parser.add_argument("--techniques", type=values.techniques, default=DEFAULT_TECHNIQUES, help=f"default: {names}")
+    parser.add_argument("--passes", type=values.passes, default=PASSES, help=f"default: {','.join(PASSES)}")
+    parser.add_argument("--resolution", type=values.resolution, metavar="WxH", help=f"default: {resolution}")
+    parser.add_argument("--aa", type=values.positive, default=1, metavar="N",
+                        help="sub-samples per pixel; 1: pixel centers")  # fmt: skip
+    parser.add_argument("--frame", type=values.frame, metavar="F", help="default: the file's current frame")
     parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
     parser.add_argument(
         "--reference-samples",
-        type=_positive,
+        type=values.positive,
         default=Options.reference_samples,
         metavar="N",
         help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
     )
     if cycles:
         parser.add_argument(
-            "--cycles-samples", type=_cycles_samples, default=Options.cycles_samples, metavar="N",
+            "--cycles-samples", type=values.cycles_samples, default=Options.cycles_samples, metavar="N",
             help="of both halves of the Cycles reference together (default: %(default)s)",
         )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the report on stdout as one JSON document")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
-
-
-def _techniques(text: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name for name in text.split(",") if name))
-    unknown = [name for name in names if not known_technique(name)]
-    if unknown or not names:
-        raise argparse.ArgumentTypeError(
-            f"technique {(unknown or [text])[0]!r} is unknown, expected some of {', '.join(DEFAULT_TECHNIQUES)} "
-            "or the path of a table (.npz)"
-        )
-    return names
-
-
-def _table(text: str) -> str:
-    if text in SHIPPED_TABLES or text.endswith(".npz"):
-        return text
-    raise argparse.ArgumentTypeError(
-        f"table {text!r} is unknown, expected some of {', '.join(SHIPPED_TABLES)} or the path of a table (.npz)"
-    )
-
-
-def _passes(text: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name for name in text.split(",") if name))
-    if not names or any(name not in PASSES for name in names):
-        raise argparse.ArgumentTypeError(f"passes are {text!r}, expected some of {', '.join(PASSES)}")
-    return names
-
-
-def _resolution(text: str) -> tuple[int, int]:
-    width, separator, height = text.partition("x")
-    if separator and width.isdecimal() and height.isdecimal():
-        size = int(width), int(height)
-        if SMALLEST_SIDE <= min(size) and max(size) <= LARGEST_SIDE:
-            return size
-    raise argparse.ArgumentTypeError(
-        f"resolution is {text!r}, expected WIDTHxHEIGHT such as 960x540, each from {SMALLEST_SIDE} to {LARGEST_SIDE}"
-    )
-
-
-def _frame(text: str) -> int:
-    if text.removeprefix("-").isdecimal() and abs(int(text)) <= LAST_FRAME:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"frame is {text!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}")
-
-
-def _positive(text: str) -> int:
-    if text.isdecimal() and int(text) > 0:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r} was given, expected a whole number above 0")
-
-
-def _cycles_samples(text: str) -> int:
-    value = _positive(text)
-    if value < 2:
-        raise argparse.ArgumentTypeError("1 was given, expected at least 2: one for each half")
-    return value
 
 
 def _options(arguments, scene: Path, output: Path, resolution=None) -> Options:
@@ -207,14 +149,6 @@ def _options(arguments, scene: Path, output: Path, resolution=None) -> Options:
     )
 
 
-def _scene(arguments, open_file) -> Path:
-    if arguments.scene and open_file:
-        raise _Misuse(f"SCENE is {arguments.scene!r}, but Blender has {open_file!r} open already; give one of them")
-    if not (arguments.scene or open_file):
-        raise _Misuse("SCENE.blend is missing: name a file (or open one in Blender first)")
-    return Path(arguments.scene or open_file)
-
-
 def _demo(arguments, bar, open_file) -> int:
     from .blender import child
 
@@ -226,12 +160,12 @@ def _demo(arguments, bar, open_file) -> int:
 
 
 def _compare(arguments, bar, open_file) -> int:
-    options = _options(arguments, _scene(arguments, open_file), arguments.output)
+    options = _options(arguments, values.scene(arguments, open_file), arguments.output)
     return _finish(arguments, bar, compare_scene(options, bar))
 
 
 def _shade(arguments, bar, open_file) -> int:
-    options = _options(arguments, _scene(arguments, open_file), arguments.output)
+    options = _options(arguments, values.scene(arguments, open_file), arguments.output)
     return _finish(arguments, bar, shade_scene(options, bar))
 
 
@@ -242,29 +176,23 @@ def _finish(arguments, bar, report) -> int:
     bar.finish()
     if arguments.json:
         # ASCII only: a redirected stdout may have an encoding that lacks the letters of a light's name.
-        _print(json.dumps(json.loads(report_files.json_text(report)), indent=2), sys.stdout)
+        say(json.dumps(json.loads(report_files.json_text(report)), indent=2), sys.stdout)
         return 0
     for warning in report["warnings"]:
-        _print(f"warning: {warning}", sys.stderr)
-    _print(summary(report, arguments.output), sys.stdout)
+        say(f"warning: {warning}", sys.stderr)
+    say(summary(report, arguments.output), sys.stdout)
     return 0
-
-
-def _print(text: str, stream) -> None:
-    """Print to `stream`, which is None when it was closed; letters that its encoding lacks are spelled out."""
-    if stream is not None:
-        encoding = stream.encoding or "ascii"
-        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
 
 
 def _run_table_script(arguments, bar, open_file) -> int:
     root = Path(__file__).resolve().parents[1]
     if not (root / "tables" / "fit.py").is_file():
-        raise _Misuse(f"tables {arguments.action} needs the source checkout with tables/fit.py, which is not here")
+        needed = "the source checkout with tables/fit.py"
+        raise values.Misuse(f"tables {arguments.action} needs {needed}, which is not here")
     for library in ("scipy", *(["matplotlib"] if arguments.action == "plot" else [])):
         if importlib.util.find_spec(library) is None:
             fix = f"install it with `pip install {library}`"
-            raise _Misuse(f"tables {arguments.action} needs {library}, which is not here; {fix}")
+            raise values.Misuse(f"tables {arguments.action} needs {library}, which is not here; {fix}")
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "tables", arguments.action, *arguments.arguments]
     return subprocess.run(command, env=environment, check=False).returncode
@@ -276,12 +204,12 @@ def _export_tables(arguments, bar, open_file) -> int:
     try:
         prefixes = table_export.export_prefixes(arguments.names or SHIPPED_TABLES)
     except ValueError as error:
-        raise _Misuse(str(error)) from error
+        raise values.Misuse(str(error)) from error
     files = table_export.export_tables(prefixes, arguments.output, bar)
     bar.finish()
     paths = {name: [str(path) for path in written] for name, written in files.items()}
     if arguments.json:
-        _print(json.dumps({"tables": paths}, indent=2), sys.stdout)
+        say(json.dumps({"tables": paths}, indent=2), sys.stdout)
     else:
-        _print("\n".join(path for written in paths.values() for path in written), sys.stdout)
+        say("\n".join(path for written in paths.values() for path in written), sys.stdout)
     return 0

@@ -64,3 +64,10 @@ class ProgressBar:
             self._stream.write("\n")
             self._stream.flush()
             self._line_open = False
+
+
+def say(text: str, stream) -> None:
+    """Print to `stream`, which is None when it was closed; letters that its encoding lacks are spelled out."""
+    if stream is not None:
+        encoding = stream.encoding or "ascii"
+        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)

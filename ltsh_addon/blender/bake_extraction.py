@@ -147,6 +147,8 @@ def _object(scene, ob, mesh_and_uv, plans, job, folder, progress) -> dict:
     bake = ObjectBake(scene, ob, uv_name, distinct)
     try:
         blocks = [Block(*values) for values in blocks_of(mesh.uv, job["width"], job["height"], job["block_rows"])]
+        finished = {tile for name, tile in job["finished"] if name == ob.name}
+        blocks = [block for block in blocks if block.tile not in finished]
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
             if record["maps"]:

@@ -79,7 +79,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             "expected at least 1 and 0"
         )
     scene = Path(options.scene).absolute()
-    _check_readable(scene)
+    check_readable(scene)
     with _temporary_folder() as folder:
         manifest = _run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings = _read_samples(manifest, folder)
@@ -111,6 +111,7 @@ class BakeJob:
     frame: int | None
     cycles_samples: int
     passes: tuple[str, ...]  # of Cycles
+    finished: tuple[tuple[str, int], ...] = ()  # (object, tile): of these no maps are needed
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
@@ -119,7 +120,7 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
     Raises as `extract` does.
     """
     scene = Path(job.scene).absolute()
-    _check_readable(scene)
+    check_readable(scene)
     with _termination_as_exception():
         return _run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
@@ -138,7 +139,7 @@ def build_demo(path: Path, *, progress: Progress | None = None) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _check_readable(scene: Path) -> None:
+def check_readable(scene: Path) -> None:
     """Raise where a look at the file says enough, so that Blender need not start."""
     if not scene.exists():
         raise SceneError(f"{scene}: no such file, expected a .blend")

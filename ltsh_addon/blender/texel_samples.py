@@ -55,7 +55,10 @@ class BakeView:
         if not self.bent:
             return view
         cosine = np.sum(view * normal, axis=-1, keepdims=True)
-        return np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(view - normal * (cosine - SMALLEST_BAKED_COSINE)))
+        bent = unit(view - normal * (cosine - SMALLEST_BAKED_COSINE))
+        # Surfaces that face away are seen the more along their normal, the more they do.
+        behind = np.clip(-cosine, 0.0, 1.0)
+        return np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(bent * (1.0 - behind) + normal * behind))
 
 
 @dataclass(frozen=True)

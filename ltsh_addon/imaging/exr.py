@@ -85,6 +85,18 @@ def check_metadata(metadata: Mapping[str, str] | None) -> dict[str, str]:
     return header
 
 
+def read_metadata(path: str | os.PathLike) -> dict[str, str]:
+    """The string attributes of the header. Raises as `read_channels` does."""
+    with open(path, "rb") as stream:
+        if stream.read(4) != b"\x76\x2f\x31\x01":
+            raise ValueError(f"{path}: is not an OpenEXR file, expected one")
+    try:
+        header = _openexr().File(str(path), header_only=True).header()
+    except (RuntimeError, ValueError, OSError) as error:
+        raise ValueError(f"{path}: is damaged and cannot be read ({error}); write it again") from error
+    return {name: value for name, value in header.items() if isinstance(value, str)}
+
+
 def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """All channels by full name, each (H, W) of the file's type, row 0 on top; of all parts of a multi-part file.
 

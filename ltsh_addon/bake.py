@@ -20,6 +20,8 @@ from .scene import AreaLight, Cancelled, SurfaceSamples
 
 BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
 SIZES = (64, 8192)
+# Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
+NOTED_SHARE_OUTSIDE = 0.01
 # Texels that are shaded at a time.
 BLOCK_TEXELS = 1 << 20
 
@@ -146,7 +148,7 @@ class _ObjectBaker:
         self.view = texel_samples.BakeView(**manifest["view"])
         self.manifest = manifest
         self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-        self.tiles, self.outside = uv_raster.tiles_of(self.mesh.uv)
+        self.tiles, self.area = uv_raster.tiles_of(self.mesh.uv)
         self.compared = tuple(name for name in options.passes if name in _shaded_passes(options) | {"combined"})
         if not options.cycles_samples:
             self.compared = ()
@@ -154,7 +156,7 @@ class _ObjectBaker:
 
     def bake(self, stem: str, key: str, finished: dict, seconds: dict, progress) -> dict:
         """Write the files of the object that are not `finished`; its record for the report."""
-        result = {"name": self.record["name"], "uv": self.record["uv"], "outside": self.outside, "tiles": {}}
+        result = {"name": self.record["name"], "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
         for tile in self.tiles:
             name = stem if len(self.tiles) == 1 else f"{stem}.{tile}"
             path = self.options.output / f"{name}.exr"
@@ -163,15 +165,31 @@ class _ObjectBaker:
             seconds[path.name] = time.perf_counter() - start
             # The order of a record that was read back.
             result["tiles"][str(tile)] = {"file": path.name, **json.loads(json.dumps(record, sort_keys=True))}
+            if self.area > 0.0:
+                baked = (record["texels"] + record["overlapping_texels"]) / (self.options.width * self.options.height)
+                result["outside"] = max(0.0, 1.0 - baked / self.area)
         return result
 
     def _tile(self, tile, path, key, progress):
+        """Write the file of one tile; its record."""
         options = self.options
-        width, height, rows = options.width, options.height, _block_rows(options)
-        triangles = self._raster.in_tile(self.mesh.uv, width, height, ((tile - 1001) % 10, (tile - 1001) // 10))
-        covered, overlaps, errors = 0, 0, ErrorSums()
-        planes = Planes(self.folder / f"planes_{tile}", self.channels(), width, height)
-        firsts = range(0, height, rows)
+        errors = ErrorSums()
+        with Planes(self.folder / f"planes_{tile}", self.channels(), options.width, options.height) as planes:
+            record = self._shade(tile, planes, errors, progress)
+            pictures = None
+            if self.compared:
+                size = options.width, options.height
+                pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
+                record |= {"pictures": pictures.names, "errors": errors.report()}
+            planes.write(path, options.margin, self._metadata(tile) | job_metadata(key, record), pictures)
+        return record
+
+    def _shade(self, tile, planes, errors, progress) -> dict:
+        """Shade a tile block by block into `planes`; how many texels there were."""
+        options, covered, overlaps = self.options, 0, 0
+        rows, place = _block_rows(options), ((tile - 1001) % 10, (tile - 1001) // 10)
+        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, place)
+        firsts = range(0, options.height, rows)
         for number, first in enumerate(firsts):
 
             def report(fraction, number=number):
@@ -180,18 +198,12 @@ class _ObjectBaker:
 
             if report(0.0) is False:
                 raise Cancelled("the bake was stopped")
-            count = min(rows, height - first)
+            count = min(rows, options.height - first)
             texels = triangles.texels(first, count, options.conservative)
             covered += len(texels.index)
             overlaps += texels.overlaps
             planes.put(first, count, texels.index, self._block(tile, first, texels, errors, report))
-        record = {"texels": covered, "overlapping_texels": overlaps}
-        pictures = None
-        if self.compared:
-            pictures = ErrorPictures(width, height, path, list(self.tables), list(self.compared))
-            record |= {"pictures": pictures.names, "errors": errors.report()}
-        planes.write(path, options.margin, self._metadata(tile) | job_metadata(key, record), pictures)
-        return record
+        return {"texels": covered, "overlapping_texels": overlaps}
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR but for the coverage."""
@@ -268,7 +280,8 @@ class _ObjectBaker:
 
     def _metadata(self, tile) -> dict[str, str]:
         options, view = self.options, self.view
-        seen = {"above": "above the surface", "point": f"position {view.vector}", "direction": f"from {view.vector}"}
+        vector = ", ".join(f"{value:g}" for value in view.vector)
+        seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
         return {
             "ltsh:scene": Path(options.scene).name,
             "ltsh:object": self.record["name"],
@@ -299,15 +312,15 @@ def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     warnings = list(manifest["warnings"])
     for record in records:
-        if record["outside"] > 0.0:
-            share = f"{100 * record['outside']:.2g} %"
+        if record["outside"] > NOTED_SHARE_OUTSIDE:
+            share = f"{100 * record['outside']:.3g} %"
             warnings.append(
                 f"object {record['name']!r}: {share} of UV map {record['uv']!r} lies outside of the texture, not baked"
             )
         for tile in record["tiles"].values():
             share = tile["overlapping_texels"] / max(tile["texels"], 1)
             if share > 0.0:
-                warnings.append(f"object {record['name']!r}: {100 * share:.2g} % of its texels are covered twice")
+                warnings.append(f"object {record['name']!r}: {100 * share:.3g} % of its texels are covered twice")
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],

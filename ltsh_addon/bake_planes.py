@@ -15,7 +15,7 @@ COVERAGE = "coverage.hit.V"
 
 
 class Planes:
-    """Channels of an image as files, so that only some rows of them need be in memory. Row 0 is below."""
+    """Channels of an image as files, so that only some rows of them need be in memory; a context. Row 0 is below."""
 
     def __init__(self, folder: Path, names: list[str], width: int, height: int):
         folder.mkdir()
@@ -23,6 +23,14 @@ class Planes:
         self.coverage = np.zeros((height, width), dtype=bool)
         self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(names)}
         self._files = {name: path.open("w+b") for name, path in self._paths.items()}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        for name, file in self._files.items():
+            file.close()
+            self._paths[name].unlink()
 
     def put(self, first: int, count: int, index, values) -> None:
         """Rows from `first`: `values` by channel at the texels `index`."""
@@ -40,7 +48,7 @@ class Planes:
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
 
     def write(self, path: Path, margin: int, metadata, pictures) -> None:
-        """Write the EXR with the margin filled and the ErrorPictures (or None) of it, and close the files."""
+        """Write the EXR with the margin filled, and the ErrorPictures (or None) of it."""
         height, width = self.shape
         rows = max(1, WRITTEN_TEXELS // width)
         with writing_rows(path, [*self.names, COVERAGE], width, height, metadata) as writer:
@@ -62,6 +70,3 @@ class Planes:
             # Before the EXR takes its name: with it the tile counts as finished.
             if pictures is not None:
                 pictures.write()
-        for name, file in self._files.items():
-            file.close()
-            self._paths[name].unlink()

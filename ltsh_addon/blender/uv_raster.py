@@ -237,8 +237,8 @@ def _cross(u, v):
 
 
 def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
-    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the share of the area
-    of the UV map that is in none of them.
+    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the area that they
+    have in all, 1 for a tile, where some of it may be outside of these tiles; else 0.
 
     Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
     """
@@ -253,5 +253,4 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     if (within & numbered).all():
         return sorted(set((1001 + column + 10 * row).tolist())), 0.0
     touching = (uv.min(axis=1) < 1.0).all(axis=1) & (uv.max(axis=1) > 0.0).all(axis=1)
-    inside = within & (column == 0) & (row == 0)
-    return ([1001] if touching.any() else []), float(1.0 - area[inside].sum() / area.sum())
+    return ([1001] if touching.any() else []), float(0.5 * area.sum())

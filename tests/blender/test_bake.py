@@ -1,0 +1,386 @@
+"""Baked lighting: against quadrature written out, against Cycles' bake, through real children; what cannot be baked."""
+
+import json
+import math
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import quadrature
+import scene_parts
+from scene_parts import add_plane, add_sphere, principled
+
+from ltsh_addon import bake, imaging
+from ltsh_addon.bake import BakeOptions, bake_scene
+from ltsh_addon.blender import child
+from ltsh_addon.imaging.exr import read_metadata
+from ltsh_addon.scene import AreaLight, Cancelled, SurfaceSamples
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = 64
+
+
+def start(light=True, camera=(0.0, -3.0, 2.0)):
+    scene_parts.empty_scene()
+    if light:
+        scene_parts.add_area_light("Key")
+    if camera:
+        scene_parts.add_camera(camera)
+
+
+def save(folder):
+    path = folder / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+def baked(path, output, **options):
+    """Report and layers by file name, row 0 on top."""
+    values = {"width": SIZE, "height": SIZE, "margin": 0, **options}
+    report = bake_scene(BakeOptions(scene=path, output=output, **values))
+    return report, {file.name: imaging.read_layers(file) for file in sorted(output.glob("*.exr"))}
+
+
+def plane_positions(size=SIZE, side=6.0):
+    """World positions (size, size, 3) of the texel centers of `scene_parts.add_plane`, row 0 on top."""
+    step = (np.arange(size) + 0.5) / size * side - side / 2.0
+    x, y = np.meshgrid(step, step[::-1])
+    return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+def plane_samples(view, **fields):
+    position = plane_positions().reshape(-1, 3)
+    ones, up = np.ones((len(position), 3)), np.broadcast_to((0.0, 0.0, 1.0), position.shape)
+    values = {
+        "roughness": 0.4, "specular_f0": 0.0, "specular_f90": 0.0, "dielectric": 0.0, "ior": 1.5,
+        "diffuse_albedo": 0.0, **fields,
+    }  # fmt: skip
+    flat = {name: np.full(len(position), value) for name, value in values.items() if name in ("roughness", "ior")}
+    colors = {name: ones * value for name, value in values.items() if name not in flat}
+    vectors = view(position) if callable(view) else np.broadcast_to(view, position.shape)
+    return SurfaceSamples(position=position, view=vectors, normal=up, diffuse_normal=up, **flat, **colors)
+
+
+KEY = AreaLight(
+    "Key", "RECTANGLE", (0.3, 0.2, 1.5), (0.6, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, -1.0),
+    np.full(3, 100.0 / (1.2 * 0.7) / math.pi),
+)  # fmt: skip
+
+
+def towards(point):
+    def view(position):
+        offset = np.array(point) - position
+        return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
+
+    return view
+
+
+@pytest.mark.parametrize(
+    ("view", "direction"),
+    [("camera", towards((0.0, -3.0, 2.0))), ("above", (0.0, 0.0, 1.0)), ((1.0, 2.0, 3.0), towards((1.0, 2.0, 3.0)))],
+    ids=["camera", "above", "point"],
+)
+def test_a_metal_plane_is_shaded_as_the_integral_over_the_light_says(tmp_path, view, direction):
+    start()
+    bpy.data.objects["Key"].rotation_euler = (0.0, 0.0, 0.0)
+    add_plane(principled(Metallic=1.0, Roughness=0.4, Base_Color=(0.9, 0.6, 0.3, 1.0))[0])
+    bpy.data.materials["Material"].node_tree.nodes["Principled BSDF"].distribution = "GGX"
+    options = {"techniques": ("reference",), "passes": ("specular",), "view": view}
+    _, files = baked(save(tmp_path), tmp_path / "out", **options)
+    samples = plane_samples(direction, specular_f0=(0.9, 0.6, 0.3), specular_f90=1.0)
+    some = np.random.default_rng(0).choice(len(samples), 300, replace=False)
+    expected = quadrature.radiance(samples.take(some), [KEY], quadrature.ggx)
+    found = files["Plane.exr"]["reference.specular"].reshape(-1, 3)[some]
+    # The patches of the oracle leave 1e-4 at this roughness, positions in texels 2e-3 of a texel.
+    assert np.abs(found - expected).max() < 1e-3 * expected.max()
+
+
+def test_diffuse_light_is_the_irradiance_over_pi_and_leaves_colors_out(tmp_path):
+    start()
+    bpy.data.objects["Key"].rotation_euler = (0.0, 0.0, 0.0)
+    add_plane(scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", Color=(0.8, 0.2, 0.5, 1.0))[0])
+    passes = ("diffuse", "diffuse_light", "combined", "specular")
+    _, files = baked(save(tmp_path), tmp_path / "out", passes=passes, view="above")
+    layers = files["Plane.exr"]
+    expected = quadrature.radiance(plane_samples((0.0, 0.0, 1.0), diffuse_albedo=1.0), [KEY], quadrature.lambert)
+    light = layers["ltsh4.diffuse_light"].reshape(-1, 3)
+    assert np.abs(light - expected).max() < 1e-3 * expected.max()
+    color = np.float32([0.8, 0.2, 0.5])
+    assert np.abs(layers["ltsh4.diffuse"] - layers["ltsh4.diffuse_light"] * color).max() < 1e-5 * light.max()
+    assert np.array_equal(layers["ltsh4.combined"], layers["ltsh4.diffuse"] + layers["ltsh4.specular"])
+    assert layers["coverage.hit"].min() == 1.0
+
+
+def textured_scene():
+    """A sphere of metal and a plane whose colors, roughness and normals come from textures, one in a node group."""
+    start(camera=(0.0, -3.0, 3.0))
+    scene_parts.add_area_light("Fill", (-1.5, 0.5, 1.2), (0.2, -0.8, 0.3), shape="DISK", energy=40.0)
+    add_sphere(principled("Metal", Metallic=1.0, Roughness=0.7)[0], radius=0.5, location=(0.0, 0.0, 0.6), segments=48)
+    material, node = principled("Rough", Roughness=0.5)
+    tree = material.node_tree
+    noise = tree.nodes.new("ShaderNodeTexNoise")
+    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 0.7, 0.0
+    group = bpy.data.node_groups.new("Group", "ShaderNodeTree")
+    group.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
+    inner = group.nodes.new("ShaderNodeBsdfPrincipled")
+    texture = group.nodes.new("ShaderNodeTexWave")
+    texture.inputs["Scale"].default_value, texture.inputs["Detail"].default_value = 0.2, 0.0
+    group.links.new(texture.outputs["Color"], inner.inputs["Base Color"])
+    group.links.new(inner.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
+    outer, mix = tree.nodes.new("ShaderNodeGroup"), tree.nodes.new("ShaderNodeMixShader")
+    outer.node_tree = group
+    tree.links.new(noise.outputs[0], node.inputs["Roughness"])
+    tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
+    tree.links.new(node.outputs[0], mix.inputs[1])
+    tree.links.new(outer.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], tree.nodes["Material Output"].inputs["Surface"])
+    scene_parts.add_bump(tree, node, strength=0.2, scale=0.7).inputs["Height"].links[0].from_node.inputs[
+        "Detail"
+    ].default_value = 0.0
+    add_plane(material, size=3.0)
+
+
+def test_textures_groups_and_mixes_agree_with_the_bake_of_cycles(tmp_path):
+    textured_scene()
+    report, files = baked(
+        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4"), cycles_samples=256, margin=2
+    )
+    assert report["problems"] == [] and set(files) == {"Plane.exr", "Sphere.exr"}
+    for name, layers in files.items():
+        covered = layers["coverage.hit"] > 0.0
+        for pass_name in ("specular", "diffuse"):
+            cycles = layers[f"cycles.{pass_name}"][covered]
+            if cycles.max() < 1e-6:
+                continue  # a metal
+            halves = [layers[f"cycles_{half}.{pass_name}"] for half in "AB"]
+            found = imaging.noisy_error_statistics(layers[f"reference.{pass_name}"], *halves, covered)
+            # Cycles averages over a texel, which takes most of this at so small a size: at 192 texels the plane's
+            # highlight agrees within the noise. The bump's shadowing of diffuse light is taken at the mean direction.
+            assert found.unbiased_relative_error < 0.012, (name, pass_name, found)
+            assert abs(found.bias) < 0.004, (name, pass_name, found)
+            for technique in ("reference", "ltsh4"):
+                error = layers[f"error_{technique}.{pass_name}"]
+                expected = layers[f"{technique}.{pass_name}"] - layers[f"cycles.{pass_name}"]
+                scale = np.abs(cycles).max()
+                assert np.abs(error - expected)[covered].max() <= 2e-7 * scale
+    errors = report["objects"][0]["tiles"]["1001"]["errors"]["specular"]
+    assert 0.0 < errors["noise"] < 0.1 and set(errors["techniques"]) == {"reference", "ltsh4"}
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} >= {"Plane.error_ltsh4.specular.png"}
+
+
+def test_several_materials_and_none_are_baked_on_one_object(tmp_path):
+    start()
+    ob = scene_parts.add_mesh(
+        "Strips",
+        [(x, y, 0.0) for x in (-1.5, -0.5, 0.5, 1.5) for y in (-1.0, 1.0)],
+        [(0, 2, 3, 1), (2, 4, 5, 3), (4, 6, 7, 5)],
+    )
+    uv = ob.data.uv_layers.new(name="UVMap")
+    corners = [(x / 3.0, y) for face in range(3) for x, y in ((face, 0), (face + 1, 0), (face + 1, 1), (face, 1))]
+    uv.data.foreach_set("uv", np.array(corners, dtype=np.float32).ravel())
+    for color in ((1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)):
+        ob.data.materials.append(scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", Color=color)[0])
+    ob.data.materials.append(None)
+    ob.data.polygons.foreach_set("material_index", [0, 1, 2])
+    _, files = baked(save(tmp_path), tmp_path / "out", passes=("diffuse",))
+    image = files["Strips.exr"]["ltsh4.diffuse"][SIZE // 2]
+    red, green, gray = image[SIZE // 6], image[SIZE // 2], image[5 * SIZE // 6]
+    assert red[0] > 0.0 == red[1] == red[2] and green[1] > 0.0 == green[0] == green[2]
+    assert gray[0] == pytest.approx(gray[1]) and gray[1] == pytest.approx(gray[2]) and gray[0] > 0.0
+
+
+def test_udim_tiles_become_files_and_repeating_textures_do_not(tmp_path):
+    start()
+    maps = {
+        "Tiles": [(0.1, 0.1), (0.9, 0.1), (0.9, 0.9), (0.1, 0.9), (1.1, 1.2), (1.8, 1.2), (1.8, 1.7), (1.1, 1.7)],
+        "Repeated": [(-2.0, -1.0), (3.0, -1.0), (3.0, 4.0), (-2.0, 4.0)] + 4 * [(0.0, 0.0)],
+    }
+    for index, (name, corners) in enumerate(maps.items()):
+        z = 0.1 * index
+        places = [(-1, -1, z), (0, -1, z), (0, 1, z), (-1, 1, z), (0, -1, z), (1, -1, z), (1, 1, z), (0, 1, z)]
+        ob = scene_parts.add_mesh(name, places, [(0, 1, 2, 3), (4, 5, 6, 7)])
+        ob.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.array(corners, dtype=np.float32).ravel())
+    report, files = baked(save(tmp_path), tmp_path / "out", passes=("diffuse",), view="above")
+    assert set(files) == {"Tiles.1001.exr", "Tiles.1012.exr", "Repeated.exr"}
+    # 0.8 x 0.8 and 0.7 x 0.5 of the tile, to the texels of a border
+    for name, share in (("Tiles.1001.exr", 0.64), ("Tiles.1012.exr", 0.35), ("Repeated.exr", 1.0)):
+        assert files[name]["coverage.hit"].mean() == pytest.approx(share, abs=4.0 / SIZE), name
+    assert any("'Repeated': 96 % of UV map 'UVMap' lies outside" in line for line in report["warnings"])
+
+
+def test_blocks_of_rows_change_nothing(tmp_path, monkeypatch):
+    textured_scene()
+    path = save(tmp_path)
+    _, whole = baked(path, tmp_path / "whole", margin=3)
+    monkeypatch.setattr(bake, "BLOCK_TEXELS", 7 * SIZE)
+    _, parts = baked(path, tmp_path / "parts", margin=3)
+    for name, layers in whole.items():
+        assert np.array_equal(layers["coverage.hit"], parts[name]["coverage.hit"])
+        for layer, pixels in layers.items():
+            # The maps of a block are baked at UV coordinates rounded differently.
+            assert np.abs(pixels - parts[name][layer]).max() <= 2e-4 * np.abs(pixels).max(), (name, layer)
+
+
+def test_the_margin_repeats_the_border_and_conservative_adds_texels(tmp_path):
+    start()
+    ob = add_plane(principled(Metallic=1.0, Roughness=0.5)[0])
+    uv = np.array([0.3, 0.3, 0.7, 0.3, 0.7, 0.7, 0.3, 0.7], dtype=np.float32)
+    ob.data.uv_layers.active.data.foreach_set("uv", uv)
+    path = save(tmp_path)
+    _, plain = baked(path, tmp_path / "plain")
+    _, wide = baked(path, tmp_path / "wide", margin=5)
+    _, safe = baked(path, tmp_path / "safe", conservative=True)
+    layers, covered = wide["Plane.exr"], plain["Plane.exr"]["coverage.hit"] > 0.0
+    image, before = layers["ltsh4.specular"], plain["Plane.exr"]["ltsh4.specular"]
+    assert np.array_equal(layers["coverage.hit"] > 0.0, covered) and np.array_equal(image[covered], before[covered])
+    rows, columns = np.nonzero(covered)
+    top, left, right = rows.min(), columns.min(), columns.max()
+    border = before[top : top + 1, left : right + 1]
+    assert np.array_equal(image[top - 5 : top, left : right + 1], np.repeat(border, 5, axis=0))
+    assert not image[top - 6].any() and np.array_equal(image[top - 3, left - 3], before[top, left])
+    touched = safe["Plane.exr"]["coverage.hit"] > 0.0
+    # .3 x 64 = 19.2: the texel 19 is touched, its center 19.5 is covered; .7 x 64 = 44.8: 44 and its center.
+    assert touched[covered].all() and touched.sum() >= covered.sum()
+
+
+def test_metadata_says_what_the_file_is(tmp_path):
+    start()
+    add_plane(name="Bo/den: ü")
+    _, files = baked(save(tmp_path), tmp_path / "out", view=(1.0, 2.0, 3.0))
+    (name,) = files
+    assert "/" not in name and ":" not in name
+    metadata = read_metadata(tmp_path / "out" / name)
+    assert metadata["ltsh:object"] == "Bo/den: ü" and metadata["ltsh:uv"] == "UVMap"
+    assert metadata["ltsh:view"] == "position 1, 2, 3" and metadata["ltsh:frame"] == "1"
+
+
+def broken_scene():
+    start()
+    add_plane(name="Good")
+    bare = add_plane(name="No map", location=(0, 0, 0.1))
+    bare.data.uv_layers.remove(bare.data.uv_layers[0])
+    add_plane(name="Point map").data.uv_layers.active.data.foreach_set("uv", np.full(8, 0.5, np.float32))
+    add_plane(name="Far map").data.uv_layers.active.data.foreach_set(
+        "uv", np.float32([-5, -5, -4.1, -5, -4.1, -4.1, -5, -4.1])
+    )
+    square = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+    double = scene_parts.add_mesh("Double", 2 * square, [(0, 1, 2, 3), (4, 5, 6, 7)])
+    double.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 1, 0, 1, 1, 0, 1] * 2))
+    add_plane(name="Hidden").hide_render = True
+    scene_parts.add_mesh("No faces", [(0, 0, 0)], []).data.uv_layers.new(name="UVMap")
+    flat = add_plane(name="Flat")
+    flat.scale = (1.0, 0.0, 0.0)
+
+
+def test_broken_objects_are_named_and_the_rest_is_baked(tmp_path, capsys):
+    from ltsh_addon import cli
+
+    broken_scene()
+    path = save(tmp_path)
+    names = [ob.name for ob in bpy.data.objects if ob.type == "MESH"]
+    arguments = [value for name in names for value in ("--object", name)]
+    capsys.readouterr()
+    code = cli.main(["bake", str(path), "-o", str(tmp_path / "out"), "--size", "64", "--quiet", *arguments])
+    said = capsys.readouterr().err
+    assert code == 1
+    assert {file.name for file in (tmp_path / "out").glob("*.exr")} == {"Good.exr", "Double.exr"}
+    for text in (
+        "not baked: object 'No map' has no UV map, found none",
+        "not baked: object 'Point map': all faces of UV map 'UVMap' have no area",
+        "not baked: object 'Far map': all of UV map 'UVMap' lies outside of the texture",
+        "not baked: object 'Hidden' is hidden in renders",
+        "not baked: object 'No faces' has no faces",
+        "not baked: object 'Flat': its transform has no inverse",
+        "warning: object 'Double': 100 % of its texels are covered twice",
+    ):
+        assert text in said, text
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert len(report["problems"]) == 6 and len(report["objects"]) == 2
+
+
+def test_scenes_that_cannot_be_baked_say_why(tmp_path):
+    start(light=False)
+    add_plane()
+    with pytest.raises(child.SceneError, match="no area light that renders, found no lights at all; add an area light"):
+        baked(save(tmp_path), tmp_path / "out")
+    scene_parts.add_area_light()
+    path = save(tmp_path)
+    with pytest.raises(child.SceneError, match="object 'Wall' is not in scene 'Scene'; meshes there: 'Plane'"):
+        baked(path, tmp_path / "out", objects=("Wall",))
+    report, _ = baked(path, tmp_path / "out", uv="Lightmap")
+    assert report["problems"] == [
+        "object 'Plane' has no UV map 'Lightmap', found 'UVMap': unwrap it, or name another with --uv"
+    ]
+    with pytest.raises(ValueError, match="size is 32x8192, expected 64 to 8192 each"):
+        baked(path, tmp_path / "out", width=32, height=8192)
+    bpy.data.objects.remove(bpy.data.objects["Plane"])
+    with pytest.raises(child.SceneError, match="no mesh that renders, nothing to bake"):
+        baked(save(tmp_path), tmp_path / "out")
+
+
+def test_above_needs_no_camera_and_camera_does(tmp_path):
+    start(camera=None)
+    add_plane()
+    path = save(tmp_path)
+    _, files = baked(path, tmp_path / "out", view="above")
+    assert files["Plane.exr"]["ltsh4.specular"].max() > 0.0
+    with pytest.raises(child.SceneError, match="no active camera"):
+        baked(path, tmp_path / "out")
+
+
+def test_stopping_leaves_no_file(tmp_path):
+    start()
+    add_plane()
+
+    def stop(stage, fraction):
+        return not stage.startswith("shade")
+
+    with pytest.raises(Cancelled):
+        bake_scene(BakeOptions(scene=save(tmp_path), output=tmp_path / "out", width=64, height=64), stop)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_after_a_kill_resume_gives_the_same_bytes(tmp_path):
+    textured_scene()
+    path = save(tmp_path)
+    arguments = ["bake", str(path), "--size", "64", "--error", "--cycles-samples", "4", "--quiet", "--margin", "3"]
+
+    def start_bake(output, *more):
+        command = [sys.executable, "-m", "ltsh_addon", *arguments, "-o", str(output), *more]
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    began = time.monotonic()
+    assert start_bake(tmp_path / "whole").wait() == 0
+    seconds = time.monotonic() - began
+    moments = np.random.default_rng(7).uniform(0.2, 1.0, 2) * seconds
+    for moment in (*moments, seconds):
+        process = start_bake(tmp_path / "killed", "--resume")
+        try:
+            process.wait(moment)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    assert start_bake(tmp_path / "killed", "--resume").wait() == 0
+    names = {file.name for file in (tmp_path / "whole").iterdir()}
+    # A killed process cannot take its hidden temporary file away; nothing else may be left.
+    visible = {file.name for file in (tmp_path / "killed").iterdir() if not file.name.startswith(".")}
+    assert visible == names
+    for name in names - {"timing.json"}:
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+
+
+def test_resume_bakes_again_what_belongs_to_another_job(tmp_path):
+    start()
+    add_plane()
+    path = save(tmp_path)
+    _, first = baked(path, tmp_path / "out", view="above", resume=True)
+    _, second = baked(path, tmp_path / "out", view="camera", resume=True)
+    assert np.abs(first["Plane.exr"]["ltsh4.specular"] - second["Plane.exr"]["ltsh4.specular"]).max() > 0.0
+    (tmp_path / "out" / "Plane.exr").write_bytes(b"no EXR")
+    _, third = baked(path, tmp_path / "out", view="camera", resume=True)
+    assert np.array_equal(second["Plane.exr"]["ltsh4.specular"], third["Plane.exr"]["ltsh4.specular"])

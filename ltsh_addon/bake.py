@@ -47,6 +47,7 @@ class BakeOptions:
     camera: str | None = None
     cycles_samples: int = 0  # 0: no Cycles bake and no error
     resume: bool = False  # keep what the same job has finished
+    apply: bool = False  # also a texture per object, and a .blend that shows it
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -76,6 +77,8 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
                 records.append(baker.bake(stem, key, finished, seconds, progress))
                 shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
+    if options.apply and records:
+        document["applied"] = _apply(options, tables, records, progress)
     imaging.write_json(options.output / "report.json", document)
     seconds["total"] = time.perf_counter() - start
     imaging.write_json(options.output / "timing.json", {"seconds": seconds})
@@ -158,8 +161,7 @@ class _ObjectBaker:
         """Write the files of the object that are not `finished`; its record for the report."""
         result = {"name": self.record["name"], "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
         for tile in self.tiles:
-            name = stem if len(self.tiles) == 1 else f"{stem}.{tile}"
-            path = self.options.output / f"{name}.exr"
+            path = self.options.output / f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
             record = finished.get((self.record["name"], tile)) or self._tile(tile, path, key, progress)
             seconds[path.name] = time.perf_counter() - start
@@ -169,6 +171,9 @@ class _ObjectBaker:
                 baked = (record["texels"] + record["overlapping_texels"]) / (self.options.width * self.options.height)
                 result["outside"] = max(0.0, 1.0 - baked / self.area)
         return result
+
+    def _suffix(self, tile) -> str:
+        return "" if len(self.tiles) == 1 else f".{tile}"
 
     def _tile(self, tile, path, key, progress):
         """Write the file of one tile; its record."""
@@ -181,7 +186,13 @@ class _ObjectBaker:
                 size = options.width, options.height
                 pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
                 record |= {"pictures": pictures.names, "errors": errors.report()}
-            planes.write(path, options.margin, self._metadata(tile) | job_metadata(key, record), pictures)
+            texture = None
+            if options.apply:
+                layer = applied_layer(options, self.tables)
+                record["texture"] = f"{path.stem.removesuffix(f'.{tile}')}.{layer}{self._suffix(tile)}.exr"
+                texture = path.with_name(record["texture"]), layer
+            metadata = self._metadata(tile) | job_metadata(key, record)
+            planes.write(path, options.margin, metadata, pictures, texture)
         return record
 
     def _shade(self, tile, planes, errors, progress) -> dict:
@@ -292,6 +303,29 @@ class _ObjectBaker:
             "ltsh:camera": self.manifest["camera"],
             "ltsh:version": compare.versions(self.manifest["blender_version"])["ltsh"],
         }
+
+
+def applied_layer(options: BakeOptions, tables) -> str:
+    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
+    pass_name = "combined" if "combined" in options.passes else options.passes[0]
+    return f"{next(iter(tables))}.{pass_name}"
+
+
+def _apply(options, tables, records, progress) -> str:
+    """Save the .blend that shows the textures; its name."""
+    from .blender import child
+
+    textures = []
+    for record in records:
+        files = [
+            {"path": str((options.output / tile["texture"]).absolute()), "tile": int(number)}
+            for number, tile in record["tiles"].items()
+        ]
+        name = f"{record['name']} {applied_layer(options, tables)}"
+        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
+    path = options.output / f"{Path(options.scene).stem}_baked.blend"
+    child.apply_bake(options.scene, path, textures, progress=progress)
+    return path.name
 
 
 def _put(values: dict, layer: str, pixels) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -47,11 +48,17 @@ class Planes:
         file.seek(4 * first * width)
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
 
-    def write(self, path: Path, margin: int, metadata, pictures) -> None:
-        """Write the EXR with the margin filled, and the ErrorPictures (or None) of it."""
+    def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
+        """Write the EXR with the margin filled, the ErrorPictures (or None) of it, and as `texture`, (path, layer), an
+        EXR with the colors of one layer."""
         height, width = self.shape
         rows = max(1, WRITTEN_TEXELS // width)
-        with writing_rows(path, [*self.names, COVERAGE], width, height, metadata) as writer:
+        with ExitStack() as files:
+            # The last to be entered is the first to take its name: with the large file the tile counts as finished.
+            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], width, height, metadata))
+            small = None
+            if texture is not None:
+                small = files.enter_context(writing_rows(texture[0], "RGB", width, height, metadata))
             for top in range(height, 0, -rows):
                 bottom = max(top - rows, 0)
                 low, high = max(bottom - margin, 0), min(top + margin, height)
@@ -65,8 +72,9 @@ class Planes:
                     plane.reshape(-1)[target] = around.reshape(-1)[source]
                     block[name] = plane[::-1]
                 writer.write(block)
+                if small is not None:
+                    small.write({letter: block[f"{texture[1]}.{letter}"] for letter in "RGB"})
                 if pictures is not None:
                     pictures.add(height - top, block)
-            # Before the EXR takes its name: with it the tile counts as finished.
             if pictures is not None:
                 pictures.write()

@@ -53,6 +53,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--cycles-samples", type=values.cycles_samples, default=ERROR_SAMPLES, metavar="N",
         help="of both halves of Cycles' bake together (default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--apply", action="store_true",
+        help="also a texture of each object, and a copy of the .blend whose materials show it",
+    )  # fmt: skip
     parser.add_argument("--resume", action="store_true", help="keep the files that the same job has finished in OUT")
     parser.add_argument("--json", action="store_true", help="print the report on stdout as one JSON document")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
@@ -79,6 +83,7 @@ def run(arguments, bar, open_file) -> int:
         camera=arguments.camera,
         cycles_samples=arguments.cycles_samples if arguments.error else 0,
         resume=arguments.resume,
+        apply=arguments.apply,
     )
     report = bake_scene(options, bar)
     bar.finish()

@@ -125,6 +125,24 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
         return _run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
 
+def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
+    """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
+
+    Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
+    not at all. Raises as `extract` does.
+    """
+    path = Path(path).absolute()
+    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
+    job = {"task": "apply", "scene": str(Path(scene).absolute()), "path": str(unfinished), "textures": textures}
+    try:
+        with _temporary_folder() as folder:
+            manifest = _run_child(job, folder, progress)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return manifest["warnings"]
+
+
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
     """Build the example scene and save it as the .blend `path`, at once or not at all."""
     path = Path(path).absolute()

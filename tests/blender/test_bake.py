@@ -17,7 +17,7 @@ from scene_parts import add_plane, add_sphere, principled
 
 from ltsh_addon import bake, imaging
 from ltsh_addon.bake import BakeOptions, bake_scene
-from ltsh_addon.blender import child
+from ltsh_addon.blender import child, gbuffer, render_settings
 from ltsh_addon.imaging.exr import read_metadata
 from ltsh_addon.scene import AreaLight, Cancelled, SurfaceSamples
 
@@ -257,6 +257,32 @@ def test_metadata_says_what_the_file_is(tmp_path):
     metadata = read_metadata(tmp_path / "out" / name)
     assert metadata["ltsh:object"] == "Bo/den: ü" and metadata["ltsh:uv"] == "UVMap"
     assert metadata["ltsh:view"] == "position 1, 2, 3" and metadata["ltsh:frame"] == "1"
+
+
+def test_apply_saves_a_file_whose_object_shows_the_texture(tmp_path):
+    start()
+    scene_parts.add_top_camera()
+    add_plane(principled(Metallic=1.0, Roughness=0.4)[0])
+    path = save(tmp_path)
+    before = path.read_bytes()
+    output = tmp_path / "out"
+    report, files = baked(path, output, passes=("specular", "combined"), apply=True)
+    assert path.read_bytes() == before and report["applied"] == "scene_baked.blend"
+    assert set(files) == {"Plane.exr", "Plane.ltsh4.combined.exr"}
+    combined = files["Plane.exr"]["ltsh4.combined"]
+    assert np.array_equal(files["Plane.ltsh4.combined.exr"][""], combined)
+    bpy.ops.wm.open_mainfile(filepath=str(output / report["applied"]))
+    (image,) = [image for image in bpy.data.images if image.name.startswith("Plane")]
+    assert image.filepath == "//Plane.ltsh4.combined.exr"
+    assert bpy.data.objects["Plane"].material_slots[0].material.name == "Material (baked Plane)"
+    # A light shines on emission in vain: the picture is the texture, texel for pixel.
+    scene = bpy.context.scene
+    scene.render.resolution_x = scene.render.resolution_y = SIZE
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    render_settings.render_exr(scene, tmp_path / "picture.exr")
+    channels = imaging.read_channels(tmp_path / "picture.exr")
+    rendered = gbuffer.read_layer(channels, "Combined", "RGB")
+    assert np.abs(rendered - combined).max() <= 2e-3 * combined.max()
 
 
 def broken_scene():

@@ -48,7 +48,8 @@ LOBE_KINDS = {
     "translucent": 4.0,
     "metal": 5.0,
     "conductor": 6.0,
-    "glass": 7.0,
+    "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
+    "glass": 8.0,
 }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from .aovs import LOBE_AOVS, LOBE_KINDS
-from .shader_graph import cut, is_constant, live_link, value_of
+from .shader_graph import cut, is_constant, is_socket, live_link, value_of
 
 PRINCIPLED = "ShaderNodeBsdfPrincipled"
 # BSDF -> kind of lobe, {AOV of aovs.LOBE_AOVS: socket name}.
@@ -37,9 +37,10 @@ LOBE_SOCKETS = {
     "ShaderNodeSubsurfaceScattering": ("diffuse", {"color": "Color"}),
     "ShaderNodeBsdfToon": ("diffuse", {"color": "Color"}),
 }
+CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
 METALLIC_SOCKETS = {
     "F82": ("metal", {"color": "Base Color", "tint": "Edge Tint", "roughness": "Roughness"}),
-    "PHYSICAL_CONDUCTOR": ("conductor", {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
+    "PHYSICAL_CONDUCTOR": (CONDUCTOR, {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
 }
 # Node -> what stands in for it where it is not exact.
 NEAREST = {
@@ -69,8 +70,6 @@ NOT_SHADED = {
 }
 # Nodes whose lobe is multiplied by what multiple scattering adds.
 MULTIPLE_SCATTERING_NODES = (PRINCIPLED, "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic")
-# Up to 4.5 an unlinked Coat Normal is the smooth normal, later it is the Normal socket.
-COAT_FOLLOWS_NORMAL = bpy.app.version >= (5, 0, 0)
 
 
 def lobe_of(node, warn: Callable[[str], None]) -> dict:
@@ -125,14 +124,12 @@ def _is_neutral(name, value) -> bool:
 
 
 def _complete_coat(node, values) -> None:
-    """Leave the coat out where its weight is 0; give it a normal where it has none of its own."""
+    """Leave the coat out where its weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
     if _is_neutral("coat_weight", values["coat_weight"]):
         for name in [name for name in values if name.startswith("coat_")]:
             del values[name]
     elif live_link(node.inputs["Coat Normal"]) is None:
         del values["coat_normal"]
-        if COAT_FOLLOWS_NORMAL and "normal" in values:
-            values["coat_normal"] = values["normal"]
     if _is_neutral("transmission", values["transmission"]):
         del values["transmission"]
 
@@ -144,8 +141,10 @@ def _note_unsupported(node, warn) -> None:
     for name, (neutral, done) in NOT_SHADED.get(kind, {}).items():
         if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
             warn(f"{name} of {node.name!r} {done}")
-    if getattr(node, "fresnel_type", "") == "PHYSICAL_CONDUCTOR":
-        warn(f"Physical Conductor of {node.name!r} is shaded with the nearest curve of reflectance over angle")
+    if kind == PRINCIPLED:
+        ior = value_of(node.inputs["IOR"])
+        if not is_socket(ior) and ior < 1.0:
+            warn(f"IOR of {node.name!r} is below 1, its reflectance is taken for the mirror direction alone")
     distribution = getattr(node, "distribution", "GGX")
     if distribution not in ("GGX", "MULTI_GGX", "MICROFIBER", "ASHIKHMIN"):
         warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")

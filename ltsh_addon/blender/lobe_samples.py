@@ -243,7 +243,8 @@ def _glass_terms(slot: _Slot, tint: np.ndarray):
     ior = np.maximum(slot.value("ior"), 1e-5)
     f0 = np.clip(reflectance.f0_of_ior(ior)[:, None] * tint, 0.0, 1.0)
     inside = slot.value("backfacing") > 0.5
-    *terms, ior = reflectance.dielectric_terms(f0, np.where(inside, 1.0 / ior, ior))
+    ior = np.where(inside, 1.0 / ior, ior)
+    *terms, ior = reflectance.dielectric_terms(f0, ior, slot.cosine(slot.specular_normal))
     return np.stack(terms), ior
 
 
@@ -252,8 +253,9 @@ def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
     ior = np.full(len(slot.index), reflectance.CONDUCTOR_FIT_IOR)
-    if slot.of("conductor").any():
-        specular += _conductor_terms(slot)
+    for kind in ("conductor", "conductor_4_5"):
+        if slot.of(kind).any():
+            specular += np.where(slot.of(kind), _conductor_terms(slot, kind == "conductor"), 0.0)
     if slot.of("glass").any():
         terms, own_ior = _glass_terms(slot, np.ones_like(slot.color))
         specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
@@ -291,12 +293,11 @@ def _metal_terms(slot: _Slot) -> np.ndarray:
     return terms
 
 
-def _conductor_terms(slot: _Slot) -> np.ndarray:
+def _conductor_terms(slot: _Slot, exact: bool) -> np.ndarray:
     """Specular terms (4, Q, 3) of conductors, whose complex index is `color` + i `tint`."""
     extinction = np.maximum(slot.value("tint"), 0.0)
-    terms = np.stack(reflectance.conductor_fit(slot.color, extinction))
-    factor = slot.scattered(reflectance.conductor_average(slot.color, extinction))
-    return np.where(slot.of("conductor"), terms * factor, 0.0)
+    terms = np.stack(reflectance.conductor_fit(slot.color, extinction, exact))
+    return terms * slot.scattered(reflectance.conductor_average(slot.color, extinction, exact))
 
 
 def _dielectric_terms(slot: _Slot):
@@ -305,9 +306,10 @@ def _dielectric_terms(slot: _Slot):
     ior, f0 = reflectance.specular_level_applied(np.maximum(slot.value("ior"), 1e-5), slot.value("specular_level"))
     f0 = np.clip(f0[:, None] * np.maximum(slot.value("tint"), 0.0), 0.0, 1.0)
     factor = slot.scattered(reflectance.dielectric_blend_average(f0, ior))
-    albedo = reflectance.dielectric_albedo(f0, ior, slot.roughness, slot.cosine(slot.specular_normal))
+    cosine = slot.cosine(slot.specular_normal)
+    albedo = reflectance.dielectric_albedo(f0, ior, slot.roughness, cosine)
     scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
     albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
     left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
-    *terms, ior = reflectance.dielectric_terms(f0, ior)
+    *terms, ior = reflectance.dielectric_terms(f0, ior, cosine)
     return np.stack(terms) * factor, ior, left

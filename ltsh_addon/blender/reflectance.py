@@ -19,10 +19,9 @@ BLEND_NODES = 16
 # The largest reflectance at normal incidence that Cycles turns into an index of refraction.
 MAX_F0 = 0.99
 SMALLEST_COSINE = 1e-4
-# Cosines at which curves are fitted, and the index of the dielectric curve among those that fit a conductor.
+# Cosines at which conductors are fitted (fewer at grazing angles), and the index of the dielectric curve in the fit.
 FIT_COSINES = (np.arange(64) + 0.5) / 64.0
 CONDUCTOR_FIT_IOR = 1.5
-INTERNAL_IORS = np.linspace(0.2, 1.0, 81)
 
 
 def f0_of_ior(ior: np.ndarray) -> np.ndarray:
@@ -75,45 +74,55 @@ def multiple_scattering(average: np.ndarray, albedo: np.ndarray, average_albedo:
     return 1.0 + scattered * ((1.0 - albedo) / albedo)[:, None]
 
 
-def conductor_reflectance(cosine: np.ndarray, index: np.ndarray, extinction: np.ndarray) -> np.ndarray:
-    """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts."""
-    squares = index * index + extinction * extinction
-    double = 2.0 * index * cosine
-    parallel = (squares * cosine**2 - double + 1.0) / (squares * cosine**2 + double + 1.0)
-    perpendicular = (squares - double + cosine**2) / (squares + double + cosine**2)
-    return 0.5 * (parallel + perpendicular)
+def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exact: bool = True) -> np.ndarray:
+    """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts.
+
+    Cycles 5 has the exact formula (Born and Wolf, "Principles of optics", section 14.2), Cycles 4.5 its limit for
+    |index + i extinction| much larger than 1.
+    """
+    index, extinction = np.maximum(index, 1e-6), np.maximum(extinction, 0.0)
+    squares, cosine2 = index * index + extinction * extinction, cosine * cosine
+    if not exact:
+        double = 2.0 * index * cosine
+        parallel = (squares * cosine2 - double + 1.0) / (squares * cosine2 + double + 1.0)
+        return 0.5 * (parallel + (squares - double + cosine2) / (squares + double + cosine2))
+    sine2 = 1.0 - cosine2
+    difference = index * index - extinction * extinction - sine2
+    length = np.sqrt(difference * difference + 4.0 * np.square(index * extinction))
+    double = 2.0 * cosine * np.sqrt(np.maximum(0.5 * (length + difference), 0.0))
+    perpendicular = (length + cosine2 - double) / (length + cosine2 + double)
+    upper = cosine2 * length + sine2 * sine2
+    return 0.5 * perpendicular * (1.0 + (upper - double * sine2) / (upper + double * sine2))
 
 
-def conductor_fit(index: np.ndarray, extinction: np.ndarray):
+def conductor_fit(index: np.ndarray, extinction: np.ndarray, exact: bool):
     """(f0, f90, dip, dielectric), each (Q, 3): least squares for the reflectance of a conductor, with the dielectric
     curve of CONDUCTOR_FIT_IOR."""
-    values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction)
-    constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(CONDUCTOR_FIT_IOR), values)
+    values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction, exact)
+    constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)
     return constant, constant + schlick, -dip, dielectric
 
 
-def conductor_average(index: np.ndarray, extinction: np.ndarray) -> np.ndarray:
+def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) -> np.ndarray:
     """Mean reflectance (Q, 3) by which Cycles scales multiple scattering of conductors: of an F82 metal that agrees at
     the cosines 1 and 1 / 7."""
-    f0, low = (conductor_reflectance(cosine, index, extinction) for cosine in (1.0, 1.0 / 7.0))
+    f0, low = (conductor_reflectance(cosine, index, extinction, exact) for cosine in (1.0, 1.0 / 7.0))
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5
     return np.clip(metal_average(f0, (schlick - low) * 7.0 / (6.0 / 7.0) ** 6), 0.0, 1.0)
 
 
-def dielectric_terms(f0: np.ndarray, ior: np.ndarray):
+def dielectric_terms(f0: np.ndarray, ior: np.ndarray, cosine: np.ndarray):
     """(f0, f90, dip, dielectric) (Q, 3) and ior (Q,) >= 1 of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
 
     Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), f_d the value of F_d at normal incidence; that is linear in F_d.
-    Below an `ior` of 1, where total reflection puts a kink into F_d, a fit with the curve of 1 / `ior` stands in.
+    Below an `ior` of 1 total reflection makes F_d nearly a step, which no curve of the lobes follows: its value for the
+    mirror direction of a view under `cosine` (Q,) stands in for it.
     """
     plain = f0_of_ior(ior)[:, None]
     constant, factor = (f0 - plain) / (1.0 - plain), (1.0 - f0) / (1.0 - plain)
     inside = (ior < 1.0)[:, None]
-    fit = np.stack([np.interp(ior, INTERNAL_IORS, column) for column in _internal_fits().T])[:, :, None]
-    low = np.where(inside, factor * fit[0], 0.0) + constant
-    high = low + np.where(inside, factor * fit[1], 0.0)
-    dip = np.where(inside, -factor * fit[2], 0.0)
-    return low, high, dip, np.where(inside, factor * fit[3], factor), np.where(ior < 1.0, 1.0 / ior, ior)
+    constant = constant + np.where(inside, factor * _internal_reflectance(cosine, ior)[:, None], 0.0)
+    return constant, constant, np.zeros_like(constant), np.where(inside, 0.0, factor), np.maximum(ior, 1.0)
 
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -152,27 +161,23 @@ def _blend_table():
     return np.clip(share, 0.0, 1.0).reshape(*roughness.shape, BLEND_NODES)
 
 
-@cache
-def _internal_fits():
-    """Coefficients (I, 4) of 1, (1 - c)^5, c (1 - c)^6 and F_d(c, 1 / ior) for the indices INTERNAL_IORS below 1."""
-    return np.stack([_fit_matrix(1.0 / ior) @ _internal_reflectance(FIT_COSINES, ior) for ior in INTERNAL_IORS])
-
-
 def _internal_reflectance(cosine, ior):
-    """Reflectance of a dielectric of relative `ior` below 1, seen from inside."""
+    """Reflectance of a dielectric of relative `ior` below 1; 0 for others."""
     square = ior * ior - 1.0 + cosine * cosine
-    g = np.sqrt(np.maximum(square, 0.0))
+    refracts = (square > 0.0) & (ior < 1.0)
+    g = np.sqrt(np.where(refracts, square, 1.0))
     first = (g - cosine) / (g + cosine)
     second = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
-    return np.where(square > 0.0, 0.5 * first**2 * (1.0 + second**2), 1.0)
+    return np.where(ior < 1.0, np.where(refracts, 0.5 * first**2 * (1.0 + second**2), 1.0), 0.0)
 
 
 @cache
-def _fit_matrix(ior):
+def _fit_matrix():
     """Matrix (4, C): values at FIT_COSINES -> coefficients of the four curves that samples have."""
-    c = FIT_COSINES
-    curves = [np.ones_like(c), schlick_curve(c), schlick_curve(c) * c * (1.0 - c), dielectric_reflectance(c, ior)]
-    return np.linalg.pinv(np.stack(curves, axis=1), rcond=1e-4)
+    c, weight = FIT_COSINES, np.sqrt(FIT_COSINES)
+    curves = [np.ones_like(c), schlick_curve(c), schlick_curve(c) * c * (1.0 - c)]
+    curves.append(dielectric_reflectance(c, CONDUCTOR_FIT_IOR))
+    return np.linalg.pinv(np.stack(curves, axis=1) * weight[:, None], rcond=1e-6) * weight
 
 
 def _interpolate(table: np.ndarray, *coordinates: np.ndarray) -> np.ndarray:

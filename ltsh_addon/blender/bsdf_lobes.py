@@ -69,7 +69,12 @@ NOT_SHADED = {
     },
 }
 # Nodes whose lobe is multiplied by what multiple scattering adds.
-MULTIPLE_SCATTERING_NODES = (PRINCIPLED, "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic")
+MULTIPLE_SCATTERING_NODES = (
+    PRINCIPLED,
+    "ShaderNodeBsdfAnisotropic",
+    "ShaderNodeBsdfMetallic",
+    "ShaderNodeBsdfGlass",
+)
 
 
 def lobe_of(node, warn: Callable[[str], None]) -> dict:
@@ -144,7 +149,7 @@ def _note_unsupported(node, warn) -> None:
     if kind == PRINCIPLED:
         ior = value_of(node.inputs["IOR"])
         if not is_socket(ior) and ior < 1.0:
-            warn(f"IOR of {node.name!r} is below 1, its reflectance is taken for the mirror direction alone")
+            warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
     distribution = getattr(node, "distribution", "GGX")
     if distribution not in ("GGX", "MULTI_GGX", "MICROFIBER", "ASHIKHMIN"):
         warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")

@@ -228,24 +228,29 @@ def _coat_part(slot: _Slot):
 
 
 def _transmission_part(slot: _Slot, under: np.ndarray):
-    """What the transmission of a Principled BSDF reflects, None without; single scattering."""
+    """What the transmission of a Principled BSDF reflects, None without."""
     if not slot.has("transmission"):
         return None
     weight = slot.transmission * (1.0 - slot.metallic)
     at = np.nonzero(weight > SMALLEST_WEIGHT)[0]
-    specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0))
+    specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0), np.sqrt(np.minimum(slot.color, 1.0)))
     specular = (specular * (weight[:, None] * under))[:, at]
     return _Part(slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular)
 
 
-def _glass_terms(slot: _Slot, tint: np.ndarray):
-    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is."""
+def _glass_terms(slot: _Slot, tint: np.ndarray, through: np.ndarray):
+    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is; `tint` is
+    that of the reflectance at normal incidence, `through` that of the light that passes."""
     ior = np.maximum(slot.value("ior"), 1e-5)
     f0 = np.clip(reflectance.f0_of_ior(ior)[:, None] * tint, 0.0, 1.0)
-    inside = slot.value("backfacing") > 0.5
-    ior = np.where(inside, 1.0 / ior, ior)
-    *terms, ior = reflectance.dielectric_terms(f0, ior, slot.cosine(slot.specular_normal))
-    return np.stack(terms), ior
+    ior = np.where(slot.value("backfacing") > 0.5, 1.0 / ior, ior)
+    view = slot.roughness, slot.cosine(slot.specular_normal)
+    factor = np.ones_like(through)
+    if slot.has("multiple_scattering"):
+        scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
+        factor = np.where(scattered, reflectance.glass_scattering(through, ior, *view), 1.0)
+    *terms, ior = reflectance.dielectric_terms(f0, ior, view[1])
+    return np.stack(terms) * factor, ior
 
 
 def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
@@ -257,7 +262,7 @@ def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
         if slot.of(kind).any():
             specular += np.where(slot.of(kind), _conductor_terms(slot, kind == "conductor"), 0.0)
     if slot.of("glass").any():
-        terms, own_ior = _glass_terms(slot, np.ones_like(slot.color))
+        terms, own_ior = _glass_terms(slot, np.ones_like(slot.color), slot.color)
         specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
         ior = np.where(slot.of("glass")[:, 0], own_ior, ior)
     if slot.of("principled").any():

@@ -13,12 +13,9 @@ import numpy as np
 
 from .. import shading
 from ..shading.brdf import dielectric_reflectance, schlick_curve
+from .glass_albedos import MAX_F0, NODES, SMALLEST_COSINE, glass_albedos, internal_reflectance
 
 ALBEDO_NODES = 32
-BLEND_NODES = 16
-# The largest reflectance at normal incidence that Cycles turns into an index of refraction.
-MAX_F0 = 0.99
-SMALLEST_COSINE = 1e-4
 # Cosines at which conductors are fitted (fewer at grazing angles), and the index of the dielectric curve in the fit.
 FIT_COSINES = (np.arange(64) + 0.5) / 64.0
 CONDUCTOR_FIT_IOR = 1.5
@@ -120,9 +117,22 @@ def dielectric_terms(f0: np.ndarray, ior: np.ndarray, cosine: np.ndarray):
     """
     plain = f0_of_ior(ior)[:, None]
     constant, factor = (f0 - plain) / (1.0 - plain), (1.0 - f0) / (1.0 - plain)
-    inside = (ior < 1.0)[:, None]
-    constant = constant + np.where(inside, factor * _internal_reflectance(cosine, ior)[:, None], 0.0)
-    return constant, constant, np.zeros_like(constant), np.where(inside, 0.0, factor), np.maximum(ior, 1.0)
+    below = (ior < 1.0)[:, None]
+    if below.any():
+        constant = constant + factor * np.where(below, internal_reflectance(cosine, np.minimum(ior, 1.0))[:, None], 0.0)
+    return constant, constant, np.zeros_like(constant), np.where(below, 0.0, factor), np.maximum(ior, 1.0)
+
+
+def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Factor (Q, 3) that Multiscatter GGX puts on the reflection of glass of color `tint` (Q, 3)."""
+    factor = np.empty_like(tint)
+    for inside in (False, True):
+        at = np.nonzero((ior < 1.0) == inside)[0]
+        if len(at):
+            tables, coordinate = glass_albedos(inside), _ior_coordinate(ior[at])
+            albedo = _interpolate(tables.albedo, roughness[at], cosine[at], coordinate)
+            factor[at] = multiple_scattering(tint[at], albedo, _interpolate(tables.average, roughness[at], coordinate))
+    return factor
 
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -133,8 +143,7 @@ def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.n
 
 def dielectric_albedo(f0: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Albedo (Q, 3) divided by E of a dielectric whose reflectance runs from `f0` (Q, 3) to 1, as Cycles has it."""
-    parameter = np.sqrt(np.abs((ior - 1.0) / (ior + 1.0)))
-    share = _interpolate(_blend_table(), roughness, cosine, parameter)[:, None]
+    share = _interpolate(_blend_table(), roughness, cosine, _ior_coordinate(ior))[:, None]
     return f0 + (1.0 - f0) * share
 
 
@@ -151,24 +160,18 @@ def _albedo_tables():
 def _blend_table():
     """Where between f0 and 1 the albedo of a dielectric lies: roughness, cosine, ((ior - 1) / (ior + 1))^(1/2)."""
     table = shading.load_table("ltsh4")
-    nodes = np.clip(np.linspace(0.0, 1.0, BLEND_NODES), SMALLEST_COSINE, 1.0)
+    nodes = np.clip(np.linspace(0.0, 1.0, NODES), SMALLEST_COSINE, 1.0)
     roughness, cosine = np.meshgrid(nodes, nodes, indexing="ij")
     curves = table.lookup(cosine.ravel(), roughness.ravel()).albedo()
     f0 = np.minimum(nodes**4, MAX_F0)
     ior = np.clip((1.0 + np.sqrt(f0)) / (1.0 - np.sqrt(f0)), table.fresnel_ior[0], table.fresnel_ior[-1])
     f0 = f0_of_ior(ior)
     share = (np.einsum("fz,fq->qz", table.dielectric_weights(ior), curves / curves[0]) - f0) / (1.0 - f0)
-    return np.clip(share, 0.0, 1.0).reshape(*roughness.shape, BLEND_NODES)
+    return np.clip(share, 0.0, 1.0).reshape(*roughness.shape, NODES)
 
 
-def _internal_reflectance(cosine, ior):
-    """Reflectance of a dielectric of relative `ior` below 1; 0 for others."""
-    square = ior * ior - 1.0 + cosine * cosine
-    refracts = (square > 0.0) & (ior < 1.0)
-    g = np.sqrt(np.where(refracts, square, 1.0))
-    first = (g - cosine) / (g + cosine)
-    second = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
-    return np.where(ior < 1.0, np.where(refracts, 0.5 * first**2 * (1.0 + second**2), 1.0), 0.0)
+def _ior_coordinate(ior):
+    return np.sqrt(np.abs((ior - 1.0) / (ior + 1.0)))
 
 
 @cache

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..scene import Film, SurfaceSamples
 from .aovs import HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
-from .lobe_samples import Hits, samples_of_lobes
+from .lobe_samples import samples_of_lobes
+from .lobe_slots import Hits
 from .shading_normals import bump_alpha2, unit, valid_specular_normal
 
 __all__ = [

@@ -6,36 +6,17 @@ reflection of its transmission. The weights are those of Cycles' closures (4.5.1
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..scene import SurfaceSamples
 from . import reflectance
-from .aovs import LOBE_AOVS, LOBE_KINDS
-from .shading_normals import bump_alpha2, unit, valid_specular_normal
+from .aovs import LOBE_KINDS
+from .lobe_slots import SMALLEST_WEIGHT, Hits, LobeSlot
+from .shading_normals import bump_alpha2
 
-# Below this weight Cycles drops a closure.
-SMALLEST_WEIGHT = 1e-5
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
-
-
-@dataclass(frozen=True)
-class Hits:
-    """What each of P hits has once."""
-
-    position: np.ndarray  # (P, 3)
-    view: np.ndarray  # (P, 3)
-    smooth_normal: np.ndarray  # (P, 3)
-    true_normal: np.ndarray  # (P, 3)
-    corrected: np.ndarray  # (P,) bool: specular normals are bent
-    receiver: np.ndarray  # (P,) integers
-    diffuse_albedo: np.ndarray  # (P, 3) of all lobes together
-
-    def take(self, index) -> Hits:
-        """The hits at `index`."""
-        return Hits(**{item.name: getattr(self, item.name)[index] for item in fields(self)})
 
 
 @dataclass
@@ -121,85 +102,13 @@ def _parts_of_slot(hits: Hits, lobe: dict[str, np.ndarray]) -> list[_Part]:
     index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
     if len(index) == 0:
         return []
-    slot = _Slot(hits, lobe, index, weight[index])
+    slot = LobeSlot(hits, lobe, index, weight[index])
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
     return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
 
 
-class _Slot:
-    """The hits (Q,) that have a lobe in one slot, and its quantities there."""
-
-    def __init__(self, hits: Hits, lobe, index, weight):
-        self.lobe, self.index, self.weight = lobe, index, weight
-        self.hits = hits.take(index)
-        self.kind = np.rint(lobe["kind"][index]).astype(int)
-        self.normal = self._normal("normal")
-        self.specular_normal = self._bent(self.normal)
-        self.roughness = np.clip(self.value("roughness", 1.0), 0.0, 1.0)
-
-    def value(self, name: str, default=None) -> np.ndarray:
-        """The quantity `name`, or what changes nothing, or `default` where there is no such value."""
-        if name in self.lobe:
-            return self.lobe[name][self.index]
-        kind, neutral = LOBE_AOVS[name]
-        neutral = default if neutral is None else neutral
-        return np.broadcast_to(np.float64(neutral), (len(self.index), 3) if kind == "COLOR" else (len(self.index),))
-
-    def has(self, name: str) -> bool:
-        """True where some sample has more than a vanishing `name`."""
-        return name in self.lobe and bool((self.value(name) > SMALLEST_WEIGHT).any())
-
-    def of(self, kind: str) -> np.ndarray:
-        """Mask (Q, 1) of a kind of lobe."""
-        return (self.kind == LOBE_KINDS[kind])[:, None]
-
-    def _normal(self, name):
-        normal = unit(self.value(name))
-        return np.where(np.any(normal != 0.0, axis=-1, keepdims=True), normal, self.hits.smooth_normal)
-
-    def _bent(self, normal):
-        bent = valid_specular_normal(normal, self.hits.true_normal, self.hits.view)
-        return np.where(self.hits.corrected[:, None], bent, normal)
-
-    def coat_normal(self) -> np.ndarray:
-        """Shading normal (Q, 3) of the coat."""
-        return self._bent(self._normal("coat_normal"))
-
-    def cosine(self, normal) -> np.ndarray:
-        """Cosine (Q,) of the view."""
-        return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
-
-    @cached_property
-    def color(self) -> np.ndarray:
-        """(Q, 3), never negative."""
-        return np.maximum(self.value("color", 0.0), 0.0)
-
-    @cached_property
-    def metallic(self) -> np.ndarray:
-        """Share (Q,) of the metal."""
-        clipped = np.clip(self.value("metallic"), 0.0, 1.0)
-        return np.where(self.of("metal")[:, 0], 1.0, np.where(self.of("principled")[:, 0], clipped, 0.0))
-
-    @cached_property
-    def transmission(self) -> np.ndarray:
-        """Share (Q,) of the transmission in what is no metal."""
-        return np.where(self.of("principled")[:, 0], np.clip(self.value("transmission"), 0.0, 1.0), 0.0)
-
-    @cached_property
-    def albedos(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directional and average albedo (Q,) of the lobe without Fresnel."""
-        return reflectance.albedos(self.roughness, self.cosine(self.specular_normal))
-
-    def scattered(self, mean: np.ndarray) -> np.ndarray:
-        """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 where there is none."""
-        if not self.has("multiple_scattering"):
-            return np.ones_like(mean)
-        factor = reflectance.multiple_scattering(mean, *self.albedos)
-        return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
-
-
-def _coat_part(slot: _Slot):
+def _coat_part(slot: LobeSlot):
     """The coat (None without), and the share (Q, 3) of the lobe's weight that is left under it."""
     under = np.repeat(slot.weight[:, None], 3, axis=1)
     if not slot.has("coat_weight"):
@@ -227,7 +136,7 @@ def _coat_part(slot: _Slot):
     return part, under
 
 
-def _transmission_part(slot: _Slot, under: np.ndarray):
+def _transmission_part(slot: LobeSlot, under: np.ndarray):
     """What the transmission of a Principled BSDF reflects, None without."""
     if not slot.has("transmission"):
         return None
@@ -238,7 +147,7 @@ def _transmission_part(slot: _Slot, under: np.ndarray):
     return _Part(slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular)
 
 
-def _glass_terms(slot: _Slot, tint: np.ndarray, through: np.ndarray):
+def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
     """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is; `tint` is
     that of the reflectance at normal incidence, `through` that of the light that passes."""
     ior = np.maximum(slot.value("ior"), 1e-5)
@@ -253,7 +162,7 @@ def _glass_terms(slot: _Slot, tint: np.ndarray, through: np.ndarray):
     return np.stack(terms) * factor, ior
 
 
-def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
+def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
     """Everything but coat and transmission."""
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
@@ -285,7 +194,7 @@ def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
     )
 
 
-def _metal_terms(slot: _Slot) -> np.ndarray:
+def _metal_terms(slot: LobeSlot) -> np.ndarray:
     """Specular terms (4, Q, 3) of F82 metals and of Glossy BSDF, which reflects its color at all angles."""
     terms = np.zeros((4, len(slot.index), 3))
     if slot.metallic.any():
@@ -298,14 +207,14 @@ def _metal_terms(slot: _Slot) -> np.ndarray:
     return terms
 
 
-def _conductor_terms(slot: _Slot, exact: bool) -> np.ndarray:
+def _conductor_terms(slot: LobeSlot, exact: bool) -> np.ndarray:
     """Specular terms (4, Q, 3) of conductors, whose complex index is `color` + i `tint`."""
     extinction = np.maximum(slot.value("tint"), 0.0)
     terms = np.stack(reflectance.conductor_fit(slot.color, extinction, exact))
     return terms * slot.scattered(reflectance.conductor_average(slot.color, extinction, exact))
 
 
-def _dielectric_terms(slot: _Slot):
+def _dielectric_terms(slot: LobeSlot):
     """Specular terms (4, Q, 3) of the dielectric part of Principled BSDF, its index (Q,), and the share (Q, 1) of the
     light that is left for the diffuse part."""
     ior, f0 = reflectance.specular_level_applied(np.maximum(slot.value("ior"), 1e-5), slot.value("specular_level"))

@@ -48,7 +48,7 @@ def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
 
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
     """Integral of 2 c F(c) of a dielectric, by the fit of Kulla and Conty 2017 ("Revisiting physically based shading at
-    Imageworks"), which Cycles uses; good to 1e-3 for an `ior` above 1."""
+    Imageworks"), which Cycles uses; good to 0.006 for an `ior` of 1 to 3."""
     below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607))
     return np.where(ior < 1.0, below, (ior - 1.0) / (4.08567 + 1.00071 * ior))
 

@@ -65,10 +65,13 @@ class MaterialReport:
     """Warnings about materials; the multiple-scattering ones are gathered into one line."""
 
     warnings: list[str] = field(default_factory=list)
+    emitters: frozenset[str] = frozenset()  # names of materials of whose emission nothing is said
     multiple_scattering: list[str] = field(default_factory=list)
 
     def warn(self, material_name: str, message: str) -> None:
         """Note `message` about a material once."""
+        if material_name in self.emitters and message.startswith("emission"):
+            return
         line = f"material {material_name!r}: {message}"
         if line not in self.warnings:
             self.warnings.append(line)
@@ -130,6 +133,7 @@ def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str
 
     Materials light nothing, but for those with a full name in `emitters`, of whose emission nothing is said either.
     """
+    report.emitters = frozenset(material.name for material in materials if material.name_full in emitters)
     for material in materials:
         ensure_nodes(material)
         if material.name_full not in emitters:
@@ -229,7 +233,8 @@ def _add_aovs(tree, node, lobe: str, sockets: dict, material) -> None:
     _aov(tree, "hit", 1.0)
     _aov(tree, "lobe", LOBES[lobe])
     receiver = tree.nodes.new("ShaderNodeAttribute")
-    receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
+    # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
+    receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
     _aov(tree, "receiver", receiver.outputs["Fac"])
     _aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
     _aov(tree, "position", geometry.outputs["Position"])

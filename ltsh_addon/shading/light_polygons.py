@@ -13,12 +13,13 @@ MOSTLY_WHOLE = 0.6
 def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
     """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
 
-    corners (V, 3) in the world; offset (3, P) from the points to the light's center.
+    corners (V, 3) in the world; offset (3, P) from the points to the light's center, which for "POLYGON" may lie
+    anywhere near.
     """
     coordinates, _, points = rows.shape
     center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
     result = scratch("corners", (coordinates, len(corners), points))
-    if light.is_round:
+    if light.is_round or light.shape == "POLYGON":
         for number, corner in enumerate((corners - light.center).astype(np.float32)):
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
             np.add(center, out, out=result[:, number])

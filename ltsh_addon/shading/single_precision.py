@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from . import double_precision, edge_loop, ridge_table
+from . import double_precision, edge_loop, light_cone, ridge_table
 from .light_polygons import integrate_visible, local_corners
 
 # Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
@@ -19,6 +19,8 @@ from .light_polygons import integrate_visible, local_corners
 CHUNK = 24592
 CORNERS = 4 * CHUNK
 DOUBLE_CHUNK = 4096
+# The light of narrower cones, in rad, is too bright for the absolute error of single precision.
+NARROW_SPREAD = 0.35
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
 
@@ -94,14 +96,13 @@ def _add_double(samples, members, lights, radiance, shade):
 def _add_fragile(samples, lights, fragile, radiance, shade):
     """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all lights with equally
     many corners in one batch, for there are few such samples."""
-    for count in sorted({len(corners) for _, _, corners in lights}):
-        chosen = [
-            (item, np.concatenate(parts))
-            for item, parts in zip(lights, fragile, strict=True)
-            if parts and len(item[2]) == count
-        ]
-        if not chosen:
-            continue
+    found = [(item, np.concatenate(parts)) for item, parts in zip(lights, fragile, strict=True) if parts]
+    for item, index in found:
+        if item[0].is_focused:
+            _add_double(samples, index, [item], radiance, shade)
+    found = [(item, index) for item, index in found if not item[0].is_focused]
+    for count in sorted({len(item[2]) for item, _ in found}):
+        chosen = [(item, index) for item, index in found if len(item[2]) == count]
         members = np.concatenate([index for _, index in chosen])
         number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
         group = np.array([item[1] for item, _ in chosen])[number]
@@ -129,14 +130,22 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
     position = np.ascontiguousarray(samples.position[index].T)
     sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
     for number, (light, group, corners) in enumerate(lights):
+        allowed = light.receives(samples.receiver, index)
+        if light.spread < NARROW_SPREAD:
+            fragile[number].append(index if allowed is None else index[allowed])
+            continue
         step = max(CORNERS // len(corners), 512)
         for start in range(0, len(index), step):
             part = slice(start, start + step)
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
-            axes = rows[:, :, part]
-            polygons = local_corners(light, corners, offset, axes, scratch)
             facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
-            of_part = partial(integrate, part)
+            if allowed is not None:
+                facing &= allowed[part]
+            axes, of_part = rows[:, :, part], partial(integrate, part)
+            if light.is_focused:
+                of_part = _Focused(light, offset, axes, of_part, len(colors))
+                axes = of_part.rows
+            polygons = local_corners(light, corners, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
             if redo.any():
                 found[:, redo] = 0.0
@@ -163,14 +172,51 @@ def _selected(values, part, index):
     return values if index is None else np.take(values, index, axis=-1)
 
 
+class _Focused:
+    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
+
+    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
+    """
+
+    def __init__(self, light, offset, axes, integrate, count):
+        self.light, self.integrate, self.count = light, integrate, count
+        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
+        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
+        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
+
+    def __call__(self, corners, index):
+        index = np.arange(corners.shape[2]) if index is None else index
+        values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
+        chords = light_cone.chord_count(corners.shape[1])
+        step = max(CORNERS // (corners.shape[1] * (2 * chords + 2)), 512)
+        for start in range(0, len(index), step):
+            part = slice(start, start + step)
+            flat, view = corners[-2:, :, part], self.view.take(index[part])
+            for number, (near, weights, polygons) in enumerate(
+                light_cone.layers(view, flat, self.light.spread, chords)
+            ):
+                # The small disks count little, so that the rounding of their edges is lost in the sum.
+                smallest = 0.0 if number < light_cone.LAYERS - 1 else edge_loop.SMALLEST_SAFE
+                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
+                values[:, start + near] += weights * found
+                fragile[start + near] |= redo
+        return values, fragile
+
+
+def _along_rows(axes, vector):
+    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
+    x, y, z = vector.astype(np.float32)
+    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]
+
+
 class _Cosine:
     """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch
 
-    def __call__(self, part, corners, index):
-        integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
+        integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
         integral *= np.float32(-1.0 / np.pi)
         return np.maximum(integral, np.float32(0.0))[None], fragile
 
@@ -182,9 +228,9 @@ class _ShadowedCosine:
         self.smooth = np.stack([_dot(row, rows[3]) for row in rows[:3]])
         self.bump_alpha2, self.scratch = bump_alpha2, scratch
 
-    def __call__(self, part, corners, index):
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
         smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch)
+        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch, smallest)
         direction = np.negative(integrals, out=integrals)
         along = np.maximum(_dot(direction, smooth), np.float32(1e-15))
         tangent2 = np.maximum(_dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
@@ -199,14 +245,14 @@ class _LobeIntegral:
     def __init__(self, ridges, weights, scratch):
         self.ridges, self.weights, self.scratch = ridges, weights, scratch
 
-    def __call__(self, part, corners, index):
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
         weights = _selected(self.weights, part, index)
         if self.ridges.source.family == "ltc":
-            integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+            integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
             values = weights[:, 0] * integral
             values *= np.float32(-1.0 / np.pi)
         else:
-            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch)
+            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch, smallest)
             products = np.multiply(weights, moments, out=self.scratch("weighted", weights.shape))
             values = np.add.reduce(products, axis=1)
             np.negative(values, out=values)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
-from . import double_precision, single_precision
+from . import double_precision, light_cone, single_precision
 from .lookup_table import LookupTable
 
 ROUND_LIGHT_CORNERS = 32
@@ -44,7 +44,7 @@ class Task:
     def seconds(self, count: int) -> float:
         """About how long `count` samples take one process."""
         per_light, per_corner = _REFERENCE_COST if self.is_reference else _SINGLE_COST if self.single else _DOUBLE_COST
-        corners = sum(ROUND_LIGHT_CORNERS if light.is_round else 4 for light in self.lights)
+        corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
@@ -70,3 +70,11 @@ class Task:
                 estimates = None if error is None else error[chunk]
                 double_precision.shade_specular(part, prepared, self.table, views["specular"], estimates)
         return radiance, error
+
+
+def _corners_integrated(light, is_reference):
+    """About how many corners the integrals over a light have."""
+    count = len(light.polygon(ROUND_LIGHT_CORNERS))
+    if light.is_focused:
+        count *= (2 * light_cone.chord_count(count) + 1) * (1 if is_reference else light_cone.LAYERS)
+    return count

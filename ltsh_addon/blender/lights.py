@@ -16,9 +16,10 @@ import numpy as np
 from ..scene import AREA_LIGHT_SHAPES, AreaLight
 from .emission_look import open_studio
 from .emission_nodes import Emission, emission_behind
+from .inventory import EmitterTraits, RenderedSurface, surface_instancer
 from .light_linking import Receivers
 from .light_textures import UnseenLight, look_at_area_lights
-from .mesh_light_faces import mesh_area_lights
+from .mesh_light_faces import SIDE_PROPERTY, mark_transparent, mesh_area_lights
 from .mesh_lights import MeshLight, collect_mesh_lights
 
 # Two axes further from a right angle than this (cosine) are called sheared.
@@ -39,6 +40,7 @@ class LightInventory:
     unseen: dict[int, UnseenLight] = field(default_factory=dict)  # by position in `lights`
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
+    instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -73,10 +75,11 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
             continue
-        light = _area_light(ob, matrix, receivers)
+        light = _area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
             placed.append((ob.original.name_full, light, _unseen(ob, matrix, inventory)))
             _note_unsupported(ob, matrix, inventory)
+            _note_instancer(instance, inventory)
     # One unusable instance takes all instances of the object along: the reference can only drop the object.
     for name, light, unseen in placed:
         if name not in inventory.left_out:
@@ -84,11 +87,27 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
                 inventory.unseen[len(inventory.lights)] = unseen
             inventory.lights.append(light)
     inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, inventory.warn)
+    for mesh in inventory.meshes:
+        inventory.instancers.update(mesh.instancers)
     return inventory
 
 
+def _note_instancer(instance, inventory: LightInventory) -> None:
+    instancer = surface_instancer(instance)
+    if instancer is not None:
+        inventory.instancers[instancer.original.name_full] = instancer
+
+
 def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
-    """The lights of `inventory` with what node trees and materials make of them, which Cycles is asked for."""
+    """The lights of `inventory` with what node trees and materials make of them, which Cycles is asked for.
+
+    Objects that must let light through in the reference get the custom property SIDE_PROPERTY, as do their materials.
+    """
+    for block in (*bpy.data.objects, *bpy.data.materials):
+        if SIDE_PROPERTY in block:
+            del block[SIDE_PROPERTY]
+    for instancer in inventory.instancers.values():
+        mark_transparent(instancer.original, 0, [slot.material for slot in instancer.material_slots])
     if not inventory.unseen and not inventory.meshes:
         return inventory.lights
     eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
@@ -120,7 +139,7 @@ def _sizes(light) -> tuple[float, float]:
     return light.size, light.size if light.shape in ("SQUARE", "DISK") else light.size_y
 
 
-def _area_light(ob, matrix: np.ndarray, receivers: Receivers) -> AreaLight:
+def _area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
     light = ob.data
     size_u, size_v = _sizes(light)
     half_u, half_v = 0.5 * size_u * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
@@ -132,9 +151,9 @@ def _area_light(ob, matrix: np.ndarray, receivers: Receivers) -> AreaLight:
         half_v=half_v,
         direction=-matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]),
         radiance=_radiance(light, half_u, half_v),
-        group=ob.original.lightgroup,
-        affects_diffuse=ob.visible_diffuse,
-        affects_specular=ob.visible_glossy,
+        group=traits.group,
+        affects_diffuse=traits.diffuse,
+        affects_specular=traits.glossy,
         spread=min(light.spread, math.pi),
         receivers=receivers.of(ob.original),
     )

@@ -18,7 +18,8 @@ from .mesh_lights import MeshLight, Placement
 from .patches import ERROR, GRID, cut_into_patches, split_light
 from .planar_polygons import FlatPolygon
 
-# Custom property of objects that shine: 1 where only the front of their faces does, -1 the back, 0 both.
+# Custom property of objects that let light through in the reference: those that shine, and instancers of such. It is
+# 1 where only the front of their faces shines, -1 the back, 0 both.
 SIDE_PROPERTY = "ltsh_emitting_side"
 MOST_POLYGONS = 2000
 # Polygons of one object with a texture that are looked at one by one; beyond, the largest stand for all.
@@ -51,9 +52,17 @@ def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, wa
         own = _constant_lights(mesh_light, parts, radiance, side)
         own += _textured_lights(mesh_light, parts, side, studio, warn)
         if own:
-            mesh_light.ob[SIDE_PROPERTY] = side
+            mark_transparent(mesh_light.ob, side, mesh_light.materials)
             lights.extend(own)
     return lights
+
+
+def mark_transparent(ob, side: int, materials: list) -> None:
+    """Give the original `ob` SIDE_PROPERTY `side`, and its `materials` one that only tells them apart from others."""
+    ob[SIDE_PROPERTY] = side
+    for material in materials:
+        if material is not None:
+            material[SIDE_PROPERTY] = 0
 
 
 def _note_directions(mesh_light: MeshLight, warn) -> None:

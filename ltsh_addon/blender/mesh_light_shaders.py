@@ -17,7 +17,7 @@ MOST_TRANSPARENT_FACES = 1024
 
 def let_light_through(scene) -> None:
     """Make the faces of all objects with SIDE_PROPERTY transparent to all but camera rays, and emit from their side."""
-    materials = {}
+    materials = {material.name_full: material for material in bpy.data.materials if SIDE_PROPERTY in material}
     for ob in bpy.data.objects:
         if SIDE_PROPERTY in ob:
             found = [slot.material for slot in ob.material_slots]

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..scene import AreaLight
 from .emission_nodes import Emission, emission_behind
-from .inventory import SURFACE_TYPES
+from .inventory import SURFACE_TYPES, EmitterTraits, RenderedSurface, surface_instancer
 from .light_linking import Receivers
 from .shader_graph import material_output
 
@@ -35,6 +35,7 @@ class MeshLight:
     materials: list  # original material or None per slot
     emission: list[Emission]  # per slot
     placements: list[Placement] = field(default_factory=list)
+    instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
 
     @property
     def varies(self) -> bool:
@@ -49,15 +50,16 @@ class MeshLight:
 
 def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list[MeshLight]:
     """Objects that a render of `depsgraph` sees with materials that may emit; `override` replaces all materials."""
-    found: dict[str, MeshLight | None] = {}
+    found: dict[tuple, MeshLight | None] = {}
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type not in SURFACE_TYPES or not instance.show_self:
             continue
-        key = ob.original.name_full + "\n" + (ob.data.name_full if ob.data else "")
+        traits = EmitterTraits.of(instance)
+        key = (ob.original.name_full, ob.data.name_full if ob.data else "", traits)
         if key not in found:
-            found[key] = _mesh_light(ob, override, receivers, known)
+            found[key] = _mesh_light(ob, traits, override, receivers, known)
             if found[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
                 warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
                 found[key] = None
@@ -65,14 +67,17 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
             placement = _placement(ob, np.array(instance.matrix_world, dtype=np.float64), found[key], depsgraph)
             if placement is not None:
                 found[key].placements.append(placement)
+                instancer = surface_instancer(instance)
+                if instancer is not None:
+                    found[key].instancers[instancer.original.name_full] = instancer
     return [light for light in found.values() if light is not None and light.placements]
 
 
-def _mesh_light(ob, override, receivers: Receivers, known: dict) -> MeshLight | None:
+def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
     slots = [override] * max(1, len(ob.material_slots)) if override else [slot.material for slot in ob.material_slots]
     materials = [None if material is None else material.original for material in slots]
     emission = [_emission_of(material, known) for material in materials]
-    if not any(part.emits for part in emission) or not (ob.visible_diffuse or ob.visible_glossy):
+    if not any(part.emits for part in emission) or not (traits.diffuse or traits.glossy):
         return None
     nothing = np.zeros(3)
     light = AreaLight(
@@ -83,9 +88,9 @@ def _mesh_light(ob, override, receivers: Receivers, known: dict) -> MeshLight | 
         half_v=nothing,
         direction=nothing,
         radiance=nothing,
-        group=ob.original.lightgroup,
-        affects_diffuse=ob.visible_diffuse,
-        affects_specular=ob.visible_glossy,
+        group=traits.group,
+        affects_diffuse=traits.diffuse,
+        affects_specular=traits.glossy,
         receivers=receivers.of(ob.original),
     )
     return MeshLight(ob.original, light, materials, emission)

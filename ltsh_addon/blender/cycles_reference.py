@@ -12,6 +12,8 @@ from pathlib import Path
 import bpy
 
 from .inventory import SURFACE_TYPES
+from .mesh_light_faces import SIDE_PROPERTY
+from .mesh_light_shaders import let_light_through
 from .render_settings import enable_passes, pin_pixel_filter, render_exr, shifted_pixels, sub_pixel_offsets
 
 SEEDS = {"A": 1, "B": 7919}
@@ -20,11 +22,18 @@ CHUNK_SECONDS = 4.0
 MAX_CHUNKS = 8
 
 
-def remove_occlusion() -> None:
-    """Make every surface, instances included, invisible to all rays but the camera's."""
+def remove_occlusion(scene) -> None:
+    """Make every surface, instances included, invisible to all rays but the camera's.
+
+    Objects that shine must stay visible to the rays that they light: these go through them instead.
+    """
     for ob in bpy.data.objects:
-        if ob.type in SURFACE_TYPES:
-            ob.visible_shadow = ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = False
+        if ob.type not in SURFACE_TYPES:
+            continue
+        ob.visible_shadow = ob.visible_transmission = False
+        if SIDE_PROPERTY not in ob:
+            ob.visible_diffuse = ob.visible_glossy = False
+    let_light_through(scene)
 
 
 def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
@@ -34,7 +43,7 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
     progress only about once a minute.
     """
-    remove_occlusion()
+    remove_occlusion(scene)
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
     pin_pixel_filter(scene)
     samples = max(1, cycles_samples // 2)

@@ -6,12 +6,13 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from . import render_settings
 from .child import SceneError
 from .cycles_reference import render_reference
 from .inventory import rendered_surfaces, with_render_depsgraph
-from .lights import LightInventory, collect_lights
+from .lights import LightInventory, collect_lights, seen_lights
 from .materials import (
     MaterialReport,
     give_default_material,
@@ -45,17 +46,19 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
         bare = [] if override else objects_without_material(surfaces)
-        return collect_lights(depsgraph), materials_in_use(surfaces, override), bare
+        return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    default = give_default_material(bare)
+    report = MaterialReport()
+    inject_aovs(materials + ([default] if default else []), report, inventory.emitting_materials)
+    inventory.receivers.mark()
+    inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
     if not inventory.lights:
         raise SceneError(
             f"scene {scene.name!r}: no area light that renders, found {_describe_lights(scene)}; add an area light"
         )
-    default = give_default_material(bare)
-    report = MaterialReport()
-    inject_aovs(materials + ([default] if default else []), report)
     warnings.extend(report.lines())
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     return inventory
@@ -104,7 +107,5 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
 
 def _light_record(light) -> dict:
-    record = dict(vars(light))
-    for name in ("center", "half_u", "half_v", "direction", "radiance"):
-        record[name] = record[name].tolist()
-    return record
+    """`light` as JSON has it; AreaLight(**record) reads it back."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}

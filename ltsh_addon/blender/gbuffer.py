@@ -127,6 +127,16 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
     return _samples_of(values), pixel[usable], int(np.count_nonzero(~usable))
 
 
+def without_holdouts(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """`channels` of a render with an opaque background, without the hits on holdouts: they alone have alpha 0.
+
+    Cycles evaluates their shaders, AOVs included, and then shows a hole.
+    """
+    hit = f"{AOV_PREFIX}hit.X"
+    kept = read_layer(channels, "Combined", "A") > 0.0
+    return {name: plane * kept if name.endswith(hit) else plane for name, plane in channels.items()}
+
+
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
     """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV."""
     depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")

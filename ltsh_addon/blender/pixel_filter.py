@@ -24,7 +24,7 @@ def filter_density(kind: str, width: float, distance: np.ndarray) -> tuple[np.nd
     `kind` and `width` (pixels) are `pixel_filter_type` and `filter_width` of the scene; filters are separable. BOX is
     one pixel whatever the width. GAUSSIAN is exp(-8 (x / width)^2), cut at 1.5 widths. BLACKMAN_HARRIS is the window of
     Harris 1978 ("On the use of windows for harmonic analysis with the discrete Fourier transform"), four terms,
-    `width` from end to end.
+    two widths from end to end. Measured on an edge: Cycles 4.5.15 and 5.2.3 agree to 1e-3 of its height.
     """
     distance = np.asarray(distance, dtype=np.float64)
     if kind == "BOX":
@@ -32,9 +32,9 @@ def filter_density(kind: str, width: float, distance: np.ndarray) -> tuple[np.nd
     elif kind == "GAUSSIAN":
         weight, half = np.exp(-8.0 * (distance / width) ** 2), 1.5 * width
     elif kind == "BLACKMAN_HARRIS":
-        phase = 2.0 * np.pi * (distance / width + 0.5)
+        phase = np.pi * (distance / width + 1.0)
         terms = (0.35875, -0.48829, 0.14128, -0.01168)
-        weight, half = sum(term * np.cos(order * phase) for order, term in enumerate(terms)), 0.5 * width
+        weight, half = sum(term * np.cos(order * phase) for order, term in enumerate(terms)), width
     else:
         raise ValueError(f"pixel filter is {kind!r}, expected BOX, GAUSSIAN or BLACKMAN_HARRIS")
     return np.where(np.abs(distance) <= half, weight, 0.0), half

@@ -55,8 +55,9 @@ def write_layers(
     """Write `layers` as one single-part float32 scanline EXR with ZIP compression and channels ``<layer>.<letter>``.
 
     Plain arrays of 1, 3 or 4 channels become V, RGB or RGBA. float32 values are kept bit for bit, NaN and Inf
-    included. `metadata` becomes string attributes of the header, `chromaticities` (xy of red, green, blue and
-    white) the attribute that tells readers the color space. The file appears complete or not at all. Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
+    included. `metadata` becomes string attributes of the header, `chromaticities` (xy of red, green, blue and white)
+    the one that tells readers the color space. The file appears complete or not at all.
+    Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
     """
     write_channels(path, _planes(layers), metadata, chromaticities)
 

@@ -53,6 +53,7 @@ def rendered_surfaces(depsgraph) -> list:
     found = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type in SURFACE_TYPES and instance.show_self:
+        # Hair grows on emitters that are not shown themselves, and has their materials.
+        if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
             found.setdefault((ob.original.name_full, ob.data.name_full if ob.data else ""), ob)
     return list(found.values())

@@ -45,7 +45,6 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
             warnings.append(f"{label} is switched off, in the Cycles reference as well")
             setattr(owner, name, False)
     warnings.extend(_steps_after_rendering(scene))
-    warnings.extend(_flat_hair(scene))
     _leave_out_world(scene, view_layer, warnings)
     scene.camera = camera
     hold_still(scene, camera)
@@ -84,22 +83,6 @@ def _steps_after_rendering(scene) -> list[str]:
     if render.use_sequencer and editor is not None and len(editor.strips):
         found.append("the video sequencer")
     return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in found]
-
-
-def _flat_hair(scene) -> list[str]:
-    """Warnings about hair as ribbons that pretend to be round: what their normals do to highlights is not followed."""
-    if scene.cycles_curves.shape != "RIBBONS":
-        return []
-    return [
-        f"object {ob.name!r}: highlights on hair shown as ribbons are about 10 % too bright; "
-        "with the curve shape '3D Curves' hair is shaded like any surface"
-        for ob in scene.objects
-        if not ob.hide_render and (ob.type == "CURVES" or any(_is_hair(system) for system in ob.particle_systems))
-    ]
-
-
-def _is_hair(system) -> bool:
-    return system.settings.type == "HAIR" and system.settings.render_type == "PATH"
 
 
 def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:

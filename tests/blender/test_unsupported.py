@@ -112,7 +112,6 @@ EXPECTED = [
     *(("material", f"'{name}'") for name in EXTRAS),
     ("world", "'Sky'"),
     ("volume", "'Smoke'"),
-    ("hair", "'Fur'"),
     ("'Catcher'", "shadow catcher"),
     ("image", "'Lost picture'", "missing"),
     ("library", "props.blend", "missing"),

@@ -224,3 +224,46 @@ class Film:
     def coverage(self) -> np.ndarray:
         """Share (H, W) of each pixel's sub-samples that hit a surface."""
         return self.image(np.ones(self.pixel.shape[0]) if self.first is None else self.first)
+
+
+@dataclass(frozen=True)
+class Border:
+    """The rectangle of the whole picture that was rendered, in pixels from its top left corner.
+
+    `cropped` pictures have the size of the rectangle; others have that of the whole, with nothing around it.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    full_width: int
+    full_height: int
+    cropped: bool = False
+
+    def __str__(self):
+        return (
+            f"{self.width}x{self.height} at {self.left},{self.top} of {self.full_width}x{self.full_height}, "
+            f"{'cropped' if self.cropped else 'in place'}"
+        )
+
+
+@dataclass(frozen=True)
+class ColorSpace:
+    """The linear RGB space that all colors of a file are in, by its name and the matrix to linear Rec.709."""
+
+    name: str
+    to_rec709: np.ndarray  # (3, 3), with both spaces' white points made equal; applied to column vectors
+
+    def __post_init__(self):
+        matrix = np.asarray(self.to_rec709, dtype=np.float64)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise ValueError(f"color space {self.name!r}: matrix {matrix!r}, expected 3 x 3 finite numbers")
+        object.__setattr__(self, "to_rec709", matrix)
+
+    def rec709(self, colors: np.ndarray) -> np.ndarray:
+        """Colors (..., 3) of this space in linear Rec.709."""
+        return np.asarray(colors) @ self.to_rec709.T
+
+
+REC709 = ColorSpace("Linear Rec.709", np.eye(3))

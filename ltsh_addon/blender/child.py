@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..scene import REC709, AreaLight, Border, Cancelled, ColorSpace, Film, SurfaceSamples
 from . import gbuffer
 
 WORKER = Path(__file__).with_name("worker.py")
@@ -54,7 +54,9 @@ class Extraction:
     """What the child found and rendered.
 
     `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
-    W m^-2 sr^-1; `seconds` has "start", "samples" and "cycles".
+    W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
+    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered. All colors,
+    those of the lights included, are in `color_space`.
     """
 
     lights: tuple[AreaLight, ...]
@@ -66,6 +68,9 @@ class Extraction:
     frame: int
     camera: str
     seconds: dict[str, float]
+    exposure: float = 1.0
+    border: Border | None = None
+    color_space: ColorSpace = REC709
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -93,6 +98,9 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             frame=manifest["frame"],
             camera=manifest["camera"],
             seconds=manifest["seconds"],
+            exposure=manifest["exposure"],
+            border=None if manifest["border"] is None else Border(**manifest["border"]),
+            color_space=_color_space(manifest["color_space"]),
         )
 
 
@@ -232,7 +240,7 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0
     for index, name in enumerate(manifest["samples"]):
-        channels = read_channels(folder / name)
+        channels = gbuffer.without_holdouts(read_channels(folder / name))
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
         unusable += bad
@@ -249,8 +257,14 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     return samples, film, warnings
 
 
+def _color_space(record: dict) -> ColorSpace:
+    from ..imaging.color_space import identified
+
+    return identified(record["to_rec709"], record["name"])
+
+
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
-    """The two halves, each the mean of its chunks weighted by their samples."""
+    """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
     from ..imaging.exr import read_channels
 
     if manifest["reference"] is None:
@@ -265,4 +279,5 @@ def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None
             for lobe, image in sums.items():
                 light = gbuffer.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
                 image[half] += count / total * light * gbuffer.read_layer(channels, passes[f"{lobe}_color"], "RGB")
-    return {lobe: image.astype(np.float32) for lobe, image in sums.items()}
+    exposure = manifest.get("exposure", 1.0)
+    return {lobe: (exposure * image).astype(np.float32) for lobe, image in sums.items()}

@@ -8,8 +8,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from . import render_settings
+from . import cameras, render_settings
 from .child import SceneError
+from .color_management import working_space
 from .cycles_reference import render_reference
 from .inventory import rendered_surfaces, with_render_depsgraph
 from .lights import LightInventory, collect_lights, seen_lights
@@ -20,6 +21,7 @@ from .materials import (
     materials_in_use,
     objects_without_material,
 )
+from .missing_files import missing_files
 from .pixel_samples import render_pixel_samples
 
 
@@ -35,6 +37,7 @@ def open_scene(path: Path, warnings: list[str]) -> None:
         warnings.append(f"{path.name} was saved by Blender {saved}; {bpy.app.version_string} may miss parts of it")
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
+    warnings.extend(missing_files())
 
 
 def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
@@ -75,11 +78,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings)
     scene = bpy.context.scene
-    if job["frame"] is not None:
-        scene.frame_set(job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
+    cameras.go_to_frame(scene, job["frame"])
+    camera = cameras.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    picture = _picture(scene, job)
     inventory = prepare_scene(scene, view_layer, camera, warnings)
     seconds["start"] = time.monotonic() - started
 
@@ -95,14 +97,27 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
         "camera": camera.name,
-        "width": width,
-        "height": height,
+        **picture,
         "lights": [_light_record(light) for light in inventory.lights],
         "warnings": warnings,
         "samples": samples,
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,
+    }
+
+
+def _picture(scene, job: dict) -> dict:
+    """Set the size; what the manifest says about the picture."""
+    width, height = cameras.set_resolution(scene, job["width"], job["height"])
+    border = cameras.render_border(scene)
+    cropped = border is not None and border.cropped
+    return {
+        "width": border.width if cropped else width,
+        "height": border.height if cropped else height,
+        "border": None if border is None else vars(border),
+        "exposure": scene.cycles.film_exposure,
+        "color_space": working_space(),
     }
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..scene import Film, SurfaceSamples
-from .aovs import HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
+from .aovs import AOV_PREFIX, HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
 from .lobe_samples import samples_of_lobes
 from .lobe_slots import Hits
 from .shading_normals import bump_alpha2, unit, valid_specular_normal
@@ -65,6 +65,16 @@ def _hits_of(values: dict[str, np.ndarray]) -> Hits:
         receiver=np.rint(values["receiver"]).astype(np.int32),
         diffuse_albedo=values["albedo"],
     )
+
+
+def without_holdouts(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """`channels` of a render with an opaque background, without the hits on holdouts: they alone have alpha 0.
+
+    Cycles evaluates their shaders, AOVs included, and then shows a hole.
+    """
+    hit = f"{AOV_PREFIX}hit.X"
+    kept = read_layer(channels, "Combined", "A") > 0.0
+    return {name: plane * kept if name.endswith(hit) else plane for name, plane in channels.items()}
 
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:

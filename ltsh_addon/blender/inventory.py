@@ -107,7 +107,8 @@ def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
     found = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type in SURFACE_TYPES and instance.show_self:
+        # Hair grows on emitters that are not shown themselves, and has their materials.
+        if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
             key = (ob.original.name_full, ob.data.name_full if ob.data else "")
             if key not in found:
                 found[key] = RenderedSurface.of(ob)

@@ -159,8 +159,16 @@ def _write_hit(material) -> None:
     receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
     write_aov(tree, "hit", 1.0)
     write_aov(tree, "receiver", receiver.outputs["Fac"])
-    write_aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
+    write_aov(tree, "correct_normal", _bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
     write_aov(tree, "position", geometry.outputs["Position"])
     write_aov(tree, "incoming", geometry.outputs["Incoming"])
     write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
     write_aov(tree, "true_normal", geometry.outputs["True Normal"])
+
+
+def _bends_normals(tree):
+    """A socket of 1, and of 0 on hair, where Cycles never bends specular normals."""
+    flipped = tree.nodes.new("ShaderNodeMath")
+    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
+    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
+    return flipped.outputs[0]

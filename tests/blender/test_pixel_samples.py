@@ -9,7 +9,7 @@ import quadrature
 import scene_parts
 from scene_parts import add_bump, add_plane, add_sphere, bsdf_material, principled
 
-from ltsh_addon.blender import gbuffer, render_settings
+from ltsh_addon.blender import gbuffer, pixel_filter
 from ltsh_addon.shading import shade
 
 
@@ -29,9 +29,8 @@ def test_one_sample_per_pixel_is_at_the_center(tmp_path):
 
 
 def test_sub_sample_offsets_cover_the_pixel_evenly():
-    assert np.array_equal(render_settings.sub_pixel_offsets(1), [[0.0, 0.0]])
     for count in (4, 16, 64):
-        offsets = render_settings.sub_pixel_offsets(count)
+        offsets = pixel_filter.filter_points("BOX", 1.0, count)
         assert offsets.shape == (count, 2) and np.abs(offsets).max() <= 0.5
         # The share of the points in any quarter of the pixel is right up to a few points.
         for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -52,7 +51,7 @@ def test_the_same_point_of_every_pixel_is_sampled(tmp_path, size, pixel_aspect):
     renders, _ = scene_parts.sample(tmp_path, prepared, sub_samples=3)
     (center, _, _), *_ = scene_parts.sample(tmp_path, prepared)[0]
     unit = 6.0 / max(size[0] * pixel_aspect, size[1])
-    for (surface, _, _), offset in zip(renders, render_settings.sub_pixel_offsets(3), strict=True):
+    for (surface, _, _), offset in zip(renders, pixel_filter.sub_pixel_offsets(prepared[0], 3), strict=True):
         moved = (surface.position - center.position)[:, :2] / (unit * np.array([pixel_aspect, 1.0]))
         assert np.abs(moved - offset).max() < 2e-3  # pixels; Cycles' center and its float32 camera
 
@@ -66,6 +65,7 @@ def test_sub_samples_fill_the_pixel_evenly_and_differ(tmp_path):
     material.node_tree.links.new(coordinates.outputs["UV"], node.inputs["Base Color"])
     node.inputs["Metallic"].default_value = 1.0
     add_plane(material, size=6.0)
+    bpy.context.scene.cycles.pixel_filter_type = "BOX"
     count = 6
     renders, _ = scene_parts.sample(tmp_path, scene_parts.prepare(), sub_samples=count)
     width, height = scene_parts.SIZE

@@ -117,6 +117,7 @@ def test_a_region_is_recorded_and_has_the_size_of_a_plain_render(tmp_path):
         # 26 x 15 pixels: columns 8 to 20, rows 2 to 8 from below.
         place = {"left": 8, "top": 6, "width": 13, "height": 7, "full_width": 26, "full_height": 15}
         assert report["border"] == {**place, "cropped": crop}
+        assert report["pixel_aspect"] == 1.0 and report["pixel_filter"] == "pixel centers"
         assert report["resolution"] == ([13, 7] if crop else [26, 15])
     assert np.array_equal(sizes[False][6:13, 8:21], sizes[True]) and sizes[True].all()
     assert sizes[False].sum() == sizes[True].sum()

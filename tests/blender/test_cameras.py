@@ -139,6 +139,18 @@ def test_a_region_holds_for_anti_aliasing_and_for_the_reference(tmp_path):
         assert np.linalg.norm(part - ours) < 0.02 * np.linalg.norm(part)
 
 
+def test_an_animated_lens_shows_the_same_sub_samples_as_one_that_stands_still(tmp_path):
+    scene = room()
+    animate(scene)
+    moving = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    scene.camera.data.animation_data_clear()
+    still = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    assert np.array_equal(moving.film.pixel, still.film.pixel)
+    assert np.abs(moving.samples.position - still.samples.position).max() < 1e-4
+    thirds = np.split(moving.samples.position, 3)
+    assert np.median(np.abs(thirds[1] - thirds[0])) > 0.005
+
+
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
 @pytest.mark.parametrize("aspect", [(1.0, 1.0), (1.0, 1.9)])

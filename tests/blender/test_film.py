@@ -135,7 +135,7 @@ def test_settings_of_the_layer_and_of_the_scene_that_are_replaced(tmp_path):
     layer.samples, layer.use_pass_cryptomatte_object = 1, True
     layer.lightgroups.add(name="Key")
     user = layer.aovs.add()
-    user.name, user.type = "Depth", "VALUE"
+    user.name, user.type = "ltsh_roughness", "COLOR"
     layer.world_override = world = bpy.data.worlds.new("Sky")
     world.color = (0.0, 1.0, 0.0)
     if bpy.app.version < (5, 0, 0):

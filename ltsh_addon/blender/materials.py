@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import bpy
 
 from .gbuffer import AOV_PREFIX, AOVS, LOBES
+from .hair import bends_normals
 from .shader_graph import (
     TRANSPARENT_NODES,
     BsdfSearch,
@@ -231,7 +232,7 @@ def _add_aovs(tree, node, lobe: str, sockets: dict, material) -> None:
     receiver = tree.nodes.new("ShaderNodeAttribute")
     receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
     _aov(tree, "receiver", receiver.outputs["Fac"])
-    _aov(tree, "correct_normal", _bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
+    _aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
     _aov(tree, "position", geometry.outputs["Position"])
     _aov(tree, "incoming", geometry.outputs["Incoming"])
     _aov(tree, "smooth_normal", geometry.outputs["Normal"])
@@ -243,14 +244,6 @@ def _add_aovs(tree, node, lobe: str, sockets: dict, material) -> None:
             link = live_link(node.inputs[wanted])
             wanted = link.from_socket if link else node.inputs[wanted].default_value
         _aov(tree, name, wanted)
-
-
-def _bends_normals(tree):
-    """A socket of 1, and of 0 on hair, where Cycles never bends specular normals."""
-    flipped = tree.nodes.new("ShaderNodeMath")
-    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
-    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
-    return flipped.outputs[0]
 
 
 def _aov(tree, name: str, value) -> None:

@@ -245,7 +245,8 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0
     for index, name in enumerate(manifest["samples"]):
-        channels = gbuffer.without_holdouts(read_channels(folder / name))
+        channels = read_channels(folder / name)
+        gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
         unusable += bad

@@ -115,7 +115,9 @@ def _add_common(parser, *, cycles, resolution="as in the file"):
     parser.add_argument("--techniques", type=_techniques, default=DEFAULT_TECHNIQUES, help=f"default: {names}")
     parser.add_argument("--passes", type=_passes, default=PASSES, help=f"default: {','.join(PASSES)}")
     parser.add_argument("--resolution", type=_resolution, metavar="WxH", help=f"default: {resolution}")
-    parser.add_argument("--aa", type=_positive, default=1, metavar="N", help="sub-samples per pixel; 1: pixel centers")
+    parser.add_argument(
+        "--aa", type=_positive, default=1, metavar="N", help="points per pixel, drawn from its filter; 1: pixel centers"
+    )
     parser.add_argument("--frame", type=_frame, metavar="F", help="default: the file's current frame")
     parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
     parser.add_argument(

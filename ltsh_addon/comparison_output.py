@@ -85,6 +85,8 @@ class Comparison:
             "frame": extraction.frame,
             "resolution": [self.film.width, self.film.height],
             "border": None if extraction.border is None else vars(extraction.border),
+            "pixel_aspect": extraction.pixel_aspect,
+            "pixel_filter": extraction.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
             "exposure": extraction.exposure,
             "color_space": extraction.color_space.name,
             "sub_samples": self.film.sub_samples,
@@ -178,7 +180,9 @@ class Comparison:
             metadata["ltsh:reference"] = notice
         layers, sheet = self.layers(), self.sheet() if with_cycles else None
         chromaticities = imaging.chromaticities(self.extraction.color_space)
-        imaging.write_layers(output / f"{name}.exr", layers, metadata, chromaticities)
+        imaging.write_layers(
+            output / f"{name}.exr", layers, metadata, chromaticities, self.extraction.pixel_aspect
+        )
         if with_cycles:
             imaging.write_png(output / "compare.png", sheet)
             imaging.write_json(output / "report.json", document)

@@ -55,8 +55,9 @@ class Extraction:
 
     `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
     W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
-    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered. All colors,
-    those of the lights included, are in `color_space`.
+    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
+    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
+    the lights included, are in `color_space`.
     """
 
     lights: tuple[AreaLight, ...]
@@ -70,6 +71,8 @@ class Extraction:
     seconds: dict[str, float]
     exposure: float = 1.0
     border: Border | None = None
+    pixel_aspect: float = 1.0
+    pixel_filter: str = "BOX"
     color_space: ColorSpace = REC709
 
 
@@ -100,6 +103,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             seconds=manifest["seconds"],
             exposure=manifest["exposure"],
             border=None if manifest["border"] is None else Border(**manifest["border"]),
+            pixel_aspect=manifest["pixel_aspect"],
+            pixel_filter=manifest["pixel_filter"],
             color_space=_color_space(manifest["color_space"]),
         )
 
@@ -240,7 +245,8 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0
     for index, name in enumerate(manifest["samples"]):
-        channels = gbuffer.without_holdouts(read_channels(folder / name))
+        channels = read_channels(folder / name)
+        gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
         unusable += bad

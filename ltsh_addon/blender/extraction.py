@@ -22,6 +22,7 @@ from .materials import (
     objects_without_material,
 )
 from .missing_files import missing_files
+from .pixel_filter import filter_name
 from .pixel_samples import render_pixel_samples
 
 
@@ -116,6 +117,8 @@ def _picture(scene, job: dict) -> dict:
         "width": border.width if cropped else width,
         "height": border.height if cropped else height,
         "border": None if border is None else vars(border),
+        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
+        "pixel_filter": filter_name(scene),
         "exposure": scene.cycles.film_exposure,
         "color_space": working_space(),
     }

@@ -67,14 +67,12 @@ def _hits_of(values: dict[str, np.ndarray]) -> Hits:
     )
 
 
-def without_holdouts(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """`channels` of a render with an opaque background, without the hits on holdouts: they alone have alpha 0.
+def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
+    """Take the hits on holdouts out of the `channels` of a render with an opaque background.
 
-    Cycles evaluates their shaders, AOVs included, and then shows a hole.
+    Cycles evaluates the shaders of holdouts, AOVs included, and then shows a hole; nothing else has alpha 0.
     """
-    hit = f"{AOV_PREFIX}hit.X"
-    kept = read_layer(channels, "Combined", "A") > 0.0
-    return {name: plane * kept if name.endswith(hit) else plane for name, plane in channels.items()}
+    read_aov(channels, "hit")[read_layer(channels, "Combined", "A") == 0.0] = 0.0
 
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:

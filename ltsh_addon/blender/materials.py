@@ -14,6 +14,7 @@ from .aov_injection import write_aov, write_lobe
 from .aovs import MAX_LOBES
 from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves
 from .bsdf_lobes import cut_alpha, emits, lobe_of
+from .hair import bends_normals
 from .shader_graph import ensure_nodes, fill_with_bsdf, is_constant, live_link, material_output
 
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
@@ -159,16 +160,8 @@ def _write_hit(material) -> None:
     receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
     write_aov(tree, "hit", 1.0)
     write_aov(tree, "receiver", receiver.outputs["Fac"])
-    write_aov(tree, "correct_normal", _bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
+    write_aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
     write_aov(tree, "position", geometry.outputs["Position"])
     write_aov(tree, "incoming", geometry.outputs["Incoming"])
     write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
     write_aov(tree, "true_normal", geometry.outputs["True Normal"])
-
-
-def _bends_normals(tree):
-    """A socket of 1, and of 0 on hair, where Cycles never bends specular normals."""
-    flipped = tree.nodes.new("ShaderNodeMath")
-    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
-    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
-    return flipped.outputs[0]

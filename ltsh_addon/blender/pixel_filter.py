@@ -65,6 +65,12 @@ def sub_pixel_offsets(scene, count: int) -> np.ndarray:
     return filter_points(scene.cycles.pixel_filter_type, scene.cycles.filter_width, count)
 
 
+def filter_name(scene) -> str:
+    """The scene's filter for a report: its kind, and its width in pixels where it has one."""
+    kind = scene.cycles.pixel_filter_type
+    return kind if kind == "BOX" else f"{kind} {scene.cycles.filter_width:g} px"
+
+
 @contextmanager
 def pinned_pixel_filter(scene):
     """Meanwhile all camera rays of a pixel go through its center; sub-samples come from shifting the camera."""

@@ -58,7 +58,7 @@ def write_html(path: str | os.PathLike, report: Mapping) -> None:
             f"frame {report['frame']}",
             f"{width} x {height} pixels",
             *_picture_facts(report),
-            f"{report['sub_samples']} sub-samples",
+            f"{report['sub_samples']} sub-samples ({report['pixel_filter']})",
             f"{report['cycles_samples']} Cycles samples",
             *(f"{name} {version}" for name, version in report["versions"].items()),
         )
@@ -86,6 +86,8 @@ def _picture_facts(report: Mapping) -> list[str]:
         facts.append(
             f"render region at {border['left']}, {border['top']} of {border['full_width']} x {border['full_height']}"
         )
+    if report["pixel_aspect"] != 1.0:
+        facts.append(f"pixels {report['pixel_aspect']:g} times as wide as high")
     if report["exposure"] != 1.0:
         facts.append(f"film exposure {report['exposure']:g}")
     return facts

@@ -142,7 +142,9 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
     """Samples (one array per render), their pixels and the raw channels of each sample render."""
     scene, layer = prepared[:2]
     files = pixel_samples.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
-    channels = [gbuffer.without_holdouts(read_channels(folder / name)) for name in files]
+    channels = [read_channels(folder / name) for name in files]
+    for image in channels:
+        gbuffer.clear_holdouts(image)
     albedo = render_settings.pass_names()["diffuse_color"]
     return [gbuffer.surface_samples(image, albedo) for image in channels], channels
 

@@ -117,6 +117,7 @@ def test_a_region_is_recorded_and_has_the_size_of_a_plain_render(tmp_path):
         # 26 x 15 pixels: columns 8 to 20, rows 2 to 8 from below.
         place = {"left": 8, "top": 6, "width": 13, "height": 7, "full_width": 26, "full_height": 15}
         assert report["border"] == {**place, "cropped": crop}
+        assert report["pixel_aspect"] == 1.0 and report["pixel_filter"] == "pixel centers"
         assert report["resolution"] == ([13, 7] if crop else [26, 15])
     assert np.array_equal(sizes[False][6:13, 8:21], sizes[True]) and sizes[True].all()
     assert sizes[False].sum() == sizes[True].sum()
@@ -136,6 +137,18 @@ def test_a_region_holds_for_anti_aliasing_and_for_the_reference(tmp_path):
         assert ours.shape == (7, 13, 3)
         # Another sequence of 512 samples per pixel: their noise.
         assert np.linalg.norm(part - ours) < 0.02 * np.linalg.norm(part)
+
+
+def test_an_animated_lens_shows_the_same_sub_samples_as_one_that_stands_still(tmp_path):
+    scene = room()
+    animate(scene)
+    moving = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    scene.camera.data.animation_data_clear()
+    still = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    assert np.array_equal(moving.film.pixel, still.film.pixel)
+    assert np.abs(moving.samples.position - still.samples.position).max() < 1e-4
+    thirds = np.split(moving.samples.position, 3)
+    assert np.median(np.abs(thirds[1] - thirds[0])) > 0.005
 
 
 @pytest.mark.parametrize("fit", ["AUTO", "HORIZONTAL", "VERTICAL"])

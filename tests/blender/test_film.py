@@ -135,7 +135,7 @@ def test_settings_of_the_layer_and_of_the_scene_that_are_replaced(tmp_path):
     layer.samples, layer.use_pass_cryptomatte_object = 1, True
     layer.lightgroups.add(name="Key")
     user = layer.aovs.add()
-    user.name, user.type = "Depth", "VALUE"
+    user.name, user.type = "ltsh_roughness", "COLOR"
     layer.world_override = world = bpy.data.worlds.new("Sky")
     world.color = (0.0, 1.0, 0.0)
     if bpy.app.version < (5, 0, 0):
@@ -298,6 +298,7 @@ def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path)
     """All the way: radiance with --aa 64 in the filter that files have by default."""
     scene = stripes("BLACKMAN_HARRIS", 1.5)
     report, layers = compared(tmp_path, sub_samples=64, cycles_samples=1024)
+    assert report["pixel_filter"] == "BLACKMAN_HARRIS 1.5 px"
     plain = plain_diffuse(tmp_path, scene, samples=1024)
     peak = plain.max()
     for name in ("ltc.diffuse", "cycles.diffuse"):

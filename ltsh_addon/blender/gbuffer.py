@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..scene import Film, SurfaceSamples
-from .aovs import AOV_PREFIX, HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
+from .aovs import HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
 from .lobe_samples import samples_of_lobes
 from .lobe_slots import Hits
 from .shading_normals import bump_alpha2, unit, valid_specular_normal

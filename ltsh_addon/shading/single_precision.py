@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from . import double_precision, edge_loop, light_cone, ridge_table
-from .light_polygons import integrate_visible, local_corners, round_levels
+from .light_polygons import integrate_visible, light_levels, local_corners
 
 # Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
 # multiple of a page long, where the cache would hold few of them.
@@ -135,14 +135,14 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, widt
         if light.spread < NARROW_SPREAD:
             fragile[number].append(index if allowed is None else index[allowed])
             continue
-        for part, outline in _batches(light, corners, position, width):
+        for part, outline, effort in _batches(light, corners, position, width):
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
             facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
             if allowed is not None:
                 facing &= allowed[part]
             axes, of_part = rows[:, :, part], partial(integrate, part)
             if light.is_focused:
-                of_part = _Focused(light, offset, axes, of_part, len(colors))
+                of_part = _Focused(light, effort, offset, axes, of_part, len(colors))
                 axes = of_part.rows
             polygons = local_corners(light, outline, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
@@ -162,14 +162,13 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, widt
 
 
 def _batches(light, corners, position, width):
-    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3)) of all points, in batches."""
-    levels = round_levels(light, position, width) if light.is_round else [(corners, None)]
-    for corners, chosen in levels:
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
+    for outline, effort, chosen in light_levels(light, corners, position, width):
         count = position.shape[1] if chosen is None else len(chosen)
-        step = max(CORNERS // len(corners), 512)
+        step = max(CORNERS // len(outline), 512)
         for start in range(0, count, step):
             part = slice(start, start + step)
-            yield part if chosen is None else chosen[part], corners
+            yield part if chosen is None else chosen[part], outline, effort
 
 
 def _dot(a, b):
@@ -188,8 +187,8 @@ class _Focused:
     The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
     """
 
-    def __init__(self, light, offset, axes, integrate, count):
-        self.light, self.integrate, self.count = light, integrate, count
+    def __init__(self, light, effort, offset, axes, integrate, count):
+        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
         self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
         plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
         self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
@@ -197,16 +196,14 @@ class _Focused:
     def __call__(self, corners, index):
         index = np.arange(corners.shape[2]) if index is None else index
         values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
-        chords = light_cone.chord_count(corners.shape[1])
-        step = max(CORNERS // (corners.shape[1] * (2 * chords + 2)), 512)
+        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
         for start in range(0, len(index), step):
             part = slice(start, start + step)
             flat, view = corners[-2:, :, part], self.view.take(index[part])
-            for number, (near, weights, polygons) in enumerate(
-                light_cone.layers(view, flat, self.light.spread, chords)
-            ):
+            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
+            for number, (near, weights, polygons) in enumerate(layers):
                 # The small disks count little, so that the rounding of their edges is lost in the sum.
-                smallest = 0.0 if number < light_cone.LAYERS - 1 else edge_loop.SMALLEST_SAFE
+                smallest = 0.0 if number < self.effort.layers - 1 else edge_loop.SMALLEST_SAFE
                 found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
                 values[:, start + near] += weights * found
                 fragile[start + near] |= redo

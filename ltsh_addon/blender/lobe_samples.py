@@ -58,8 +58,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
     specular = np.concatenate([part.specular for part in parts], axis=1)[:, order]
     index, behind = index[order], joined["behind"]
     at_hit = hits.take(index)
-    smooth_normal = np.where(behind[:, None], joined["diffuse_normal"], at_hit.smooth_normal)
-    bumped = at_hit.corrected & ~behind
+    smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -72,7 +71,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,
-        bump_alpha2=np.where(bumped, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
+        bump_alpha2=np.where(at_hit.corrected, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
     )
     return samples, index
 

@@ -20,7 +20,8 @@ BLOCK = 65536
 
 def end_at_horizons_of_cycles(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> SurfaceSamples:
     """The samples with the smooth normal as geometric normal where the light's choice of directions counts more."""
-    differ = np.flatnonzero((samples.geometric_normal != samples.smooth_normal).any(axis=1))
+    reflects = (samples.specular_f90 != 0.0).any(axis=1) | (samples.dielectric != 0.0).any(axis=1)
+    differ = np.flatnonzero(reflects & (samples.geometric_normal != samples.smooth_normal).any(axis=1))
     if len(differ) == 0 or not lights:
         return samples
     normal = np.array(samples.geometric_normal)

@@ -50,6 +50,7 @@ EXACT = {
     "metallic node": {"node_type": METALLIC, "Edge Tint": TINT, "settings": MULTIPLE},
     "conductor": {"node_type": METALLIC, "settings": (*MULTIPLE, ("fresnel_type", "PHYSICAL_CONDUCTOR"))},
     "translucent": {"node_type": "ShaderNodeBsdfTranslucent"},
+    "translucent, bump": {"node_type": "ShaderNodeBsdfTranslucent", "bump": True},
 }
 # Largest error in percent of the specular and of the diffuse part, as measured with both Blenders, and some.
 APPROXIMATED = {

@@ -22,6 +22,8 @@ LOBE_SOCKETS = {
             "specular_level": "Specular IOR Level",
             "tint": "Specular Tint",
             "transmission": "Transmission Weight",
+            "sheen_weight": "Sheen Weight",
+            "sheen_tint": "Sheen Tint",
             "coat_weight": "Coat Weight",
             "coat_roughness": "Coat Roughness",
             "coat_ior": "Coat IOR",
@@ -57,7 +59,7 @@ NOT_SHADED = {
         "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
         "Anisotropic": (0.0, "is shaded as 0"),
         "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
-        "Sheen Weight": (0.0, "is shaded as diffuse reflection of the same albedo"),
+        "Sheen Weight": (0.0, "adds diffuse reflection of the same albedo"),
         "Thin Film Thickness": (0.0, "is shaded as 0"),
     },
     "ShaderNodeBsdfAnisotropic": {"Anisotropy": (0.0, "is shaded as 0")},
@@ -95,7 +97,7 @@ def lobe_of(node, warn: Callable[[str], None]) -> dict:
     if normal is not None:
         values["normal"] = normal.from_socket
     if kind == "principled":
-        _complete_coat(node, values)
+        _drop_absent_layers(node, values)
     if getattr(node, "distribution", "") == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES:
         values["multiple_scattering"] = 1.0
     if kind == "glass" or "transmission" in values:
@@ -133,12 +135,13 @@ def _is_neutral(name, value) -> bool:
     return neutral is not None and is_constant(value, neutral)
 
 
-def _complete_coat(node, values) -> None:
-    """Leave the coat out where its weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
-    if _is_neutral("coat_weight", values["coat_weight"]):
-        for name in [name for name in values if name.startswith("coat_")]:
-            del values[name]
-    elif live_link(node.inputs["Coat Normal"]) is None:
+def _drop_absent_layers(node, values) -> None:
+    """Leave layers out whose weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
+    for layer in ("coat", "sheen"):
+        if _is_neutral(f"{layer}_weight", values[f"{layer}_weight"]):
+            for name in [name for name in values if name.startswith(f"{layer}_")]:
+                del values[name]
+    if "coat_normal" in values and live_link(node.inputs["Coat Normal"]) is None:
         del values["coat_normal"]
     if _is_neutral("transmission", values["transmission"]):
         del values["transmission"]

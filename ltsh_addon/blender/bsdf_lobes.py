@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from .aovs import LOBE_AOVS, LOBE_KINDS
-from .shader_graph import cut, is_constant, is_socket, live_link, value_of
+from .shader_graph import cut, is_constant, is_socket, live_link, product, value_of
 
 PRINCIPLED = "ShaderNodeBsdfPrincipled"
 # BSDF -> kind of lobe, {AOV of aovs.LOBE_AOVS: socket name}.
@@ -39,19 +39,21 @@ LOBE_SOCKETS = {
     "ShaderNodeSubsurfaceScattering": ("diffuse", {"color": "Color"}),
     "ShaderNodeBsdfToon": ("diffuse", {"color": "Color"}),
 }
+# Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
+NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
 CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
 METALLIC_SOCKETS = {
     "F82": ("metal", {"color": "Base Color", "tint": "Edge Tint", "roughness": "Roughness"}),
     "PHYSICAL_CONDUCTOR": (CONDUCTOR, {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
 }
-# Node -> what stands in for it where it is not exact.
+# Node -> what is said of it.
 NEAREST = {
-    "ShaderNodeBsdfGlass": "only its reflection is shaded",
-    "ShaderNodeBsdfSheen": "it is shaded as a Diffuse BSDF of the same albedo",
-    "ShaderNodeSubsurfaceScattering": "it is shaded as a Diffuse BSDF",
-    "ShaderNodeBsdfToon": "it is shaded as a Diffuse BSDF of the same albedo",
-    "ShaderNodeBsdfRefraction": "it is not shaded",
+    "ShaderNodeBsdfGlass": "lets no light through, only its reflection is shaded",
+    "ShaderNodeBsdfSheen": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
+    "ShaderNodeSubsurfaceScattering": "is not supported, it is shaded as a Diffuse BSDF",
+    "ShaderNodeBsdfToon": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
 }
+NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> {socket: (value at which it changes nothing, what is done)}; sockets absent in a version are skipped.
 NOT_SHADED = {
     PRINCIPLED: {
@@ -88,11 +90,14 @@ def lobe_of(node, warn: Callable[[str], None]) -> dict:
     if node.bl_idname == "ShaderNodeBsdfMetallic":
         sockets = METALLIC_SOCKETS[node.fresnel_type]
     if sockets is None or (node.bl_idname == "ShaderNodeBsdfToon" and node.component != "DIFFUSE"):
-        warn(f"node {node.name!r} is not supported, {NEAREST['ShaderNodeBsdfRefraction']}")
+        warn(f"node {node.name!r} {NOT_SUPPORTED}")
         return {}
     _note_unsupported(node, warn)
     kind, names = sockets
     values = {"kind": LOBE_KINDS[kind], **{aov: value_of(node.inputs[name]) for aov, name in names.items()}}
+    nearest_alpha = NEAREST_ALPHA.get(getattr(node, "distribution", ""))
+    if nearest_alpha is not None:
+        values["roughness"] = product(node.id_data, values["roughness"], nearest_alpha**0.5)
     normal = live_link(node.inputs["Normal"])
     if normal is not None:
         values["normal"] = normal.from_socket
@@ -150,7 +155,7 @@ def _drop_absent_layers(node, values) -> None:
 def _note_unsupported(node, warn) -> None:
     kind = node.bl_idname
     if kind in NEAREST:
-        warn(f"node {node.name!r} is not supported, {NEAREST[kind]}")
+        warn(f"node {node.name!r} {NEAREST[kind]}")
     for name, (neutral, done) in NOT_SHADED.get(kind, {}).items():
         if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
             warn(f"{name} of {node.name!r} {done}")
@@ -158,6 +163,7 @@ def _note_unsupported(node, warn) -> None:
         ior = value_of(node.inputs["IOR"])
         if not is_socket(ior) and ior < 1.0:
             warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
-    distribution = getattr(node, "distribution", "GGX")
-    if distribution not in ("GGX", "MULTI_GGX", "MICROFIBER", "ASHIKHMIN"):
-        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")
+    distribution = getattr(node, "distribution", "")
+    if distribution in NEAREST_ALPHA:
+        alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
+        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX of {alpha}")

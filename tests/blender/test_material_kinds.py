@@ -63,7 +63,8 @@ APPROXIMATED = {
     "anisotropic": ({"Metallic": 1.0, "Anisotropic": 0.5}, (25.0, None)),
     "sheen": ({"Sheen Weight": 0.3, "Sheen Tint": TINT}, (0.5, 5.0)),
     "sheen on metal": ({"Sheen Weight": 0.6, "Metallic": 1.0, "settings": MULTIPLE, **COAT}, (0.5, 60.0)),
-    "Beckmann": ({"node_type": GLOSSY, "settings": (("distribution", "BECKMANN"),)}, (30.0, None)),
+    "Beckmann": ({"node_type": GLOSSY, "settings": (("distribution", "BECKMANN"),)}, (15.0, None)),
+    "Ashikhmin": ({"node_type": GLOSSY, "settings": (("distribution", "ASHIKHMIN_SHIRLEY"),)}, (12.0, None)),
     "diffuse roughness": ({"Diffuse Roughness": 0.5}, (0.5, 30.0)),
 }
 

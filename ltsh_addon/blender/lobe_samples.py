@@ -53,7 +53,11 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
     bare = np.ones(len(hits.position), dtype=bool)
     for part in parts:
         bare[part.index] = False
-    parts.append(_bare_part(hits, np.nonzero(bare)[0]))
+    return _joined(hits, [*parts, _bare_part(hits, np.nonzero(bare)[0])])
+
+
+def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples of all parts and the hit of each, in the order of the hits."""
     index = np.concatenate([part.index for part in parts])
     order = np.argsort(index, kind="stable")
     joined = {
@@ -123,7 +127,7 @@ def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_
     """
     expected = np.zeros_like(hits.diffuse_albedo)
     for part in parts:
-        np.add.at(expected, part.index, part.diffuse)
+        expected[part.index] += part.diffuse
     base = own[0]
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)

@@ -90,7 +90,7 @@ class Comparison:
             "exposure": extraction.exposure,
             "color_space": extraction.color_space.name,
             "sub_samples": self.film.sub_samples,
-            "surface_samples": len(extraction.samples),
+            "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": [
                 {"name": light.name, "shape": light.shape, "group": light.group, "radiance": light.radiance.tolist()}

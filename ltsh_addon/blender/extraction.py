@@ -97,7 +97,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "camera": camera.name,
         "width": width,
         "height": height,
-        "lights": [_light_record(light) for light in inventory.lights],
+        "lights": [light_record(light) for light in inventory.lights],
         "warnings": warnings,
         "samples": samples,
         "reference": reference,
@@ -106,6 +106,6 @@ def extract(job: dict, folder: Path, progress) -> dict:
     }
 
 
-def _light_record(light) -> dict:
+def light_record(light) -> dict:
     """`light` as JSON has it; AreaLight(**record) reads it back."""
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}

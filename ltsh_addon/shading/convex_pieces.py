@@ -111,7 +111,7 @@ def _union(a, b, flat, limit):
         for other, corner in enumerate(b):
             if corner == end and b[(other + 1) % len(b)] == start:
                 # a from `end` around to `start`, then b from there to `end`
-                ring = a[position + 1 :] + a[: position + 1] + (b[other + 2 :] + b[:other])[: len(b) - 2]
+                ring = a[position + 1 :] + a[: position + 1] + (b[other:] + b[:other])[2:]
                 points = flat[ring]
                 turns = _turn(np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0))
                 return ring if (turns >= -limit).all() else None

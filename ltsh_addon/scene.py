@@ -86,7 +86,7 @@ class AreaLight:
 
     @property
     def area_vector(self) -> np.ndarray:
-        """Normal (3,) as long as the area in m^2 where `corners` or half_u and half_v run counterclockwise around it."""
+        """Normal (3,), the area in m^2 long, around which `corners`, or half_u and half_v, run counterclockwise."""
         if self.corners is not None:
             offset = self.corners - self.corners[0]
             return 0.5 * np.cross(offset, np.roll(offset, -1, axis=0)).sum(axis=0)

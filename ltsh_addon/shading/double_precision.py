@@ -12,7 +12,7 @@ import numpy as np
 from . import light_cone
 from .edge_integrals import vector_irradiance
 from .lobe_integrals import form_factor, integrals_on_sphere, polygon_integrals, tilted
-from .local_view import light_view, local_frames, to_local, visible_parts
+from .local_view import light_view, local_frames, seen_parts, to_local
 from .lookup_table import Lobe, LookupTable
 from .reference_lights import reference_integrals
 from .ridge_table import SHARP_ROUGHNESS
@@ -30,6 +30,7 @@ class LightOfEachSample:
     affects_diffuse: bool = True
     affects_specular: bool = True
     is_focused: bool = False
+    is_round: bool = False
 
     def receives(self, receiver, index):
         """None, as of a light without receivers: those that the light does not reach were left out before."""
@@ -58,7 +59,7 @@ def shade_diffuse(samples, lights, radiance):
         if not light.affects_diffuse:
             continue
         for candidates, second_normal, integral in kinds:
-            for index, polygon in visible_parts(samples, frame, light, corners, candidates, second_normal):
+            for index, polygon in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
                 if light.is_focused:
                     view = light_view(samples, frame, light, index, lambda vectors: vectors)
                     sharp = np.zeros(len(index), bool)
@@ -67,6 +68,11 @@ def shade_diffuse(samples, lights, radiance):
                     irradiance = integral(polygon, index)
                 reflected = irradiance[:, None] * samples.diffuse_albedo[index]
                 radiance[group, index] += reflected * _of(light.radiance, index)
+
+
+def lobe_width(samples, index) -> np.ndarray:
+    """About how many radians (Q,) wide the specular lobes are: alpha."""
+    return np.maximum(samples.roughness[index].astype(np.float64), 1e-3) ** 2
 
 
 def _focused(light, view, index, polygon, sharp, integral, count):
@@ -111,7 +117,8 @@ def shade_specular(samples, lights, table, radiance, error=None):
         if table == REFERENCE:
             parts = reference_integrals(samples, cosine, frame, light, corners, lit, error)
         else:
-            visible = visible_parts(samples, frame, light, corners, lit, samples.geometric_normal)
+            width = lobe_width(samples, lit)
+            visible = seen_parts(samples, frame, light, corners, lit, width, samples.geometric_normal)
             parts = (
                 (index, _table_integrals(table, lobe, samples, frame, light, index, polygon))
                 for index, polygon in visible

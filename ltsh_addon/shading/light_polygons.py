@@ -10,6 +10,29 @@ from .polygon import split_at_horizon
 MOSTLY_WHOLE = 0.6
 
 
+# Corners of a round light by how far it reaches, in units of the lobe's width where it meets the light: below 8 of them
+# 32 corners are within 0.1 % of an ellipse, and so on.
+ROUND_CORNERS = (32, 64, 128, 256)
+_ROUND_LIMITS = (8.0, 40.0, 300.0)
+_FOCUSED_ROUND_CORNERS = 64
+
+
+def round_levels(light, position, width):
+    """Yield (corners (V, 3), chosen (Q',), None for all) of a round light for points with x, y, z in `position`
+    (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    offset = [position[axis] - light.center[axis] for axis in range(3)]
+    height = np.abs(sum(offset[axis] * light.direction[axis] for axis in range(3)))
+    reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
+    beyond = np.sqrt(sum(component * component for component in offset)) - reach
+    distance = np.maximum(np.maximum(height, beyond), 1e-12 * reach)
+    level = np.searchsorted(_ROUND_LIMITS, reach / (distance * width))
+    for number in np.unique(level):
+        count = ROUND_CORNERS[number]
+        corners = light.polygon(min(count, _FOCUSED_ROUND_CORNERS) if light.is_focused else count)
+        chosen = np.nonzero(level == number)[0]
+        yield corners, None if len(chosen) == len(level) else chosen
+
+
 def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
     """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import light_cone
+from .light_polygons import round_levels
 from .polygon import split_at_horizon
 
 
@@ -60,6 +61,16 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
     for outer, polygon in parts:
         for inner, clipped in split_at_horizon(polygon):
             yield index[outer][inner], clipped
+
+
+def seen_parts(samples, frame, light, corners, candidates, width, second_normal=None):
+    """As `visible_parts`; round lights have as many corners as lobes of `width` (Q,) or a number ask for."""
+    levels = [(corners, None)]
+    if light.is_round:
+        levels = round_levels(light, samples.position[candidates].T, width)
+    for corners, chosen in levels:
+        of_level = candidates if chosen is None else candidates[chosen]
+        yield from visible_parts(samples, frame, light, corners, of_level, second_normal)
 
 
 def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:

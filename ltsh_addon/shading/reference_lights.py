@@ -11,7 +11,7 @@ from .convex_pieces import convex_pieces
 from .local_view import in_front, light_view, to_local, visible_parts
 from .polygon import split_at_horizon
 
-FINE_ROUND_LIGHT_CORNERS = 64
+FINE_ROUND_LIGHT_CORNERS = 128
 # Per arc of a cone's edge, where the factor of the spread is 0.
 CONE_CHORDS = 4
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from . import double_precision, edge_loop, light_cone, ridge_table
-from .light_polygons import integrate_visible, local_corners
+from .light_polygons import integrate_visible, local_corners, round_levels
 
 # Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
 # multiple of a page long, where the cache would hold few of them.
@@ -43,7 +43,7 @@ def shade_diffuse(samples, lights, radiance, scratch):
                 integrate = _ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
             colors = _columns(samples.diffuse_albedo, index)[None]
             integrate = integrate or _Cosine(scratch)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, 1.0, radiance, fragile, scratch)
     _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
 
 
@@ -60,8 +60,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
             integrate = _LobeIntegral(ridges, weights, scratch)
-            colors = color_rows(index)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+            colors, width = color_rows(index), double_precision.lobe_width(samples, index)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch)
 
     def in_double(part, items, target):
         double_precision.shade_specular(part, items, table, target)
@@ -94,13 +94,13 @@ def _add_double(samples, members, lights, radiance, shade):
 
 
 def _add_fragile(samples, lights, fragile, radiance, shade):
-    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all lights with equally
-    many corners in one batch, for there are few such samples."""
+    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all plain lights with
+    equally many corners in one batch, for there are few such samples."""
     found = [(item, np.concatenate(parts)) for item, parts in zip(lights, fragile, strict=True) if parts]
     for item, index in found:
-        if item[0].is_focused:
+        if item[0].is_focused or item[0].is_round:
             _add_double(samples, index, [item], radiance, shade)
-    found = [(item, index) for item, index in found if not item[0].is_focused]
+    found = [(item, index) for item, index in found if not (item[0].is_focused or item[0].is_round)]
     for count in sorted({len(item[2]) for item, _ in found}):
         chosen = [(item, index) for item, index in found if len(item[2]) == count]
         members = np.concatenate([index for _, index in chosen])
@@ -121,11 +121,12 @@ def _add_fragile(samples, lights, fragile, radiance, shade):
             np.add.at(radiance, (group[part], members[part]), target[0].astype(np.float32))
 
 
-def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch):
+def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch):
     """Add the light of all `lights` at the samples `index` (Q,) to radiance (G, P, 3).
 
     rows (C, 3, Q) are the axes of the coordinates that `integrate` wants, colors (F, 3, Q) the reflectances of its
-    integrals. Points left to double precision are appended to `fragile`, per light.
+    integrals, `width` that of the lobes as for `round_levels`. Points left to double precision are appended to
+    `fragile`, per light.
     """
     position = np.ascontiguousarray(samples.position[index].T)
     sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
@@ -134,9 +135,7 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
         if light.spread < NARROW_SPREAD:
             fragile[number].append(index if allowed is None else index[allowed])
             continue
-        step = max(CORNERS // len(corners), 512)
-        for start in range(0, len(index), step):
-            part = slice(start, start + step)
+        for part, outline in _batches(light, corners, position, width):
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
             facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
             if allowed is not None:
@@ -145,7 +144,7 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
             if light.is_focused:
                 of_part = _Focused(light, offset, axes, of_part, len(colors))
                 axes = of_part.rows
-            polygons = local_corners(light, corners, offset, axes, scratch)
+            polygons = local_corners(light, outline, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
             if redo.any():
                 found[:, redo] = 0.0
@@ -160,6 +159,17 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
             # Terms that cancel in the Fresnel factor may leave a rest below zero.
             np.maximum(reflected, np.float32(0.0), out=reflected)
         radiance[group, index] += reflected.T
+
+
+def _batches(light, corners, position, width):
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3)) of all points, in batches."""
+    levels = round_levels(light, position, width) if light.is_round else [(corners, None)]
+    for corners, chosen in levels:
+        count = position.shape[1] if chosen is None else len(chosen)
+        step = max(CORNERS // len(corners), 512)
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            yield part if chosen is None else chosen[part], corners
 
 
 def _dot(a, b):

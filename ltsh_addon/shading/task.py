@@ -10,7 +10,6 @@ from ..scene import AreaLight, SurfaceSamples
 from . import double_precision, light_cone, single_precision
 from .lookup_table import LookupTable
 
-ROUND_LIGHT_CORNERS = 32
 # Double precision arrays of this many samples stay in the cache.
 DOUBLE_CHUNK = 4096
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
@@ -50,7 +49,7 @@ class Task:
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
         prepared = [
-            (light, self.groups.index(light.group), light.polygon(ROUND_LIGHT_CORNERS)) for light in self.lights
+            (light, self.groups.index(light.group), light.polygon()) for light in self.lights
         ]
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
@@ -74,7 +73,7 @@ class Task:
 
 def _corners_integrated(light, is_reference):
     """About how many corners the integrals over a light have."""
-    count = len(light.polygon(ROUND_LIGHT_CORNERS))
+    count = len(light.polygon())
     if light.is_focused:
         count *= (2 * light_cone.chord_count(count) + 1) * (1 if is_reference else light_cone.LAYERS)
     return count

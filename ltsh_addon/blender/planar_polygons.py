@@ -12,7 +12,7 @@ PLANE_ANGLE = 1e-3
 PLANE_DISTANCE = 1e-5
 # A union of triangles is flat up to this distance by its extent.
 FLATNESS = 1e-4
-# A corner with a smaller sine is on a straight edge.
+# A corner this close to the line between its neighbors is on a straight edge, by the size of the coordinates.
 STRAIGHT = 1e-6
 # Products of triangles and vertices in the test for hollows; beyond, it looks at a share of the triangles.
 HOLLOW_PRODUCTS = 20_000_000
@@ -116,9 +116,10 @@ def _outline(vertices, triangles) -> np.ndarray | None:
 
 def _without_straight_corners(corners):
     before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
-    sine = np.linalg.norm(np.cross(before, after), axis=-1)
-    bent = sine > STRAIGHT * np.linalg.norm(before, axis=-1) * np.linalg.norm(after, axis=-1)
-    return corners[bent]
+    chord = np.linalg.norm(before + after, axis=-1)
+    area = np.linalg.norm(np.cross(before, after), axis=-1)
+    limit = STRAIGHT * max(np.abs(corners).max(), np.ptp(corners, axis=0).max())
+    return corners[area > limit * chord]
 
 
 def _normal(corners: np.ndarray) -> np.ndarray:

@@ -85,7 +85,7 @@ class Comparison:
             "frame": extraction.frame,
             "resolution": [self.film.width, self.film.height],
             "sub_samples": self.film.sub_samples,
-            "surface_samples": len(extraction.samples),
+            "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": [
                 {"name": light.name, "shape": light.shape, "group": light.group, "radiance": light.radiance.tolist()}

@@ -1,7 +1,7 @@
 """Shader outputs (AOVs) that carry what shading needs, put into the materials of the opened file (runs in the child).
 
-Supported are Principled BSDF, Glossy BSDF and Diffuse BSDF with anything feeding their sockets. What else Cycles would
-render is named in a warning and shaded as the nearest of these.
+Every material is a weighted sum of BSDF nodes, each of them a lobe with its own AOVs. What Cycles renders and the
+lobes cannot say is named in a warning and shaded as the nearest lobe.
 """
 
 from __future__ import annotations
@@ -10,82 +10,31 @@ from dataclasses import dataclass, field
 
 import bpy
 
-from .gbuffer import AOV_PREFIX, AOVS, LOBES
-from .shader_graph import (
-    TRANSPARENT_NODES,
-    BsdfSearch,
-    ensure_nodes,
-    fill_with_bsdf,
-    live_link,
-    material_output,
-)
+from .aov_injection import write_aov, write_lobe
+from .aovs import MAX_LOBES
+from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves
+from .bsdf_lobes import cut_alpha, emits, lobe_of
+from .shader_graph import ensure_nodes, fill_with_bsdf, is_constant, live_link, material_output
 
-# Socket -> value at which it changes nothing; absent sockets (by version) are skipped.
-NEUTRAL_PRINCIPLED = {
-    "Diffuse Roughness": 0.0,
-    "Subsurface Weight": 0.0,
-    "Specular Tint": (1.0, 1.0, 1.0),
-    "Anisotropic": 0.0,
-    "Transmission Weight": 0.0,
-    "Coat Weight": 0.0,
-    "Sheen Weight": 0.0,
-    "Thin Film Thickness": 0.0,
-}
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
 RECEIVER_PROPERTY = "ltsh_receiver"
-NEUTRAL_GLOSSY = {"Anisotropy": 0.0}
-NEUTRAL_DIFFUSE = {"Roughness": 0.0}
-
-# BSDF -> (lobe, {AOV: socket name or constant}).
-LOBE_SOCKETS = {
-    "ShaderNodeBsdfPrincipled": (
-        "principled",
-        {
-            "color": "Base Color",
-            "roughness": "Roughness",
-            "metallic": "Metallic",
-            "ior": "IOR",
-            "specular_level": "Specular IOR Level",
-        },
-    ),
-    "ShaderNodeBsdfAnisotropic": ("glossy", {"color": "Color", "roughness": "Roughness"}),
-    "ShaderNodeBsdfDiffuse": ("none", {"roughness": 1.0}),
-    "ShaderNodeBsdfGlass": ("principled", {"roughness": "Roughness", "ior": "IOR", "specular_level": 0.5}),
-    "ShaderNodeBsdfMetallic": ("principled", {"color": "Base Color", "roughness": "Roughness", "metallic": 1.0}),
-}
-SUPPORTED = ("ShaderNodeBsdfPrincipled", "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfDiffuse")
-NEAREST = {
-    "ShaderNodeBsdfGlass": "shaded as the reflection of a dielectric",
-    "ShaderNodeBsdfMetallic": "shaded as a Principled metal",
-}
 
 
 @dataclass
 class MaterialReport:
-    """Warnings about materials; the multiple-scattering ones are gathered into one line."""
+    """Warnings about materials."""
 
     warnings: list[str] = field(default_factory=list)
-    emitters: frozenset[str] = frozenset()  # names of materials of whose emission nothing is said
-    multiple_scattering: list[str] = field(default_factory=list)
 
     def warn(self, material_name: str, message: str) -> None:
         """Note `message` about a material once."""
-        if material_name in self.emitters and message.startswith("emission"):
-            return
         line = f"material {material_name!r}: {message}"
         if line not in self.warnings:
             self.warnings.append(line)
 
     def lines(self) -> list[str]:
         """All warnings."""
-        gathered = []
-        if self.multiple_scattering:
-            names = ", ".join(repr(name) for name in sorted(self.multiple_scattering))
-            gathered.append(
-                "distribution Multiscatter GGX is shaded as GGX (rough surfaces come out darker than in Cycles), "
-                f"materials: {names}"
-            )
-        return self.warnings + gathered
+        return list(self.warnings)
 
 
 def materials_in_use(surfaces: list, override=None) -> list:
@@ -128,134 +77,91 @@ def give_default_material(objects: list):
     return material
 
 
+@dataclass(frozen=True)
+class _Lobes:
+    """The lobes of one material: those of its leaves that have one, and what each writes."""
+
+    material: object
+    leaves: tuple[Leaf, ...]
+    values: tuple[dict, ...]
+
+
 def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str] = frozenset()) -> None:
-    """Make every material write the quantities of `gbuffer.AOVS`; cut transparency and volumes.
+    """Make every material write the quantities of `aovs`; cut transparency and volumes.
 
     Materials light nothing, but for those with a full name in `emitters`, of whose emission nothing is said either.
     """
-    report.emitters = frozenset(material.name for material in materials if material.name_full in emitters)
+    found = []
     for material in materials:
         ensure_nodes(material)
-        if material.name_full not in emitters:
+        emitter = material.name_full in emitters
+        if not emitter:
             material.cycles.emission_sampling = "NONE"
-        _inject_into(material, report)
+        lobes = _lobes_of(material, emitter, report)
+        if lobes is not None:
+            found.append(lobes)
+            _write_hit(material)
+    # A slot has the same AOVs in all materials.
+    for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
+        users = [lobes for lobes in found if len(lobes.leaves) > slot]
+        names = sorted({name for lobes in users for name in lobes.values[slot]})
+        for lobes in users:
+            write_lobe(lobes.leaves[slot].tree, slot, lobes.values[slot], names)
 
 
-def declare_aovs(view_layer) -> None:
-    """Add the passes of `gbuffer.AOVS` to `view_layer`."""
-    for name, kind in AOVS.items():
-        aov = view_layer.aovs.add()
-        aov.name, aov.type = AOV_PREFIX + name, kind
+def _lobes_of(material, emitter: bool, report: MaterialReport) -> _Lobes | None:
+    """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface."""
 
-
-def remove_aovs(view_layer) -> None:
-    """Take the passes of `declare_aovs` out again."""
-    for aov in [aov for aov in view_layer.aovs if aov.name.startswith(AOV_PREFIX)]:
-        view_layer.aovs.remove(aov)
-
-
-def _inject_into(material, report: MaterialReport) -> None:
-    tree = material.node_tree
-    output = material_output(tree)
-    found = None
-    if output is not None:
-        volume = live_link(output.inputs["Volume"])
-        if volume is not None:
-            tree.links.remove(volume)
-            report.warn(material.name, "its volume is not shaded; left out of the Cycles reference as well")
-        found = BsdfSearch(lambda message: report.warn(material.name, message)).find(tree, output.inputs["Surface"])
-    if found is None:
-        _add_aovs(tree, None, "none", {"roughness": 1.0}, material)
-        return
-    tree, node = found
-    if node.bl_idname in TRANSPARENT_NODES:
-        return  # nothing to shade: rays and AOVs go on to the next surface
-    lobe, sockets = LOBE_SOCKETS.get(node.bl_idname, ("none", {"roughness": 1.0}))
-    _note_unsupported(material, tree, node, report)
-    _add_aovs(tree, node, lobe, sockets, material)
-
-
-def _note_unsupported(material, tree, node, report: MaterialReport) -> None:
     def warn(message):
         report.warn(material.name, message)
 
-    kind = node.bl_idname
-    if kind == "ShaderNodeEmission":
+    tree = material.node_tree
+    output = material_output(tree)
+    if output is None:
+        return _Lobes(material, (), ())
+    volume = live_link(output.inputs["Volume"])
+    if volume is not None:
+        tree.links.remove(volume)
+        warn("its volume is not shaded; left out of the Cycles reference as well")
+    leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
+    if leaves and all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
+        return None
+    if not emitter and any(emits(leaf.node) for leaf in leaves):
         warn("emission is not shaded and lights nothing, in the Cycles reference neither")
-        return
-    if kind not in SUPPORTED:
-        warn(f"node {node.name!r} is not supported, {NEAREST.get(kind, 'its specular part is not shaded')}")
-    neutral = {
-        "ShaderNodeBsdfPrincipled": NEUTRAL_PRINCIPLED,
-        "ShaderNodeBsdfAnisotropic": NEUTRAL_GLOSSY,
-        "ShaderNodeBsdfDiffuse": NEUTRAL_DIFFUSE,
-    }.get(kind, {})
-    for name, value in neutral.items():
-        if name in node.inputs and not _is_constant(node.inputs[name], value):
-            warn(f"{name} of {node.name!r} is not shaded")
-    if kind == "ShaderNodeBsdfPrincipled":
-        _cut_principled_extras(tree, node, warn)
-    distribution = getattr(node, "distribution", "GGX")
-    if distribution == "MULTI_GGX" and kind in SUPPORTED:
-        report.multiple_scattering.append(material.name)
-    elif distribution != "GGX" and kind in SUPPORTED:
-        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")
+    pairs = []
+    for leaf in leaves:
+        if leaf.node.bl_idname == "ShaderNodeEmission":
+            continue
+        cut_alpha(leaf.tree, leaf.node, warn)
+        values = lobe_of(leaf.node, warn)
+        if values:
+            share = {} if is_constant(leaf.weight, 1.0) else {"weight": leaf.weight}
+            pairs.append((leaf, {**values, **share}))
+    pairs = _largest(pairs, warn)
+    return _Lobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
 
 
-def _cut_principled_extras(tree, node, warn) -> None:
-    alpha = node.inputs["Alpha"]
-    if not _is_constant(alpha, 1.0):
-        warn(f"Alpha of {node.name!r} is cut, the surface is shaded and rendered opaque")
-        _cut(tree, alpha)
-        alpha.default_value = 1.0
-    strength, color = node.inputs["Emission Strength"], node.inputs["Emission Color"]
-    if not _is_constant(strength, 0.0) and not _is_constant(color, (0.0, 0.0, 0.0)):
-        warn("emission is not shaded and lights nothing, in the Cycles reference neither")
+def _largest(pairs: list, warn) -> list:
+    """The MAX_LOBES pairs (leaf, values) of largest weight, as far as constants tell, in their order."""
+    if len(pairs) <= MAX_LOBES:
+        return pairs
+    order = sorted(range(len(pairs)), key=lambda index: -pairs[index][0].bound)
+    dropped = ", ".join(repr(pairs[index][0].node.name) for index in order[MAX_LOBES:])
+    warn(f"it has {len(pairs)} BSDF nodes, of which {MAX_LOBES} are shaded, not {dropped}")
+    return [pairs[index] for index in sorted(order[:MAX_LOBES])]
 
 
-def _cut(tree, socket) -> None:
-    for link in list(socket.links):
-        tree.links.remove(link)
-
-
-def _is_constant(socket, value) -> bool:
-    if live_link(socket) is not None:
-        return False
-    found = socket.default_value
-    if isinstance(value, tuple):
-        return all(abs(a - b) < 1e-6 for a, b in zip(found, value, strict=False))
-    return abs(found - value) < 1e-6
-
-
-def _add_aovs(tree, node, lobe: str, sockets: dict, material) -> None:
-    """AOV nodes beside `node` (inside the group where it is), fed by what feeds its `sockets`."""
+def _write_hit(material) -> None:
+    """AOVs of what a hit has once, however many lobes."""
+    tree = material.node_tree
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
-    _aov(tree, "hit", 1.0)
-    _aov(tree, "lobe", LOBES[lobe])
     receiver = tree.nodes.new("ShaderNodeAttribute")
     # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
     receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
-    _aov(tree, "receiver", receiver.outputs["Fac"])
-    _aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
-    _aov(tree, "position", geometry.outputs["Position"])
-    _aov(tree, "incoming", geometry.outputs["Incoming"])
-    _aov(tree, "smooth_normal", geometry.outputs["Normal"])
-    _aov(tree, "true_normal", geometry.outputs["True Normal"])
-    normal = live_link(node.inputs["Normal"]) if node is not None and "Normal" in node.inputs else None
-    _aov(tree, "normal", normal.from_socket if normal else geometry.outputs["Normal"])
-    for name, wanted in sockets.items():
-        if isinstance(wanted, str):
-            link = live_link(node.inputs[wanted])
-            wanted = link.from_socket if link else node.inputs[wanted].default_value
-        _aov(tree, name, wanted)
-
-
-def _aov(tree, name: str, value) -> None:
-    """One AOV output: `value` is a socket, a number or a color."""
-    node = tree.nodes.new("ShaderNodeOutputAOV")
-    node.aov_name = AOV_PREFIX + name
-    target = node.inputs["Color" if AOVS[name] == "COLOR" else "Value"]
-    if isinstance(value, bpy.types.NodeSocket):
-        tree.links.new(value, target)
-    else:
-        target.default_value = value
+    write_aov(tree, "hit", 1.0)
+    write_aov(tree, "receiver", receiver.outputs["Fac"])
+    write_aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
+    write_aov(tree, "position", geometry.outputs["Position"])
+    write_aov(tree, "incoming", geometry.outputs["Incoming"])
+    write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
+    write_aov(tree, "true_normal", geometry.outputs["True Normal"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .materials import declare_aovs, remove_aovs
+from .aov_injection import declare_aovs, remove_aovs
 from .render_settings import enable_passes, pin_pixel_filter, render_exr, shifted_pixels, sub_pixel_offsets
 
 

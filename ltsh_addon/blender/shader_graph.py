@@ -1,17 +1,14 @@
-"""Finding the BSDF that a material shows, through groups, reroutes, muted nodes and mixes (runs in the child).
+"""Small steps through node trees and numbers computed by nodes (runs in the child).
 
-The node trees are those of the file as opened in the child, so they are edited freely: groups on the way are made
-single-user (their copies receive outputs that other users must not), transparency is cut.
+The node trees are those of the file as opened in the child, so they are edited freely. A number is a Python float where
+it is constant, and the socket of the same tree that computes it where it is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import bpy
 
-TRANSPARENT_NODES = ("ShaderNodeBsdfTransparent", "ShaderNodeHoldout")
-PREFERRED_NODES = ("ShaderNodeBsdfPrincipled", "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfDiffuse")
+GROUP_SOCKET_NAME = "ltsh weight"
 
 
 def live_link(socket):
@@ -22,109 +19,120 @@ def live_link(socket):
     return None
 
 
+def value_of(socket):
+    """The socket that feeds the input `socket`, or its own value: a number or a tuple."""
+    link = live_link(socket)
+    if link is not None:
+        return link.from_socket
+    value = socket.default_value
+    return tuple(value) if hasattr(value, "__len__") else float(value)
+
+
+def is_socket(value) -> bool:
+    """True for what nodes compute, False for constants."""
+    return isinstance(value, bpy.types.NodeSocket)
+
+
+def is_constant(value, expected) -> bool:
+    """True where `value` (of `value_of`) is the constant `expected`, a number or the first components of a tuple."""
+    if is_socket(value):
+        return False
+    found = value if isinstance(value, tuple) else (value,)
+    wanted = expected if isinstance(expected, tuple) else (expected,)
+    return all(abs(a - b) < 1e-6 for a, b in zip(found, wanted, strict=False))
+
+
 def material_output(tree):
     """The Material Output that Cycles uses, or None."""
     return tree.get_output_node("CYCLES") or tree.get_output_node("ALL")
 
 
-class BsdfSearch:
-    """Walks from a material's Surface input to one BSDF; `warn` receives what had to be cut or ignored."""
-
-    def __init__(self, warn: Callable[[str], None]):
-        self.warn = warn
-        self.groups: list = []  # (tree, group node) from the material inwards
-
-    def find(self, tree, socket):
-        """(tree, node) of the BSDF behind the input `socket` of `tree`, or None if nothing is linked."""
-        link = live_link(socket)
-        if link is None:
-            return None
-        node, output = link.from_node, link.from_socket
-        if node.mute:
-            inner = [passed.from_socket for passed in node.internal_links if passed.to_socket == output]
-            return self.find(tree, inner[0]) if inner else None
-        if node.bl_idname == "NodeReroute":
-            return self.find(tree, node.inputs[0])
-        if node.bl_idname == "ShaderNodeGroup":
-            return self._find_in_group(tree, node, output)
-        if node.bl_idname == "NodeGroupInput":
-            return self._find_outside_group(output)
-        if node.bl_idname == "ShaderNodeMixShader":
-            return self._find_in_mix(tree, node)
-        if node.bl_idname == "ShaderNodeAddShader":
-            return self._find_in_sum(tree, node)
-        return tree, node
-
-    def _find_in_group(self, tree, node, output):
-        if node.node_tree is None:
-            return None
-        node.node_tree = node.node_tree.copy()
-        outputs = [
-            inner for inner in node.node_tree.nodes if inner.bl_idname == "NodeGroupOutput" and inner.is_active_output
-        ]
-        sockets = [socket for inner in outputs for socket in inner.inputs if socket.identifier == output.identifier]
-        if not sockets:
-            return None
-        self.groups.append((tree, node))
-        found = self.find(node.node_tree, sockets[0])
-        # A shader that came in through Group Input has emptied the stack further on purpose.
-        if self.groups and self.groups[-1][1] == node:
-            self.groups.pop()
-        return found
-
-    def _find_outside_group(self, output):
-        if not self.groups:
-            return None
-        tree, node = self.groups.pop()
-        sockets = [socket for socket in node.inputs if socket.identifier == output.identifier]
-        return self.find(tree, sockets[0]) if sockets else None
-
-    def _find_in_mix(self, tree, node):
-        factor, branches = node.inputs[0], [node.inputs[1], node.inputs[2]]
-        kinds = [self._peek(socket) for socket in branches]
-        for index, kind in enumerate(kinds):
-            other = live_link(branches[1 - index])
-            if kind in TRANSPARENT_NODES and kinds[1 - index] not in TRANSPARENT_NODES and other is not None:
-                self.warn(f"transparency of node {node.name!r} is cut, the surface is shaded and rendered opaque")
-                _bypass(tree, node, other.from_socket)
-                return self.find(tree, branches[1 - index])
-        if live_link(factor) is None and factor.default_value in (0.0, 1.0):
-            return self.find(tree, branches[int(factor.default_value)])
-        # The larger share first; a supported BSDF before any other.
-        order = [1, 0] if live_link(factor) is None and factor.default_value > 0.5 else [0, 1]
-        order.sort(key=lambda index: kinds[index] not in PREFERRED_NODES)
-        return self._choose(tree, node, [branches[index] for index in order])
-
-    def _find_in_sum(self, tree, node):
-        branches = [socket for socket in node.inputs if live_link(socket) is not None]
-        lit = [socket for socket in branches if self._peek(socket) != "ShaderNodeEmission"]
-        if len(lit) < len(branches) and lit:
-            self.warn(f"emission in node {node.name!r} is not shaded")
-        lit.sort(key=lambda socket: self._peek(socket) not in PREFERRED_NODES)
-        if len(lit) == 1:
-            return self.find(tree, lit[0])
-        return self._choose(tree, node, lit or branches)
-
-    def _choose(self, tree, node, branches):
-        for socket in branches:
-            found = self.find(tree, socket)
-            if found is not None:
-                self.warn(f"node {node.name!r} combines several BSDFs, only the lobe of {found[1].name!r} is shaded")
-                return found
-        return None
-
-    def _peek(self, socket) -> str:
-        """Type of the node behind `socket`, past reroutes; "" when unlinked."""
-        link = live_link(socket)
-        while link is not None and link.from_node.bl_idname == "NodeReroute":
-            link = live_link(link.from_node.inputs[0])
-        return link.from_node.bl_idname if link else ""
+def group_output(tree):
+    """The Group Output in use of a group's `tree`, or None."""
+    for node in tree.nodes:
+        if node.bl_idname == "NodeGroupOutput" and node.is_active_output:
+            return node
+    return None
 
 
-def _bypass(tree, node, source) -> None:
-    """Feed everything that `node` feeds from `source` instead."""
+def socket_named(sockets, identifier: str):
+    """The socket with `identifier`, or None."""
+    return next((socket for socket in sockets if socket.identifier == identifier), None)
+
+
+def passed_through(node, output):
+    """The input socket that a muted `node` hands on to its `output`, or None."""
+    return next((link.from_socket for link in node.internal_links if link.to_socket == output), None)
+
+
+def bypass(tree, node, source) -> None:
+    """Feed everything that `node` feeds from the socket `source` instead."""
     for target in [link.to_socket for link in node.outputs[0].links]:
         tree.links.new(source, target)
+
+
+def cut(tree, socket) -> None:
+    """Take away what feeds the input `socket`."""
+    for link in list(socket.links):
+        tree.links.remove(link)
+
+
+def _math(tree, operation: str, first, second, clamp: bool = False):
+    node = tree.nodes.new("ShaderNodeMath")
+    node.operation, node.use_clamp = operation, clamp
+    for value, socket in zip((first, second), node.inputs, strict=False):
+        if is_socket(value):
+            tree.links.new(value, socket)
+        else:
+            socket.default_value = value
+    return node.outputs[0]
+
+
+def product(tree, first, second):
+    """first * second."""
+    if not is_socket(first) and not is_socket(second):
+        return first * second
+    for constant, other in ((first, second), (second, first)):
+        if not is_socket(constant) and constant in (0.0, 1.0):
+            return other if constant else 0.0
+    return _math(tree, "MULTIPLY", first, second)
+
+
+def total(tree, first, second):
+    """first + second."""
+    if not is_socket(first) and not is_socket(second):
+        return first + second
+    return _math(tree, "ADD", first, second)
+
+
+def mix_weights(tree, factor):
+    """Weights of both inputs of a Mix Shader node whose factor socket is `factor`; Cycles clamps the factor."""
+    value = value_of(factor)
+    if not is_socket(value):
+        value = min(max(value, 0.0), 1.0)
+        return 1.0 - value, value
+    clamped = _math(tree, "ADD", value, 0.0, clamp=True)
+    return _math(tree, "SUBTRACT", 1.0, clamped), clamped
+
+
+def carry_into_group(tree, group, value):
+    """The same number inside the node `group` of `tree`, whose node tree has no other user."""
+    if not is_socket(value):
+        return value
+    inner = group.node_tree
+    item = inner.interface.new_socket(GROUP_SOCKET_NAME, in_out="INPUT", socket_type="NodeSocketFloat")
+    tree.links.new(value, socket_named(group.inputs, item.identifier))
+    return socket_named(inner.nodes.new("NodeGroupInput").outputs, item.identifier)
+
+
+def carry_out_of_group(group, value):
+    """The same number outside the node `group`, computed in its node tree, which has no other user."""
+    if not is_socket(value):
+        return value
+    inner = group.node_tree
+    item = inner.interface.new_socket(GROUP_SOCKET_NAME, in_out="OUTPUT", socket_type="NodeSocketFloat")
+    inner.links.new(value, socket_named(group_output(inner).inputs, item.identifier))
+    return socket_named(group.outputs, item.identifier)
 
 
 def ensure_nodes(material) -> None:

@@ -99,7 +99,7 @@ def bsdf_material(node_type, name="Material", **inputs):
     """A material of one BSDF with GGX distribution; (material, node). Underscores in input names stand for spaces."""
     material, tree, output = new_material(name)
     node = tree.nodes.new(node_type)
-    if hasattr(node, "distribution"):
+    if hasattr(node, "distribution") and node_type != "ShaderNodeBsdfSheen":
         node.distribution = "GGX"
     for key, value in inputs.items():
         node.inputs[key.replace("_", " ")].default_value = value

@@ -1,0 +1,155 @@
+"""What the sockets of BSDF nodes mean for the lobes of `aovs`, and what of them is not shaded (runs in the child)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import bpy
+
+from .aovs import LOBE_AOVS, LOBE_KINDS
+from .shader_graph import cut, is_constant, is_socket, live_link, value_of
+
+PRINCIPLED = "ShaderNodeBsdfPrincipled"
+# BSDF -> kind of lobe, {AOV of aovs.LOBE_AOVS: socket name}.
+LOBE_SOCKETS = {
+    PRINCIPLED: (
+        "principled",
+        {
+            "color": "Base Color",
+            "roughness": "Roughness",
+            "metallic": "Metallic",
+            "ior": "IOR",
+            "specular_level": "Specular IOR Level",
+            "tint": "Specular Tint",
+            "transmission": "Transmission Weight",
+            "coat_weight": "Coat Weight",
+            "coat_roughness": "Coat Roughness",
+            "coat_ior": "Coat IOR",
+            "coat_tint": "Coat Tint",
+            "coat_normal": "Coat Normal",
+        },
+    ),
+    "ShaderNodeBsdfAnisotropic": ("glossy", {"color": "Color", "roughness": "Roughness"}),
+    "ShaderNodeBsdfDiffuse": ("diffuse", {"color": "Color"}),
+    "ShaderNodeBsdfTranslucent": ("translucent", {"color": "Color"}),
+    "ShaderNodeBsdfGlass": ("glass", {"color": "Color", "roughness": "Roughness", "ior": "IOR"}),
+    "ShaderNodeBsdfSheen": ("diffuse", {"color": "Color"}),
+    "ShaderNodeSubsurfaceScattering": ("diffuse", {"color": "Color"}),
+    "ShaderNodeBsdfToon": ("diffuse", {"color": "Color"}),
+}
+CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
+METALLIC_SOCKETS = {
+    "F82": ("metal", {"color": "Base Color", "tint": "Edge Tint", "roughness": "Roughness"}),
+    "PHYSICAL_CONDUCTOR": (CONDUCTOR, {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
+}
+# Node -> what stands in for it where it is not exact.
+NEAREST = {
+    "ShaderNodeBsdfGlass": "only its reflection is shaded",
+    "ShaderNodeBsdfSheen": "it is shaded as a Diffuse BSDF of the same albedo",
+    "ShaderNodeSubsurfaceScattering": "it is shaded as a Diffuse BSDF",
+    "ShaderNodeBsdfToon": "it is shaded as a Diffuse BSDF of the same albedo",
+    "ShaderNodeBsdfRefraction": "it is not shaded",
+}
+# Node -> {socket: (value at which it changes nothing, what is done)}; sockets absent in a version are skipped.
+NOT_SHADED = {
+    PRINCIPLED: {
+        "Diffuse Roughness": (0.0, "is shaded as 0"),
+        "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
+        "Anisotropic": (0.0, "is shaded as 0"),
+        "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
+        "Sheen Weight": (0.0, "is shaded as diffuse reflection of the same albedo"),
+        "Thin Film Thickness": (0.0, "is shaded as 0"),
+    },
+    "ShaderNodeBsdfAnisotropic": {"Anisotropy": (0.0, "is shaded as 0")},
+    "ShaderNodeBsdfDiffuse": {"Roughness": (0.0, "is shaded as 0")},
+    "ShaderNodeBsdfGlass": {"Thin Film Thickness": (0.0, "is shaded as 0")},
+    "ShaderNodeBsdfMetallic": {
+        "Anisotropy": (0.0, "is shaded as 0"),
+        "Thin Film Thickness": (0.0, "is shaded as 0"),
+    },
+}
+# Nodes whose lobe is multiplied by what multiple scattering adds.
+MULTIPLE_SCATTERING_NODES = (
+    PRINCIPLED,
+    "ShaderNodeBsdfAnisotropic",
+    "ShaderNodeBsdfMetallic",
+    "ShaderNodeBsdfGlass",
+)
+
+
+def lobe_of(node, warn: Callable[[str], None]) -> dict:
+    """What the BSDF `node` writes: AOV of `aovs.LOBE_AOVS` -> value of `shader_graph.value_of`; {} without a lobe.
+
+    Quantities that change nothing are left out. `warn` gets what is not shaded as Cycles does.
+    """
+    sockets = LOBE_SOCKETS.get(node.bl_idname)
+    if node.bl_idname == "ShaderNodeBsdfMetallic":
+        sockets = METALLIC_SOCKETS[node.fresnel_type]
+    if sockets is None or (node.bl_idname == "ShaderNodeBsdfToon" and node.component != "DIFFUSE"):
+        warn(f"node {node.name!r} is not supported, {NEAREST['ShaderNodeBsdfRefraction']}")
+        return {}
+    _note_unsupported(node, warn)
+    kind, names = sockets
+    values = {"kind": LOBE_KINDS[kind], **{aov: value_of(node.inputs[name]) for aov, name in names.items()}}
+    normal = live_link(node.inputs["Normal"])
+    if normal is not None:
+        values["normal"] = normal.from_socket
+    if kind == "principled":
+        _complete_coat(node, values)
+    if getattr(node, "distribution", "") == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES:
+        values["multiple_scattering"] = 1.0
+    if kind == "glass" or "transmission" in values:
+        backfacing = node.id_data.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
+        values["backfacing"] = backfacing
+    return {name: value for name, value in values.items() if name == "kind" or not _is_neutral(name, value)}
+
+
+def cut_alpha(tree, node, warn: Callable[[str], None]) -> None:
+    """Make a Principled BSDF `node` of `tree` opaque."""
+    if node.bl_idname != PRINCIPLED or is_constant(value_of(node.inputs["Alpha"]), 1.0):
+        return
+    warn(f"Alpha of {node.name!r} is cut, the surface is shaded and rendered opaque")
+    cut(tree, node.inputs["Alpha"])
+    node.inputs["Alpha"].default_value = 1.0
+
+
+def emits(node) -> bool:
+    """True for shader nodes that shine."""
+    if node.bl_idname == "ShaderNodeEmission":
+        return True
+    if node.bl_idname != PRINCIPLED:
+        return False
+    strength, color = value_of(node.inputs["Emission Strength"]), value_of(node.inputs["Emission Color"])
+    return not is_constant(strength, 0.0) and not is_constant(color, (0.0, 0.0, 0.0))
+
+
+def _is_neutral(name, value) -> bool:
+    kind, neutral = LOBE_AOVS[name]
+    return neutral is not None and is_constant(value, neutral)
+
+
+def _complete_coat(node, values) -> None:
+    """Leave the coat out where its weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
+    if _is_neutral("coat_weight", values["coat_weight"]):
+        for name in [name for name in values if name.startswith("coat_")]:
+            del values[name]
+    elif live_link(node.inputs["Coat Normal"]) is None:
+        del values["coat_normal"]
+    if _is_neutral("transmission", values["transmission"]):
+        del values["transmission"]
+
+
+def _note_unsupported(node, warn) -> None:
+    kind = node.bl_idname
+    if kind in NEAREST:
+        warn(f"node {node.name!r} is not supported, {NEAREST[kind]}")
+    for name, (neutral, done) in NOT_SHADED.get(kind, {}).items():
+        if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
+            warn(f"{name} of {node.name!r} {done}")
+    if kind == PRINCIPLED:
+        ior = value_of(node.inputs["IOR"])
+        if not is_socket(ior) and ior < 1.0:
+            warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
+    distribution = getattr(node, "distribution", "GGX")
+    if distribution not in ("GGX", "MULTI_GGX", "MICROFIBER", "ASHIKHMIN"):
+        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")

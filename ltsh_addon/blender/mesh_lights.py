@@ -12,7 +12,7 @@ from ..scene import AreaLight
 from .emission_nodes import Emission, emission_behind
 from .inventory import SURFACE_TYPES, EmitterTraits, RenderedSurface, surface_instancer
 from .light_linking import Receivers
-from .shader_graph import material_output
+from .shader_graph import live_link, material_output
 
 
 @dataclass
@@ -57,7 +57,8 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
         if ob.type not in SURFACE_TYPES or not instance.show_self:
             continue
         traits = EmitterTraits.of(instance)
-        key = (ob.original.name_full, ob.data.name_full if ob.data else "", traits)
+        slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
+        key = (ob.original.name_full, ob.data.name_full if ob.data else "", slots, traits)
         if key not in found:
             found[key] = _mesh_light(ob, traits, override, receivers, known)
             if found[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
@@ -104,6 +105,12 @@ def _emission_of(material, known: dict[str, Emission]) -> Emission:
         output = material_output(tree) if tree else None
         known[material.name_full] = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
     return known[material.name_full]
+
+
+def displaces(material) -> bool:
+    """True if something feeds the Displacement socket of `material`."""
+    output = material_output(material.node_tree)
+    return output is not None and live_link(output.inputs["Displacement"]) is not None
 
 
 def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement | None:

@@ -254,6 +254,39 @@ def test_the_reference_leaves_other_surfaces_hidden(tmp_path):
     assert_agrees(tmp_path, samples=512)
 
 
+def test_a_material_override_that_emits_makes_lamps_of_all_surfaces(tmp_path):
+    start()
+    add_lamp_plane(scene_parts.principled("Not lit")[0])
+    material, _ = scene_parts.principled("Override", Roughness=0.5, Emission_Strength=3.0)
+    bpy.context.view_layer.material_override = material
+    prepared = assert_agrees(tmp_path, samples=512)
+    assert [light.name for light in prepared[2].lights] == ["Plane", "Plane", "Lamp", "Lamp"]
+
+
+def test_transparency_over_emission_is_cut_in_both(tmp_path):
+    """Half transparent lamps shine as Cycles' reference shows them, which has them opaque and says so."""
+    start()
+    material, tree, output = scene_parts.new_material("Veil")
+    mix, emission = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeEmission")
+    emission.inputs["Strength"].default_value = 20.0
+    tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+    tree.links.new(emission.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    add_lamp_plane(material)
+    assert_agrees(tmp_path)
+
+
+def test_displacement_of_a_lamp_is_named():
+    start()
+    material, _ = lamp_material()
+    material.displacement_method = "DISPLACEMENT"
+    tree = material.node_tree
+    output = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputMaterial")
+    tree.links.new(tree.nodes.new("ShaderNodeDisplacement").outputs[0], output.inputs["Displacement"])
+    add_lamp_plane(material)
+    assert sum("'Lamp'" in line and "displacement" in line for line in scene_parts.prepare()[3]) == 1
+
+
 def test_the_camera_sees_lamps_as_before(tmp_path):
     """Letting light through is for rays that light, not for the camera's."""
     start()

@@ -103,11 +103,12 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
     """SIDE_PROPERTY of an object."""
     sides = set()
     for placement in mesh_light.placements:
-        vertices, triangles = placement.vertices, placement.triangles
+        vertices = placement.vertices
+        triangles = planar_polygons.welded(vertices, placement.triangles)
         closed = planar_polygons.is_closed(triangles)
         if planar_polygons.hides_itself(vertices, triangles, closed):
             warn(f"object {mesh_light.ob.name!r}: its faces may stand in their own light, shaded as if they did not")
-        outward = int(np.sign(planar_polygons.signed_volume(vertices, triangles))) if closed else 0
+        outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
         sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
     return sides.pop() if len(sides) == 1 else 0
 

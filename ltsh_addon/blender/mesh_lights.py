@@ -54,7 +54,7 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type not in SURFACE_TYPES or not instance.show_self:
+        if ob.type not in SURFACE_TYPES or not instance.show_self or not _is_rendered(ob):
             continue
         traits = EmitterTraits.of(instance)
         slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
@@ -72,6 +72,11 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
                 if instancer is not None:
                     found[key].instancers[instancer.original.name_full] = instancer
     return [light for light in found.values() if light is not None and light.placements]
+
+
+def _is_rendered(ob) -> bool:
+    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
+    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
 
 
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:

@@ -245,6 +245,32 @@ def test_evaluated_geometry_and_all_instances_shine(tmp_path):
     assert len(prepared[2].lights) == 8
 
 
+@pytest.mark.parametrize("extrude", [0.0, 0.03])
+def test_text_shines_once(tmp_path, extrude):
+    """Blender shows renders a text and the mesh that it makes."""
+    start()
+    text = bpy.data.curves.new("Sign", "FONT")
+    text.body, text.extrude = "LI", extrude
+    text.materials.append(lamp_material()[0])
+    sign = scene_parts.link(
+        bpy.data.objects.new("Sign", text), location=(-0.4, 1.2, 1.0), rotation=(math.pi - 0.7, 0.0, 0.0)
+    )
+    sign.visible_camera = False
+    lights = assert_agrees(tmp_path, samples=1024, count=16, tolerance=6e-3)[2].lights
+    assert {light.name for light in lights} == {"Sign"}
+
+
+def test_a_sheet_of_two_layers_shines_once_to_each_side(tmp_path):
+    start()
+    corners = [(-0.5, -0.3, 0.0), (0.5, -0.3, 0.0), (0.5, 0.3, 0.0), (-0.5, 0.3, 0.0)]
+    sheet = scene_parts.add_mesh(
+        "Sheet", corners * 2, [(0, 1, 2, 3), (7, 6, 5, 4)], location=(0.0, 1.0, 1.2), rotation=(-0.7, 0.0, 0.0)
+    )
+    sheet.data.materials.append(lamp_material()[0])
+    sheet.visible_camera = False
+    assert len(assert_agrees(tmp_path, samples=1024, tolerance=6e-3)[2].lights) == 2
+
+
 def test_the_reference_leaves_other_surfaces_hidden(tmp_path):
     """A plain wall in front of a lamp takes nothing from its light."""
     start()

@@ -99,7 +99,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [_light_record(light) for light in inventory.lights],
+        "lights": [light_record(light) for light in inventory.lights],
         "warnings": warnings,
         "samples": samples,
         "reference": reference,
@@ -124,6 +124,6 @@ def _picture(scene, job: dict) -> dict:
     }
 
 
-def _light_record(light) -> dict:
+def light_record(light) -> dict:
     """`light` as JSON has it; AreaLight(**record) reads it back."""
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}

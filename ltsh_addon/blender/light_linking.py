@@ -2,7 +2,8 @@
 
 Measured in 4.5.15 and 5.2.3: a light with a receiver collection reaches what the collection includes, or everything
 if it includes nothing, except what it excludes. Items that stand in the collection directly and its child collections
-have a state; all that is inside a child has the child's state. An instance follows its instancer where that is an
+have a state; all that is inside a child has the child's state. Where an object has several, the last child's counts,
+and its own before those. An instance follows its instancer where that is an
 item of any receiver collection, otherwise its own object.
 """
 
@@ -29,11 +30,12 @@ class LinkedObjects:
 
 def linked_objects(collection) -> LinkedObjects:
     """What the receiver `collection` includes and excludes."""
-    names = {"INCLUDE": set(), "EXCLUDE": set()}
-    for item, ob in zip(collection.collection_objects, collection.objects, strict=True):
-        names[item.light_linking.link_state].add(ob.name_full)
+    states = {}
     for item, child in zip(collection.collection_children, collection.children, strict=True):
-        names[item.light_linking.link_state].update(ob.name_full for ob in child.all_objects)
+        states.update(dict.fromkeys((ob.name_full for ob in child.all_objects), item.light_linking.link_state))
+    for item, ob in zip(collection.collection_objects, collection.objects, strict=True):
+        states[ob.name_full] = item.light_linking.link_state
+    names = {state: {name for name, own in states.items() if own == state} for state in ("INCLUDE", "EXCLUDE")}
     return LinkedObjects(frozenset(names["INCLUDE"]), frozenset(names["EXCLUDE"]))
 
 

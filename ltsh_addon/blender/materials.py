@@ -162,7 +162,8 @@ def _write_hit(material) -> None:
     tree = material.node_tree
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
     receiver = tree.nodes.new("ShaderNodeAttribute")
-    receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
+    # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
+    receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
     write_aov(tree, "hit", 1.0)
     write_aov(tree, "receiver", receiver.outputs["Fac"])
     write_aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)

@@ -6,6 +6,7 @@ one side is hidden, so only the other counts: that toward the camera, mostly the
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import bpy
@@ -14,7 +15,7 @@ import numpy as np
 from ..scene import AreaLight
 from . import planar_polygons
 from .emission_look import PIXELS, Studio
-from .mesh_lights import MeshLight, Placement
+from .mesh_lights import MeshLight, Placement, displaces
 from .patches import ERROR, GRID, cut_into_patches, split_light
 from .planar_polygons import FlatPolygon
 
@@ -28,14 +29,38 @@ STAND_INS = 32
 FEW_POLYGONS = 16
 
 
+@contextmanager
+def _undisplaced(found: list[MeshLight]):
+    """Meanwhile no material moves the faces out of the camera's sight."""
+    methods = {
+        material.name_full: (material, material.displacement_method)
+        for mesh_light in found
+        for material in mesh_light.materials
+        if material is not None
+    }
+    try:
+        for material, _ in methods.values():
+            material.displacement_method = "BUMP"
+        yield
+    finally:
+        for material, method in methods.values():
+            material.displacement_method = method
+
+
 def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
     """The lights that the objects `found` are, seen from the camera at `eye` (3,).
 
     Objects that shine get the custom property SIDE_PROPERTY.
     """
+    for mesh_light in found:
+        _note_what_is_lost(mesh_light, warn)
+    with _undisplaced(found):
+        return _lights_of_all(found, studio, eye, warn)
+
+
+def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
     lights, known = [], {}
     for mesh_light in found:
-        _note_directions(mesh_light, warn)
         radiance = [
             _material_radiance(studio, material, known) if emission.emits and not emission.varies else np.zeros((2, 3))
             for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True)
@@ -65,22 +90,25 @@ def mark_transparent(ob, side: int, materials: list) -> None:
             material[SIDE_PROPERTY] = 0
 
 
-def _note_directions(mesh_light: MeshLight, warn) -> None:
+def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
     for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
         if emission.emits and emission.directional:
             nodes = ", ".join(sorted(emission.directional))
             warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
+        if emission.emits and material.displacement_method != "BUMP" and displaces(material):
+            warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
 
 def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
     """SIDE_PROPERTY of an object."""
     sides = set()
     for placement in mesh_light.placements:
-        vertices, triangles = placement.vertices, placement.triangles
+        vertices = placement.vertices
+        triangles = planar_polygons.welded(vertices, placement.triangles)
         closed = planar_polygons.is_closed(triangles)
         if planar_polygons.hides_itself(vertices, triangles, closed):
             warn(f"object {mesh_light.ob.name!r}: its faces may stand in their own light, shaded as if they did not")
-        outward = int(np.sign(planar_polygons.signed_volume(vertices, triangles))) if closed else 0
+        outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
         sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
     return sides.pop() if len(sides) == 1 else 0
 

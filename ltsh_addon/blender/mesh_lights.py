@@ -12,7 +12,7 @@ from ..scene import AreaLight
 from .emission_nodes import Emission, emission_behind
 from .inventory import SURFACE_TYPES, EmitterTraits, RenderedSurface, surface_instancer
 from .light_linking import Receivers
-from .shader_graph import material_output
+from .shader_graph import live_link, material_output
 
 
 @dataclass
@@ -54,10 +54,11 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type not in SURFACE_TYPES or not instance.show_self:
+        if ob.type not in SURFACE_TYPES or not instance.show_self or not _is_rendered(ob):
             continue
         traits = EmitterTraits.of(instance)
-        key = (ob.original.name_full, ob.data.name_full if ob.data else "", traits)
+        slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
+        key = (ob.original.name_full, ob.data.name_full if ob.data else "", slots, traits)
         if key not in found:
             found[key] = _mesh_light(ob, traits, override, receivers, known)
             if found[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
@@ -71,6 +72,11 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
                 if instancer is not None:
                     found[key].instancers[instancer.original.name_full] = instancer
     return [light for light in found.values() if light is not None and light.placements]
+
+
+def _is_rendered(ob) -> bool:
+    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
+    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
 
 
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
@@ -104,6 +110,12 @@ def _emission_of(material, known: dict[str, Emission]) -> Emission:
         output = material_output(tree) if tree else None
         known[material.name_full] = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
     return known[material.name_full]
+
+
+def displaces(material) -> bool:
+    """True if something feeds the Displacement socket of `material`."""
+    output = material_output(material.node_tree)
+    return output is not None and live_link(output.inputs["Displacement"]) is not None
 
 
 def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement | None:

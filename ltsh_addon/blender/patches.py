@@ -19,6 +19,8 @@ ERROR = 0.02
 GRID = 64
 # Corners of the polygon that stands for an ellipse cut into patches: 2e-3 of its radius from it, with its area.
 ROUND_CORNERS = 64
+# Largest rectangle at the edge of a round light with a spread, whose half axes are 1.
+FOCUSED_EDGE = 0.125
 
 
 @dataclass(frozen=True)
@@ -105,20 +107,49 @@ def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
     outline = _outline(light)
     parts = []
     for cell, radiance in zip(patches.cells, patches.radiance, strict=True):
-        left, right, bottom, top = cell
-        center = light.center + 0.5 * (left + right) * light.half_u + 0.5 * (bottom + top) * light.half_v
-        half_u, half_v = 0.5 * (right - left) * light.half_u, 0.5 * (top - bottom) * light.half_v
-        part = replace(light, center=center, half_u=half_u, half_v=half_v, radiance=radiance)
-        if light.shape in ("SQUARE", "RECTANGLE"):
-            parts.append(replace(part, shape="RECTANGLE"))
-            continue
-        inside = clip_to_cell(outline, cell)
-        area = polygon_area(inside)
-        if area >= (1.0 - 1e-6) * (right - left) * (top - bottom):
-            parts.append(replace(part, shape="RECTANGLE", corners=None))
-        elif area > 1e-9 * (right - left) * (top - bottom):
-            parts.append(replace(part, shape="POLYGON", corners=_in_space(light, inside)))
+        parts.extend(_light_of_cell(replace(light, radiance=radiance), outline, cell))
     return parts
+
+
+def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLight]:
+    """The part of `light` in `cell`; `outline` (V, 2) is that of the light where it is no rectangle."""
+    size = (cell[1] - cell[0]) * (cell[3] - cell[2])
+    inside = outline if light.shape in ("SQUARE", "RECTANGLE") else clip_to_cell(outline, cell)
+    share = polygon_area(inside) / size
+    if light.shape in ("SQUARE", "RECTANGLE") or share >= 1.0 - 1e-6:
+        return [_rectangle(light, cell)]
+    if share <= 1e-9:
+        return []
+    if not light.is_focused:
+        whole = _rectangle(light, cell)
+        return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
+    # Polygons have no spread: small rectangles with the same power stand for the edge.
+    if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
+        return [part for half in _halves(cell) for part in _light_of_cell(light, outline, half)]
+    bounds = np.stack([inside.min(axis=0), inside.max(axis=0)], axis=-1).ravel()
+    full = (bounds[1] - bounds[0]) * (bounds[3] - bounds[2])
+    return [_rectangle(replace(light, radiance=light.radiance * share * size / full), bounds)]
+
+
+def _halves(cell) -> list[tuple]:
+    left, right, bottom, top = cell
+    if right - left >= top - bottom:
+        middle = 0.5 * (left + right)
+        return [(left, middle, bottom, top), (middle, right, bottom, top)]
+    middle = 0.5 * (bottom + top)
+    return [(left, right, bottom, middle), (left, right, middle, top)]
+
+
+def _rectangle(light: AreaLight, cell) -> AreaLight:
+    left, right, bottom, top = cell
+    return replace(
+        light,
+        shape="RECTANGLE",
+        corners=None,
+        center=light.center + 0.5 * (left + right) * light.half_u + 0.5 * (bottom + top) * light.half_v,
+        half_u=0.5 * (right - left) * light.half_u,
+        half_v=0.5 * (top - bottom) * light.half_v,
+    )
 
 
 def _outline(light: AreaLight) -> np.ndarray:
@@ -129,7 +160,8 @@ def _outline(light: AreaLight) -> np.ndarray:
         outline = np.linalg.lstsq(axes, offset.T, rcond=None)[0].T
         return outline if signed_area(outline) > 0.0 else outline[::-1]
     step = 2.0 * np.pi / ROUND_CORNERS
-    angle = step * np.arange(ROUND_CORNERS)
+    # No corner where the ellipse touches its rectangle: the polygon stays inside.
+    angle = step * (np.arange(ROUND_CORNERS) + 0.5)
     return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 

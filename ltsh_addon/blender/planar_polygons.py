@@ -12,8 +12,10 @@ PLANE_ANGLE = 1e-3
 PLANE_DISTANCE = 1e-5
 # A union of triangles is flat up to this distance by its extent.
 FLATNESS = 1e-4
-# A corner with a smaller sine is on a straight edge.
+# A corner this close to the line between its neighbors is on a straight edge, by the size of the coordinates.
 STRAIGHT = 1e-6
+# Volume by the cube of its extent below which a closed surface is a sheet.
+SHEET = 1e-6
 # Products of triangles and vertices in the test for hollows; beyond, it looks at a share of the triangles.
 HOLLOW_PRODUCTS = 20_000_000
 MOST_ISLANDS = 64
@@ -116,9 +118,10 @@ def _outline(vertices, triangles) -> np.ndarray | None:
 
 def _without_straight_corners(corners):
     before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
-    sine = np.linalg.norm(np.cross(before, after), axis=-1)
-    bent = sine > STRAIGHT * np.linalg.norm(before, axis=-1) * np.linalg.norm(after, axis=-1)
-    return corners[bent]
+    chord = np.linalg.norm(before + after, axis=-1)
+    area = np.linalg.norm(np.cross(before, after), axis=-1)
+    limit = STRAIGHT * max(np.abs(corners).max(), np.ptp(corners, axis=0).max())
+    return corners[area > limit * chord]
 
 
 def _normal(corners: np.ndarray) -> np.ndarray:
@@ -126,6 +129,20 @@ def _normal(corners: np.ndarray) -> np.ndarray:
     offset = corners - corners.mean(axis=0)
     normal = np.cross(offset, np.roll(offset, -1, axis=0)).sum(axis=0)
     return normal / np.linalg.norm(normal)
+
+
+def welded(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The `triangles` (T, 3) with one index for all vertices (N, 3) in the same place."""
+    _, first, number = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    return first[number.ravel()[triangles]]
+
+
+def outward_side(vertices: np.ndarray, triangles: np.ndarray) -> int:
+    """The side on which closed `triangles` (T, 3) are seen: 1 where their normals point, -1 the other.
+
+    A sheet of two layers, front and back, has no volume: each layer is seen from where its normal points.
+    """
+    return -1 if signed_volume(vertices, triangles) < -SHEET * np.ptp(vertices, axis=0).max() ** 3 else 1
 
 
 def is_closed(triangles: np.ndarray) -> bool:
@@ -186,7 +203,7 @@ def _is_hollow(vertices, triangles, closed: bool) -> bool:
     lengths = np.linalg.norm(normals, axis=-1)
     solid = lengths > 0.0
     normals, first = normals[solid] / lengths[solid, None], first[solid] - used_center
-    outward = np.sign(signed_volume(vertices, triangles)) if closed else 1.0
+    outward = outward_side(vertices, triangles) if closed else 1
     for start in range(0, len(first), 256):
         part = slice(start, start + 256)
         height = (used - used_center) @ normals[part].T - np.sum(first[part] * normals[part], axis=-1)

@@ -23,8 +23,8 @@ from ltsh_addon.shading import spherical_harmonics  # noqa: E402
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 BATCH = 50_000
 QUADRATURE_BATCH = 2000
-# Absolute, against quadrature: float64 on generic and on hard sets, float32 on all.
-GENERIC, HARD, SINGLE = 1e-8, 1e-7, 2e-5
+# Absolute, against quadrature; of 1e5 polygons of each set the worst were 3e-13 and 1.8e-5.
+DOUBLE, SINGLE = 1e-11, 2e-5
 # Of tiny polygons in float32, unless the lobe is a thousand times darker there than elsewhere.
 RELATIVE = 1e-4
 
@@ -112,14 +112,12 @@ def repeated(generator, count):
     return np.concatenate([polygons[:, :2], middle[:, None], polygons[:, 2:3], polygons[:, 2:]], axis=1)
 
 
-SETS = {
-    generic: GENERIC, tiny: HARD, huge: HARD, crossing: HARD, grazing: HARD, edge_on: HARD, repeated: GENERIC,
-}  # fmt: skip
+SETS = (generic, tiny, huge, crossing, grazing, edge_on, repeated)
 
 
 def against_quadrature(count, generator):
     """`count` polygons of each set and lobes of the tables, in both precisions."""
-    for kind, limit in SETS.items():
+    for kind in SETS:
         worst, start = {np.float64: 0.0, np.float32: 0.0}, time.perf_counter()
         relative = 0.0
         for first in range(0, count, QUADRATURE_BATCH):
@@ -137,10 +135,10 @@ def against_quadrature(count, generator):
                     scale = np.abs(expected)
                     relative = max(relative, (error / np.maximum(scale, 1e-3 * scale.max())).max())
         text = f"  {kind.__name__:<9} {count} polygons: "
-        text += f"float64 {worst[np.float64]:.1e} (limit {limit:.0e}), float32 {worst[np.float32]:.1e} ({SINGLE:.0e})"
+        text += f"float64 {worst[np.float64]:.1e} (limit {DOUBLE:.0e}), float32 {worst[np.float32]:.1e} ({SINGLE:.0e})"
         text += f", relative {relative:.1e} ({RELATIVE:.0e})" if kind is tiny else ""
         print(f"{text}, {time.perf_counter() - start:.0f} s", flush=True)
-        if worst[np.float64] > limit or worst[np.float32] > SINGLE or relative > RELATIVE:
+        if worst[np.float64] > DOUBLE or worst[np.float32] > SINGLE or relative > RELATIVE:
             raise SystemExit(f"{kind.__name__}: beyond the limit")
 
 

@@ -15,7 +15,6 @@ from .lobe_integrals import form_factor, integrals_on_sphere, polygon_integrals,
 from .local_view import light_view, local_frames, seen_parts, to_local
 from .lookup_table import Lobe, LookupTable
 from .reference_lights import reference_integrals
-from .ridge_table import SHARP_ROUGHNESS
 
 REFERENCE = "reference"
 
@@ -59,11 +58,10 @@ def shade_diffuse(samples, lights, radiance):
         if not light.affects_diffuse:
             continue
         for candidates, second_normal, integral in kinds:
-            for index, polygon in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
+            for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
                 if light.is_focused:
                     view = light_view(samples, frame, light, index, lambda vectors: vectors)
-                    sharp = np.zeros(len(index), bool)
-                    irradiance = _focused(light, view, index, polygon, sharp, integral, 1)[0]
+                    irradiance = _focused(light, view, effort, index, polygon, integral, 1)[0]
                 else:
                     irradiance = integral(polygon, index)
                 reflected = irradiance[:, None] * samples.diffuse_albedo[index]
@@ -75,18 +73,12 @@ def lobe_width(samples, index) -> np.ndarray:
     return np.maximum(samples.roughness[index].astype(np.float64), 1e-3) ** 2
 
 
-def _focused(light, view, index, polygon, sharp, integral, count):
+def _focused(light, view, effort, index, polygon, integral, count):
     """Integrals (count, Q) over polygons (5, W, Q) times the factor of the light's spread; integral(polygons, index) is
-    that without it. Lobes that are `sharp` (Q,) see the cone itself."""
+    that without it."""
     result = np.zeros((count, len(index)))
-    for kind in (False, True):
-        chosen = np.nonzero(sharp == kind)[0]
-        if len(chosen) == 0:
-            continue
-        chords = light_cone.chord_count(polygon.shape[1], kind)
-        flat = polygon[3:, :, chosen]
-        for near, weights, corners in light_cone.layers(view.take(chosen), flat, light.spread, chords):
-            result[:, chosen[near]] += weights * integral(corners[3:], index[chosen[near]])
+    for near, weights, corners in light_cone.layers(view, polygon[3:], light.spread, effort):
+        result[:, near] += weights * integral(corners[3:], index[near])
     return result
 
 
@@ -120,8 +112,8 @@ def shade_specular(samples, lights, table, radiance, error=None):
             width = lobe_width(samples, lit)
             visible = seen_parts(samples, frame, light, corners, lit, width, samples.geometric_normal)
             parts = (
-                (index, _table_integrals(table, lobe, samples, frame, light, index, polygon))
-                for index, polygon in visible
+                (index, _table_integrals(table, lobe, samples, frame, light, effort, index, polygon))
+                for index, polygon, effort in visible
             )
         for index, integrals in parts:
             plain, schlick, dip, dielectric = integrals[..., None]
@@ -142,7 +134,7 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
     return lobe.with_coefficients(np.stack([*lobe.coefficients[:3], dielectric]))
 
 
-def _table_integrals(table, lobe, samples, frame, light, index, polygon):
+def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon):
     """Integrals (4, Q), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
 
     def integral(polygon, index):
@@ -158,4 +150,4 @@ def _table_integrals(table, lobe, samples, frame, light, index, polygon):
         return warped if own.tilt is None else tilted(warped, own.tilt)
 
     view = light_view(samples, frame, light, index, to_lobe)
-    return _focused(light, view, index, polygon, samples.roughness[index] < SHARP_ROUGHNESS, integral, 4)
+    return _focused(light, view, effort, index, polygon, integral, 4)

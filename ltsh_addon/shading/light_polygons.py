@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from . import light_cone
 from .polygon import split_at_horizon
 
 # Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
@@ -14,7 +17,26 @@ MOSTLY_WHOLE = 0.6
 # 32 corners are within 0.1 % of an ellipse, and so on.
 ROUND_CORNERS = (32, 64, 128, 256)
 _ROUND_LIMITS = (8.0, 40.0, 300.0)
-_FOCUSED_ROUND_CORNERS = 64
+_FOCUSED_ROUND_CORNERS = (32, 64)
+
+
+def light_levels(light, corners, position, width):
+    """Yield (corners (V, 3), effort for its cone, chosen (Q',) of the points, None for all) as lobes need them.
+
+    The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q), all in double
+    precision, so that both paths come to the same decisions.
+    """
+    if light.is_focused:
+        for effort, chosen in light_cone.efforts(light, position, width):
+            if light.is_round:
+                corners = light.polygon(_FOCUSED_ROUND_CORNERS[effort.chords > 2])
+                effort = replace(effort, chords=2)
+            yield corners, effort, chosen
+    elif light.is_round:
+        for outline, chosen in round_levels(light, position, width):
+            yield outline, None, chosen
+    else:
+        yield corners, None, None
 
 
 def round_levels(light, position, width):
@@ -27,8 +49,7 @@ def round_levels(light, position, width):
     distance = np.maximum(np.maximum(height, beyond), 1e-12 * reach)
     level = np.searchsorted(_ROUND_LIMITS, reach / (distance * width))
     for number in np.unique(level):
-        count = ROUND_CORNERS[number]
-        corners = light.polygon(min(count, _FOCUSED_ROUND_CORNERS) if light.is_focused else count)
+        corners = light.polygon(ROUND_CORNERS[number])
         chosen = np.nonzero(level == number)[0]
         yield corners, None if len(chosen) == len(level) else chosen
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from . import light_cone
-from .light_polygons import round_levels
+from .light_polygons import light_levels
 from .polygon import split_at_horizon
 
 
@@ -24,11 +24,13 @@ def local_frames(normal, view):
 
 
 def in_front(samples, light, candidates):
-    """Those candidate points that lie on the side to which the light shines, and that it lights at all."""
+    """Those candidate points that lie on the side to which the light shines, in its cone, and that it lights at all."""
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )
     facing = ((samples.position[candidates] - center) * direction).sum(axis=1) > 0.0
+    if light.is_focused:
+        facing &= light_cone.may_reach(light, samples.position[candidates].T)
     allowed = light.receives(samples.receiver, candidates)
     return candidates[facing if allowed is None else facing & allowed]
 
@@ -64,13 +66,12 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
 
 
 def seen_parts(samples, frame, light, corners, candidates, width, second_normal=None):
-    """As `visible_parts`; round lights have as many corners as lobes of `width` (Q,) or a number ask for."""
-    levels = [(corners, None)]
-    if light.is_round:
-        levels = round_levels(light, samples.position[candidates].T, width)
-    for corners, chosen in levels:
+    """As `visible_parts`, (index, polygons, effort), with what lobes of `width` (Q,) or a number need of the light."""
+    position = samples.position[candidates].T
+    for outline, effort, chosen in light_levels(light, corners, position, width):
         of_level = candidates if chosen is None else candidates[chosen]
-        yield from visible_parts(samples, frame, light, corners, of_level, second_normal)
+        for index, polygon in visible_parts(samples, frame, light, outline, of_level, second_normal):
+            yield index, polygon, effort
 
 
 def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:

@@ -12,7 +12,8 @@ from functools import partial
 import numpy as np
 
 from . import double_precision, edge_loop, light_cone, ridge_table
-from .light_polygons import integrate_visible, local_corners, round_levels
+from .fresnel_kinds import any_component, columns, fresnel_kinds
+from .light_polygons import integrate_visible, light_levels, local_corners
 
 # Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
 # multiple of a page long, where the cache would hold few of them.
@@ -21,27 +22,25 @@ CORNERS = 4 * CHUNK
 DOUBLE_CHUNK = 4096
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
-# With more different indices of refraction in a block the dielectric's weights are summed up per sample.
-SEPARATE_IORS = 8
 
 
 def shade_diffuse(samples, lights, radiance, scratch):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     lights = [item for item in lights if item[0].affects_diffuse]
-    lit = np.nonzero(_any(samples.diffuse_albedo))[0]
+    lit = np.nonzero(any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
     if samples.diffuse_normal is not samples.smooth_normal:
-        bumped = _any(samples.diffuse_normal != samples.smooth_normal)[lit]
+        bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     fragile = [[] for _ in lights]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
-            rows = _normal_frame(_columns(samples.diffuse_normal, index))
+            rows = _normal_frame(columns(samples.diffuse_normal, index))
             clip_rows, integrate = (2,), None
             if is_bumped:
-                smooth = _columns(samples.smooth_normal, index)
+                smooth = columns(samples.smooth_normal, index)
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
                 integrate = _ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
-            colors = _columns(samples.diffuse_albedo, index)[None]
+            colors = columns(samples.diffuse_albedo, index)[None]
             integrate = integrate or _Cosine(scratch)
             _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, 1.0, radiance, fragile, scratch)
     _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
@@ -52,11 +51,11 @@ def shade_specular(samples, lights, table, radiance, scratch):
     lights = [item for item in lights if item[0].affects_specular]
     ridges = ridge_table.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
-    reflective = np.logical_or.reduce([_any(term) for term in terms])
+    reflective = np.logical_or.reduce([any_component(term) for term in terms])
     lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
     fragile = [[] for _ in lights]
-    for vectors, members, color_rows in _fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
+    for vectors, members, color_rows in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
             integrate = _LobeIntegral(ridges, weights, scratch)
@@ -70,18 +69,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
     _add_fragile(samples, lights, fragile, radiance, in_double)
 
 
-def _any(vectors):
-    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
-    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
-
-
 def _chunks(members):
     return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
-
-
-def _columns(vectors, index):
-    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
-    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
 
 
 def _add_double(samples, members, lights, radiance, shade):
@@ -132,17 +121,20 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, widt
     sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
     for number, (light, group, corners) in enumerate(lights):
         allowed = light.receives(samples.receiver, index)
+        if light.is_focused:
+            near = light_cone.may_reach(light, position)
+            allowed = near if allowed is None else allowed & near
         if light.spread < NARROW_SPREAD:
-            fragile[number].append(index if allowed is None else index[allowed])
+            fragile[number].append(index[allowed])
             continue
-        for part, outline in _batches(light, corners, position, width):
+        for part, outline, effort in _batches(light, corners, position, width):
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
             facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
             if allowed is not None:
                 facing &= allowed[part]
             axes, of_part = rows[:, :, part], partial(integrate, part)
             if light.is_focused:
-                of_part = _Focused(light, offset, axes, of_part, len(colors))
+                of_part = _Focused(light, effort, offset, axes, of_part, len(colors))
                 axes = of_part.rows
             polygons = local_corners(light, outline, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
@@ -162,14 +154,13 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, widt
 
 
 def _batches(light, corners, position, width):
-    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3)) of all points, in batches."""
-    levels = round_levels(light, position, width) if light.is_round else [(corners, None)]
-    for corners, chosen in levels:
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
+    for outline, effort, chosen in light_levels(light, corners, position, width):
         count = position.shape[1] if chosen is None else len(chosen)
-        step = max(CORNERS // len(corners), 512)
+        step = max(CORNERS // len(outline), 512)
         for start in range(0, count, step):
             part = slice(start, start + step)
-            yield part if chosen is None else chosen[part], corners
+            yield part if chosen is None else chosen[part], outline, effort
 
 
 def _dot(a, b):
@@ -188,8 +179,8 @@ class _Focused:
     The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
     """
 
-    def __init__(self, light, offset, axes, integrate, count):
-        self.light, self.integrate, self.count = light, integrate, count
+    def __init__(self, light, effort, offset, axes, integrate, count):
+        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
         self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
         plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
         self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
@@ -197,16 +188,14 @@ class _Focused:
     def __call__(self, corners, index):
         index = np.arange(corners.shape[2]) if index is None else index
         values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
-        chords = light_cone.chord_count(corners.shape[1])
-        step = max(CORNERS // (corners.shape[1] * (2 * chords + 2)), 512)
+        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
         for start in range(0, len(index), step):
             part = slice(start, start + step)
             flat, view = corners[-2:, :, part], self.view.take(index[part])
-            for number, (near, weights, polygons) in enumerate(
-                light_cone.layers(view, flat, self.light.spread, chords)
-            ):
+            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
+            for number, (near, weights, polygons) in enumerate(layers):
                 # The small disks count little, so that the rounding of their edges is lost in the sum.
-                smallest = 0.0 if number < light_cone.LAYERS - 1 else edge_loop.SMALLEST_SAFE
+                smallest = 0.0 if number < self.effort.layers - 1 else edge_loop.SMALLEST_SAFE
                 found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
                 values[:, start + near] += weights * found
                 fragile[start + near] |= redo
@@ -269,56 +258,6 @@ class _LobeIntegral:
         return np.maximum(values, np.float32(0.0), out=values), fragile
 
 
-def _fresnel_kinds(samples, members):
-    """Yield (vectors, members, colors): what part of the Fresnel terms the samples `members` need.
-
-    `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
-    """
-    dipped = _any(samples.specular_dip)[members]
-    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members] | dipped
-    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
-    dielectric = _any(samples.dielectric)[members]
-
-    def white(index):
-        return _columns(samples.specular_f0, index)[None]
-
-    def schlick(index):
-        f0 = _columns(samples.specular_f0, index)
-        return np.stack([f0, _columns(samples.specular_f90, index) - f0])
-
-    def f82(index):
-        return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
-
-    def coat(index):
-        return _columns(samples.dielectric, index)[None]
-
-    yield (0,), members[~dielectric & flat], white
-    yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
-    yield (0, 1, 2), members[~dielectric & dipped], f82
-    for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
-        yield (vector,), with_ior, coat
-    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
-        first = f82 if 2 in own else schlick
-        for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
-            yield (*own, vector), with_ior, lambda index, first=first: np.concatenate([first(index), coat(index)])
-
-
-def _by_ior(ior, members):
-    """Yield (vector, members): the dielectric's weight vector, one per index of refraction where there are few."""
-    values = ior[members]
-    if len(members) == 0:
-        return
-    if values.min() == values.max():
-        yield ("dielectric", float(values[0])), members
-        return
-    distinct, number = np.unique(values, return_inverse=True)
-    if len(distinct) > SEPARATE_IORS:
-        yield "dielectric", members
-        return
-    for position, value in enumerate(distinct):
-        yield ("dielectric", float(value)), members[number == position]
-
-
 def _normal_frame(normal):
     """Frames (3, 3, P) around normals (3, P), without a preferred tangent (Duff et al. 2017)."""
     x, y, z = normal
@@ -331,7 +270,7 @@ def _normal_frame(normal):
 
 def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
-    normal, view = _columns(samples.normal, index), _columns(samples.view, index)
+    normal, view = columns(samples.normal, index), columns(samples.view, index)
     cosine = _dot(normal, view)
     tangent = view - cosine * normal
     sine = np.sqrt(_dot(tangent, tangent))

@@ -75,5 +75,6 @@ def _corners_integrated(light, is_reference):
     """About how many corners the integrals over a light have."""
     count = len(light.polygon())
     if light.is_focused:
-        count *= (2 * light_cone.chord_count(count) + 1) * (1 if is_reference else light_cone.LAYERS)
+        effort = light_cone.EFFORTS[1]
+        count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count

@@ -141,7 +141,7 @@ class SurfaceSamples:
     dielectric: np.ndarray  # (P, 3) weight of the dielectric lobe; (P,) is taken for all colors
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
-    geometric_normal: np.ndarray | None = None  # (P, 3); left out: `normal`
+    geometric_normal: np.ndarray | None = None  # (P, 3) for the horizon of the specular lobe; left out: `normal`
     smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
     bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
     specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0

@@ -24,6 +24,7 @@ import numpy as np
 
 from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
 from . import gbuffer
+from .specular_horizon import end_at_horizons_of_cycles
 
 WORKER = Path(__file__).with_name("worker.py")
 Progress = Callable[[str, float], "bool | None"]
@@ -83,9 +84,10 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     with _temporary_folder() as folder:
         manifest = _run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings = _read_samples(manifest, folder)
+        lights = tuple(AreaLight(**record) for record in manifest["lights"])
         return Extraction(
-            lights=tuple(AreaLight(**record) for record in manifest["lights"]),
-            samples=samples,
+            lights=lights,
+            samples=end_at_horizons_of_cycles(samples, lights),
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
             reference=read_reference(manifest, folder),

@@ -44,11 +44,20 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
 
     `lobes` has for each slot the quantities of LOBE_AOVS that were written, (P,) or (P, 3).
     """
-    parts = [part for lobe in lobes for part in _parts_of_slot(hits, lobe)]
+    slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
+    parts_of_slots = [_parts_of(slot) for slot in slots]
+    parts = [part for own in parts_of_slots for part in own]
+    for slot, own in zip(slots, parts_of_slots, strict=True):
+        if slot.has("sheen_weight"):
+            _put_under_sheen(hits, slot, own, parts)
     bare = np.ones(len(hits.position), dtype=bool)
     for part in parts:
         bare[part.index] = False
-    parts.append(_bare_part(hits, np.nonzero(bare)[0]))
+    return _joined(hits, [*parts, _bare_part(hits, np.nonzero(bare)[0])])
+
+
+def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples of all parts and the hit of each, in the order of the hits."""
     index = np.concatenate([part.index for part in parts])
     order = np.argsort(index, kind="stable")
     joined = {
@@ -58,8 +67,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
     specular = np.concatenate([part.specular for part in parts], axis=1)[:, order]
     index, behind = index[order], joined["behind"]
     at_hit = hits.take(index)
-    smooth_normal = np.where(behind[:, None], joined["diffuse_normal"], at_hit.smooth_normal)
-    bumped = at_hit.corrected & ~behind
+    smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -72,7 +80,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,
-        bump_alpha2=np.where(bumped, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
+        bump_alpha2=np.where(at_hit.corrected, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
     )
     return samples, index
 
@@ -96,16 +104,45 @@ def _bare_part(hits, index) -> _Part:
     return _Part(index, normal, normal, ones, ones)
 
 
-def _parts_of_slot(hits: Hits, lobe: dict[str, np.ndarray]) -> list[_Part]:
-    """The parts of one slot."""
+def _slot_of(hits: Hits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
+    """The hits that have a lobe in one slot, or None."""
     weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
     index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
-    if len(index) == 0:
-        return []
-    slot = LobeSlot(hits, lobe, index, weight[index])
+    return LobeSlot(hits, lobe, index, weight[index]) if len(index) else None
+
+
+def _parts_of(slot: LobeSlot) -> list[_Part]:
+    """The parts of one slot, its base first."""
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
     return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
+
+
+def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
+    """Take away from the slot's `own` parts what its sheen reflects, and let it reflect that as diffuse light.
+
+    The albedo R of the sheen follows from the diffuse albedo of the hit, which is linear in R: without the sheen it
+    would be what all `parts` expect together, with it the slot's own diffuse part D becomes w s R + (1 - max(s) R) D,
+    s the weight times the tint of the sheen, w the weight of the slot.
+    """
+    expected = np.zeros_like(hits.diffuse_albedo)
+    for part in parts:
+        expected[part.index] += part.diffuse
+    base = own[0]
+    shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
+    shine = np.where(slot.of("principled"), shine, 0.0)
+    most = shine.max(axis=1, keepdims=True)
+    change = slot.weight[:, None] * shine - most * base.diffuse
+    missing = (hits.diffuse_albedo - expected)[base.index]
+    square = (change * change).sum(axis=1)
+    albedo = np.divide((missing * change).sum(axis=1), square, out=np.zeros(len(square)), where=square > 1e-9)
+    albedo = np.clip(albedo, 0.0, 1.0)[:, None]
+    left = np.ones((len(hits.position), 1))
+    left[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
+    for part in own:
+        part.specular *= left[part.index]
+        part.diffuse *= left[part.index]
+    base.diffuse += slot.weight[:, None] * shine * albedo
 
 
 def _coat_part(slot: LobeSlot):

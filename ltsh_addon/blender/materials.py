@@ -13,7 +13,7 @@ import bpy
 from .aov_injection import write_aov, write_lobe
 from .aovs import MAX_LOBES
 from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves
-from .bsdf_lobes import cut_alpha, emits, lobe_of
+from .bsdf_lobes import cut_alpha, emits, is_emission, lobe_of
 from .shader_graph import ensure_nodes, fill_with_bsdf, is_constant, live_link, material_output
 
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
@@ -118,19 +118,24 @@ def _lobes_of(material, emitter: bool, report: MaterialReport) -> _Lobes | None:
     tree = material.node_tree
     output = material_output(tree)
     if output is None:
-        return _Lobes(material, (), ())
+        output = tree.nodes.new("ShaderNodeOutputMaterial")
     volume = live_link(output.inputs["Volume"])
     if volume is not None:
         tree.links.remove(volume)
         warn("its volume is not shaded; left out of the Cycles reference as well")
     leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
-    if leaves and all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
+    if not leaves:
+        # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
+        black = tree.nodes.new("ShaderNodeBsdfDiffuse")
+        black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+        tree.links.new(black.outputs[0], output.inputs["Surface"])
+    elif all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
         return None
     if not emitter and any(emits(leaf.node) for leaf in leaves):
         warn("emission is not shaded and lights nothing, in the Cycles reference neither")
     pairs = []
     for leaf in leaves:
-        if leaf.node.bl_idname == "ShaderNodeEmission":
+        if is_emission(leaf.node):
             continue
         cut_alpha(leaf.tree, leaf.node, warn)
         values = lobe_of(leaf.node, warn)

@@ -50,6 +50,7 @@ EXACT = {
     "metallic node": {"node_type": METALLIC, "Edge Tint": TINT, "settings": MULTIPLE},
     "conductor": {"node_type": METALLIC, "settings": (*MULTIPLE, ("fresnel_type", "PHYSICAL_CONDUCTOR"))},
     "translucent": {"node_type": "ShaderNodeBsdfTranslucent"},
+    "translucent, bump": {"node_type": "ShaderNodeBsdfTranslucent", "bump": True},
 }
 # Largest error in percent of the specular and of the diffuse part, as measured with both Blenders, and some.
 APPROXIMATED = {
@@ -60,8 +61,10 @@ APPROXIMATED = {
     "IOR below 1": ({"IOR": 0.7}, (13.0, 0.5)),
     "subsurface": ({"Subsurface Weight": 0.5, "Subsurface Scale": 0.02}, (0.5, 3.0)),
     "anisotropic": ({"Metallic": 1.0, "Anisotropic": 0.5}, (25.0, None)),
-    "sheen": ({"Sheen Weight": 0.3}, (10.0, 10.0)),
-    "Beckmann": ({"node_type": GLOSSY, "settings": (("distribution", "BECKMANN"),)}, (30.0, None)),
+    "sheen": ({"Sheen Weight": 0.3, "Sheen Tint": TINT}, (0.5, 5.0)),
+    "sheen on metal": ({"Sheen Weight": 0.6, "Metallic": 1.0, "settings": MULTIPLE, **COAT}, (0.5, 60.0)),
+    "Beckmann": ({"node_type": GLOSSY, "settings": (("distribution", "BECKMANN"),)}, (15.0, None)),
+    "Ashikhmin": ({"node_type": GLOSSY, "settings": (("distribution", "ASHIKHMIN_SHIRLEY"),)}, (12.0, None)),
     "diffuse roughness": ({"Diffuse Roughness": 0.5}, (0.5, 30.0)),
 }
 

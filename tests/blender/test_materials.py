@@ -8,6 +8,7 @@ import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
 from ltsh_addon.blender import gbuffer, render_settings
+from ltsh_addon.blender.materials import MaterialReport, inject_aovs
 
 # Texture coordinates and colors pass through float32 a few times.
 EXACT = 2e-6
@@ -289,3 +290,11 @@ def test_other_shaders_are_named_and_shaded_as_the_nearest(tmp_path, plane_scene
     assert len(warnings) == len(kinds) and len(surface) == 24 * 16
     for number, (line, done) in enumerate(zip(warnings, kinds.values(), strict=True)):
         assert line.startswith(f"material 'Material {number}': node '") and done in line
+
+
+def test_materials_that_shine_into_the_scene_keep_their_emission():
+    quiet, shining = (principled(name, **{"Emission Strength": 2.0})[0] for name in ("Quiet", "Shining"))
+    report = MaterialReport()
+    inject_aovs([quiet, shining], report, frozenset({"Shining"}))
+    assert quiet.cycles.emission_sampling == "NONE" and shining.cycles.emission_sampling != "NONE"
+    assert len(report.lines()) == 1 and "'Quiet'" in report.lines()[0] and "emission" in report.lines()[0]

@@ -260,3 +260,39 @@ def test_emission_beside_a_bsdf_is_a_light_and_never_a_lobe(tmp_path):
     samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.add(s.node("Emission"), s.metal())))
     assert np.array_equal(pixel, np.arange(24 * 16)) and np.abs(samples.specular_f90 - 1.0).max() < EXACT
     assert warnings == [] and "Plane" in {light.name for light in scene_parts.prepare()[2].lights}
+
+
+def test_a_color_as_surface_is_emission(tmp_path):
+    s = Shaders("Glow")
+    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.node("RGB")))
+    assert np.array_equal(pixel, np.arange(24 * 16)) and len(warnings) == 1 and "emission" in warnings[0]
+    assert not samples.specular_f90.any() and not samples.diffuse_albedo.any()
+
+
+@pytest.mark.parametrize("front", ["no output", "nothing linked", "a mix of nothing"])
+def test_what_has_no_surface_shader_is_black(tmp_path, front):
+    s = Shaders("Nothing")
+    if front == "no output":
+        s.tree.nodes.clear()
+    elif front == "a mix of nothing":
+        s.show(s.node("MixShader"))
+    add_plane(s.material, location=(0.0, 0.0, 0.5))
+    behind = Shaders("Behind")
+    samples, pixel, warnings = seen_from_above(tmp_path, behind.show(behind.metal()))
+    assert warnings == [] and np.array_equal(pixel, np.arange(24 * 16)) and np.allclose(samples.position[:, 2], 0.5)
+    assert not samples.specular_f90.any() and not samples.dielectric.any() and not samples.diffuse_albedo.any()
+
+
+def test_groups_of_a_linked_material_are_followed(tmp_path):
+    library = tmp_path / "library.blend"
+    bpy.data.libraries.write(str(library), {nested_groups()}, fake_user=True)
+    before = library.read_bytes()
+    scene_parts.empty_scene()
+    with bpy.data.libraries.load(str(library), link=True) as (_, wanted):
+        wanted.materials = ["Mix"]
+    samples, pixel, warnings = seen_from_above(tmp_path, bpy.data.materials["Mix"])
+    assert warnings == [] and np.array_equal(np.bincount(pixel), np.full(24 * 16, 4)) and library.read_bytes() == before
+    u = samples.position[::4, 0] / 6.0 + 0.5
+    # In the order of the walk: the inner glossy lobe, the metal from outside, the diffuse lobe, the outer glossy one.
+    assert np.abs(samples.specular_f90[1::4] - ((1.0 - u) * 0.75 * u)[:, None]).max() < EXACT
+    assert np.abs(samples.specular_f0[3::4] - u[:, None] * GLOSSY[:3]).max() < EXACT

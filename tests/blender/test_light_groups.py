@@ -15,6 +15,9 @@ GROUPS = ("Keys", "Lamps")
 
 def combined_by_group(folder, prepared, samples):
     """Halves (2, P, 3) of Cycles' Combined pass by light group ("" for all light), at the pixels of the samples."""
+    # The preparation takes passes of the user's own out, these among them.
+    for name in GROUPS:
+        prepared[1].lightgroups.add(name=name)
     scene_parts.reference(folder, prepared, samples)
     halves = {}
     for half in "AB":

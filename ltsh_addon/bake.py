@@ -236,7 +236,8 @@ class _ObjectBaker:
         def read_map(number):
             return maps[number].reshape(-1, 3)[texels.index]
 
-        samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view)
+        receiver = self.record["receiver"]
+        samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
         values = {}
         for order, (name, table) in enumerate(self.tables.items()):
 
@@ -301,6 +302,7 @@ class _ObjectBaker:
             "ltsh:frame": str(self.manifest["frame"]),
             "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
             "ltsh:camera": self.manifest["camera"],
+            "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
             "ltsh:version": compare.versions(self.manifest["blender_version"])["ltsh"],
         }
 

@@ -113,7 +113,7 @@ def _add_common(parser, *, cycles, resolution="as in the file"):
     parser.add_argument("--passes", type=values.passes, default=PASSES, help=f"default: {','.join(PASSES)}")
     parser.add_argument("--resolution", type=values.resolution, metavar="WxH", help=f"default: {resolution}")
     parser.add_argument("--aa", type=values.positive, default=1, metavar="N",
-                        help="sub-samples per pixel; 1: pixel centers")  # fmt: skip
+                        help="points per pixel, drawn from its filter; 1: pixel centers")  # fmt: skip
     parser.add_argument("--frame", type=values.frame, metavar="F", help="default: the file's current frame")
     parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
     parser.add_argument(

@@ -60,7 +60,7 @@ class Comparison:
         }
 
     def _radiance(self, result, pass_name) -> np.ndarray:
-        return getattr(result.shading, pass_name)
+        return self.extraction.exposure * getattr(result.shading, pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
@@ -84,8 +84,13 @@ class Comparison:
             "camera": extraction.camera,
             "frame": extraction.frame,
             "resolution": [self.film.width, self.film.height],
+            "border": None if extraction.border is None else vars(extraction.border),
+            "pixel_aspect": extraction.pixel_aspect,
+            "pixel_filter": extraction.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
+            "exposure": extraction.exposure,
+            "color_space": extraction.color_space.name,
             "sub_samples": self.film.sub_samples,
-            "surface_samples": len(extraction.samples),
+            "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": [
                 {"name": light.name, "shape": light.shape, "group": light.group, "radiance": light.radiance.tolist()}
@@ -166,11 +171,18 @@ class Comparison:
             "ltsh:frame": str(self.extraction.frame),
             "ltsh:camera": self.extraction.camera,
             "ltsh:version": document["versions"]["ltsh"],
+            "ltsh:exposure": repr(self.extraction.exposure),
+            "ltsh:color_space": self.extraction.color_space.name,
         }
+        if self.extraction.border is not None:
+            metadata["ltsh:border"] = str(self.extraction.border)
         if notice := self._subset_notice():
             metadata["ltsh:reference"] = notice
         layers, sheet = self.layers(), self.sheet() if with_cycles else None
-        imaging.write_layers(output / f"{name}.exr", layers, metadata)
+        chromaticities = imaging.chromaticities(self.extraction.color_space)
+        imaging.write_layers(
+            output / f"{name}.exr", layers, metadata, chromaticities, self.extraction.pixel_aspect
+        )
         if with_cycles:
             imaging.write_png(output / "compare.png", sheet)
             imaging.write_json(output / "report.json", document)
@@ -211,7 +223,7 @@ class Comparison:
         """The comparison sheet (H, W, 3), 8 bit: the specular pass where there is one."""
         pass_name = "specular" if "specular" in self.options.passes else self.options.passes[0]
         halves = self.cycles[pass_name]
-        mean = halves.mean(axis=0)
+        mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
         hit = self.film.coverage() > 0.0
         noise = imaging.reference_noise(halves[0], halves[1], hit)
         tiles = []
@@ -219,7 +231,8 @@ class Comparison:
             report = self._technique_report(name, pass_name)
             error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
             label = compare.LABELS.get(name, name)
-            tiles.append(imaging.Tile(label, self.images[name, pass_name], error, _caption(report)))
+            image = self.images[name, pass_name]
+            tiles.append(imaging.Tile(label, rec709(image), rec709(error), _caption(report)))
         title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
         notes = [
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
@@ -227,7 +240,7 @@ class Comparison:
         ]
         if notice := self._subset_notice():
             notes.append(notice)
-        return imaging.comparison_sheet(title, ("Cycles", mean), tiles, notes=notes)
+        return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
 
 
 def _percent(value) -> str:

@@ -40,7 +40,7 @@ class AreaLight:
     group: str = ""
     affects_diffuse: bool = True
     affects_specular: bool = True
-    corners: np.ndarray | None = None  # (V, 3) m, simple polygon, counterclockwise seen from the lit side; POLYGON only
+    corners: np.ndarray | None = None  # (V, 3) m, a simple polygon, either way around; POLYGON only
     spread: float = np.pi  # rad, full angle of the cone into which the light shines
     receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
 
@@ -65,6 +65,8 @@ class AreaLight:
             object.__setattr__(self, "corners", corners)
         if not 0.0 < self.spread <= np.pi + 1e-6:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
+        if self.shape == "POLYGON" and self.is_focused:
+            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape POLYGON")
         if self.receivers is not None:
             object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
 
@@ -73,23 +75,42 @@ class AreaLight:
         """True for DISK and ELLIPSE."""
         return self.shape in ("DISK", "ELLIPSE")
 
+    @property
+    def is_focused(self) -> bool:
+        """True where the spread matters: closer to pi the factor is 1 but for directions along the light's plane."""
+        return self.spread < np.pi - 1e-5
+
+    def receives(self, receiver: np.ndarray, index=slice(None)) -> np.ndarray | None:
+        """Mask (Q,) of the samples `index` whose `receiver` (P,) the light lights; None: it lights all."""
+        return None if self.receivers is None else np.isin(receiver[index], self.receivers)
+
+    @property
+    def area_vector(self) -> np.ndarray:
+        """Normal (3,), the area in m^2 long, around which `corners`, or half_u and half_v, run counterclockwise."""
+        if self.corners is not None:
+            offset = self.corners - self.corners[0]
+            return 0.5 * np.cross(offset, np.roll(offset, -1, axis=0)).sum(axis=0)
+        return (np.pi if self.is_round else 4.0) * np.cross(self.half_u, self.half_v)
+
     def polygon(self, round_vertices: int = 32) -> np.ndarray:
         """Corners (V, 3) in m, counterclockwise as seen from the lit side.
 
         A disk or ellipse becomes a regular polygon of `round_vertices` corners, stretched to the area of the ellipse.
         """
-        if self.corners is not None:
-            return self.corners
-        if self.is_round:
-            angle = 2.0 * np.pi * np.arange(round_vertices) / round_vertices
-            step = 2.0 * np.pi / round_vertices
-            radius = np.sqrt(step / np.sin(step))
-            s, t = radius * np.cos(angle), radius * np.sin(angle)
-        else:
-            s, t = np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
-        corners = self.center + s[:, None] * self.half_u + t[:, None] * self.half_v
-        mirrored = np.dot(np.cross(self.half_u, self.half_v), self.direction) < 0.0
-        return corners[::-1] if mirrored else corners
+        corners = self.corners
+        if corners is None:
+            s, t = self._outline(round_vertices)
+            corners = self.center + s[:, None] * self.half_u + t[:, None] * self.half_v
+        return corners[::-1] if np.dot(self.area_vector, self.direction) < 0.0 else corners
+
+    def _outline(self, round_vertices):
+        """Corners s, t (V,) in units of half_u and half_v."""
+        if not self.is_round:
+            return np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
+        angle = 2.0 * np.pi * np.arange(round_vertices) / round_vertices
+        step = 2.0 * np.pi / round_vertices
+        radius = np.sqrt(step / np.sin(step))
+        return radius * np.cos(angle), radius * np.sin(angle)
 
 
 # Fields of SurfaceSamples with one number per sample; all others are vectors or colors.
@@ -120,7 +141,7 @@ class SurfaceSamples:
     dielectric: np.ndarray  # (P, 3) weight of the dielectric lobe; (P,) is taken for all colors
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
-    geometric_normal: np.ndarray | None = None  # (P, 3); left out: `normal`
+    geometric_normal: np.ndarray | None = None  # (P, 3) for the horizon of the specular lobe; left out: `normal`
     smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
     bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
     specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0
@@ -203,3 +224,46 @@ class Film:
     def coverage(self) -> np.ndarray:
         """Share (H, W) of each pixel's sub-samples that hit a surface."""
         return self.image(np.ones(self.pixel.shape[0]) if self.first is None else self.first)
+
+
+@dataclass(frozen=True)
+class Border:
+    """The rectangle of the whole picture that was rendered, in pixels from its top left corner.
+
+    `cropped` pictures have the size of the rectangle; others have that of the whole, with nothing around it.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    full_width: int
+    full_height: int
+    cropped: bool = False
+
+    def __str__(self):
+        return (
+            f"{self.width}x{self.height} at {self.left},{self.top} of {self.full_width}x{self.full_height}, "
+            f"{'cropped' if self.cropped else 'in place'}"
+        )
+
+
+@dataclass(frozen=True)
+class ColorSpace:
+    """The linear RGB space that all colors of a file are in, by its name and the matrix to linear Rec.709."""
+
+    name: str
+    to_rec709: np.ndarray  # (3, 3), with both spaces' white points made equal; applied to column vectors
+
+    def __post_init__(self):
+        matrix = np.asarray(self.to_rec709, dtype=np.float64)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise ValueError(f"color space {self.name!r}: matrix {matrix!r}, expected 3 x 3 finite numbers")
+        object.__setattr__(self, "to_rec709", matrix)
+
+    def rec709(self, colors: np.ndarray) -> np.ndarray:
+        """Colors (..., 3) of this space in linear Rec.709."""
+        return np.asarray(colors) @ self.to_rec709.T
+
+
+REC709 = ColorSpace("Linear Rec.709", np.eye(3))

@@ -15,7 +15,7 @@ import numpy as np
 
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import families, fit, optimum, table_file, validate
+from . import families, fit, grazing, optimum, table_file, validate
 from .brdfs import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -56,6 +56,9 @@ def _parser():
     bounding = actions.add_parser("optimum", help="the least error of families of lobes at single points")
     bounding.add_argument("names", nargs="*", type=_name, metavar="FAMILY", help=f"as for fit; {default}")
     bounding.add_argument("--count", type=_size, default=optimum.COUNT, metavar="N", help="points per axis, default 12")
+    bounding.add_argument(
+        "--grazing", action="store_true", help="beside the shipped tables at n.v 0.04 to 0.2, per roughness and n.v"
+    )
     bounding.set_defaults(run=_optimum)
     plotting = actions.add_parser("plot", help="draw the figures of tables/README.md")
     plotting.add_argument("-o", dest="output", type=Path, default=FOLDER.parent / "docs", metavar="OUT")
@@ -192,6 +195,8 @@ def _as_text(results):
 
 
 def _optimum(options) -> int:
+    if options.grazing:
+        return _grazing(options)
     print("| family | coefficients | moments | mean | median | 90 % | max | shipped table: mean | median |")
     print("|---" * 9 + "|")
     for name in options.names or SHIPPED_TABLES:
@@ -202,6 +207,28 @@ def _optimum(options) -> int:
             cells += [errors.mean(), np.median(errors)]
         size = f"{families.family_named(name).size} | {optimum.edge_terms(name)}"
         print(f"| `{name}` | {size} | {' | '.join(f'{cell:.4f}' for cell in cells)} |", flush=True)
+    return 0
+
+
+def _grazing(options) -> int:
+    """Shaded errors and L2 errors of a table beside those of the lobe solved at the point itself."""
+    names = [name for name in options.names or ["ltsh4"] if name in SHIPPED_TABLES and name != "ltc"]
+    if not names:
+        print("ltsh tables: --grazing needs a shipped table of spherical harmonics: ltsh2 or ltsh4", file=sys.stderr)
+        return 2
+    for name in names:
+        found = grazing.grazing_errors(load_table(name), min(options.count, len(grazing.ROUGHNESS)))
+        print(f"| `{name}` roughness | n.v | shaded error | solved | ratio | L2 error | solved | ratio |")
+        print("|---" * 8 + "|")
+        for row in found:
+            errors = f"{row.table:.4f} | {row.solved:.4f} | {row.ratio:.2f}"
+            lobes = f"{row.table_lobe:.4f} | {row.solved_lobe:.4f} | {row.table_lobe / row.solved_lobe:.2f}"
+            print(f"| {row.roughness:.2f} | {row.cosine:.3f} | {errors} | {lobes} |")
+        table, solved = (np.sqrt(np.mean([getattr(row, key) ** 2 for row in found])) for key in ("table", "solved"))
+        ratios = np.array([row.ratio for row in found])
+        print(f"root mean square {table:.4f}, solved {solved:.4f}, ratio {table / solved:.2f}; "
+              f"ratio at most {ratios.max():.2f}, above {grazing.GOAL} at {np.count_nonzero(ratios > grazing.GOAL)} "
+              f"of {len(ratios)} points", flush=True)  # fmt: skip
     return 0
 
 

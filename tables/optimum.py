@@ -46,14 +46,22 @@ class Optimum:
 
 def optimum(name: str, count: int = COUNT) -> Optimum:
     """The least errors found for the family called `name` at count x count points."""
-    family = family_named(name)
     cosine, roughness = np.array(grid(count)).T
+    errors, _ = best_lobes(family_named(name), cosine, roughness, (count, count))
+    return Optimum(name, errors, edge_terms(name))
+
+
+def best_lobes(family, cosine, roughness, shape, starts=()):
+    """Least errors (P,) and the warp parameters (P, n) that have them, at cosine (P,) and roughness (P,).
+
+    The points are a grid of `shape`, row by row; further `starts` (P, n) of the search can be given.
+    """
     theta = np.arccos(cosine)
-    best = np.full(count**2, np.inf)
-    found = np.zeros((count**2, family.parameters))
+    best = np.full(len(cosine), np.inf)
+    found = np.zeros((len(cosine), family.parameters))
 
     def search(start):
-        for part in np.split(np.arange(count**2), count):
+        for part in np.array_split(np.arange(len(cosine)), shape[0]):
             errors, parameters = _search(family, cosine[part], roughness[part], start[part])
             better = errors < best[part]
             found[part[better]], best[part[better]] = parameters[better], errors[better]
@@ -62,9 +70,11 @@ def optimum(name: str, count: int = COUNT) -> Optimum:
         start = np.zeros_like(found)
         start[:, :2], start[:, 2] = logarithm, -share * theta
         search(start)
+    for start in starts:
+        search(start)
     for shift in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        search(np.roll(found.reshape(count, count, -1), shift, axis=(0, 1)).reshape(found.shape))
-    return Optimum(name, best, edge_terms(name))
+        search(np.roll(found.reshape(*shape, -1), shift, axis=(0, 1)).reshape(found.shape))
+    return best, found
 
 
 def _search(family, cosine, roughness, start):

@@ -82,8 +82,8 @@ def _measure(table, mu, roughness):
     basis = _basis_at(table, mu, roughness, directions)
     weighted = basis * weights
     best = np.linalg.lstsq(weighted @ basis.T, weighted @ lobe, rcond=1e-13)[0] @ basis
-    disks = _disks(directions) * weights
-    exact, approximate = disks @ lobe / mass, disks @ fitted / mass
+    lit = disks(directions) * weights
+    exact, approximate = lit @ lobe / mass, lit @ fitted / mass
     return (
         np.sqrt((weights * (fitted - lobe) ** 2).sum() / squared),
         np.sqrt((weights * (best - lobe) ** 2).sum() / squared),
@@ -109,7 +109,7 @@ def _basis_at(table, mu, roughness, directions):
     return basis / np.sqrt((basis * basis).mean(axis=1, keepdims=True))
 
 
-def _disks(directions):
+def disks(directions):
     """(D, S) share of a pair of mirror-symmetric disk-shaped lights that covers each direction, spread evenly."""
     k = np.arange(LIGHTS) + 0.5
     z, azimuth = 1.0 - k / LIGHTS, np.pi * (1.0 + np.sqrt(5.0)) * k

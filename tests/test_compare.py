@@ -108,9 +108,10 @@ def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("spe
     types = {
         "scene": str, "camera": str, "frame": int, "resolution": list, "sub_samples": int, "surface_samples": int,
         "cycles_samples": int, "lights": list, "versions": dict, "tables": dict, "passes": dict, "seconds": dict,
-        "warnings": list,
+        "warnings": list, "exposure": float, "color_space": str,
+        "pixel_aspect": float, "pixel_filter": str,
     }  # fmt: skip
-    assert set(report) == {*types, "reference"}
+    assert set(report) == {*types, "reference", "border"}
     assert all(isinstance(report[key], kind) for key, kind in types.items())
     assert set(report["versions"]) == {"ltsh", "blender", "python", "numpy", "OpenEXR"}
     assert all(isinstance(version, str) and version for version in report["versions"].values())

@@ -34,6 +34,8 @@ LOBE_AOVS = {
     "multiple_scattering": ("VALUE", 0.0),  # 1 for Multiscatter GGX
     "transmission": ("VALUE", 0.0),
     "backfacing": ("VALUE", 0.0),
+    "sheen_weight": ("VALUE", 0.0),
+    "sheen_tint": ("COLOR", (1.0, 1.0, 1.0)),
     "coat_weight": ("VALUE", 0.0),
     "coat_roughness": ("VALUE", 0.03),
     "coat_ior": ("VALUE", 1.5),
@@ -48,7 +50,8 @@ LOBE_KINDS = {
     "translucent": 4.0,
     "metal": 5.0,
     "conductor": 6.0,
-    "glass": 7.0,
+    "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
+    "glass": 8.0,
 }
 
 

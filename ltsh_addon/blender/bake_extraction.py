@@ -7,13 +7,21 @@ from pathlib import Path
 
 import bpy
 
-from . import extraction, render_settings
+from . import cameras, extraction, render_settings
 from .child import SceneError
+from .color_management import working_space
 from .cycles_reference import remove_occlusion
 from .inventory import rendered_surfaces, with_render_depsgraph
-from .lights import collect_lights
+from .lights import collect_lights, seen_lights
 from .material_maps import MaterialPlan
-from .materials import MaterialReport, ensure_nodes, give_default_material, lobes_of, objects_without_material
+from .materials import (
+    RECEIVER_PROPERTY,
+    MaterialReport,
+    ensure_nodes,
+    give_default_material,
+    lobes_of,
+    objects_without_material,
+)
 from .texel_bake import (
     Block,
     ObjectBake,
@@ -33,25 +41,30 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     progress("open scene", 0.0)
     extraction.open_scene(Path(job["scene"]), warnings)
     scene = bpy.context.scene
-    if job["frame"] is not None:
-        scene.frame_set(job["frame"])
+    cameras.go_to_frame(scene, job["frame"])
     camera = _camera(scene, job)
     view_layer = render_settings.choose_view_layer(scene, warnings)
     objects = chosen_objects(scene, view_layer, job["objects"])
     render_settings.neutralize(scene, view_layer, camera, warnings)
     render_settings.prepare_surfaces(warnings)
-    inventory, meshes, problems = _inspect(scene, objects, job)
+    if view_layer.material_override is not None:
+        override = view_layer.material_override.name
+        warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
+        view_layer.material_override = None
+    inventory, meshes, problems, bare = _inspect(scene, objects, job)
+    plans = _material_plans([ob for ob in objects if ob.name in meshes], bare, inventory.emitting_materials, warnings)
+    inventory.receivers.mark()
+    lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
-    if not inventory.lights:
+    if not lights:
         raise SceneError(
             f"scene {scene.name!r}: no area light that renders, found {extraction.describe_lights(scene)}; "
             "add an area light"
         )
-    plans = _material_plans([ob for ob in objects if ob.name in meshes], warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     view = view_of(scene, job["view"], camera, bent=job["cycles_samples"] > 0)
     _look_from(scene, camera, job)
-    remove_occlusion()
+    remove_occlusion(scene)
     records = []
     for number, ob in enumerate(objects):
         record = {"name": ob.name, "problem": problems.get(ob.name)}
@@ -65,7 +78,8 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     return {
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
-        "lights": [extraction.light_record(light) for light in inventory.lights],
+        "lights": [extraction.light_record(light) for light in lights],
+        "color_space": working_space(),
         "warnings": warnings,
         "view": vars(view),
         "camera": camera.name if job["view"] == "camera" else "",
@@ -77,7 +91,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
 def _camera(scene, job):
     """The camera of the view, or one that only stands where a render needs one."""
     if job["view"] == "camera":
-        return render_settings.choose_camera(scene, job["camera"])
+        return cameras.choose_camera(scene, job["camera"])
     camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
     scene.collection.objects.link(camera)
     scene.camera = camera
@@ -93,7 +107,8 @@ def _look_from(scene, camera, job) -> None:
 
 
 def _inspect(scene, objects, job):
-    """Lights, the mesh and UV map of every object by name, and what is wrong with the others by name."""
+    """Lights, the mesh and UV map of every object by name, what is wrong with the others by name, and the surfaces
+    without material."""
 
     def visit(depsgraph):
         meshes, problems = {}, {}
@@ -104,33 +119,38 @@ def _inspect(scene, objects, job):
             except ObjectError as error:
                 problems[ob.name] = str(error)
         # Asked for here, where the depsgraph is that of a render.
-        rendered = {surface.original.name_full for surface in rendered_surfaces(depsgraph)}
+        rendered = {surface.original.name_full: surface for surface in rendered_surfaces(depsgraph)}
         for ob in objects:
             if ob.name in meshes and ob.name_full not in rendered:
                 problems[ob.name] = f"object {ob.name!r} is not rendered: its collection is excluded or hidden"
                 del meshes[ob.name]
-        return collect_lights(depsgraph), meshes, problems
+        bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
+        return collect_lights(depsgraph), meshes, problems, bare
 
     return with_render_depsgraph(scene, visit)
 
 
-def _material_plans(objects, warnings) -> dict[str, list[MaterialPlan]]:
-    """For every object by name the plans of its material slots."""
-    give_default_material(objects_without_material(objects))
+def _material_plans(objects, bare, emitting, warnings) -> dict[str, list[MaterialPlan]]:
+    """For every object by name the plans of its material slots; `bare` get a material first."""
+    give_default_material(bare)
     report, made = MaterialReport(), {}
 
     def plan(material):
         if material.name_full not in made:
             ensure_nodes(material)
-            material.cycles.emission_sampling = "NONE"
-            lobes = lobes_of(material, False, report)
+            lobes = lobes_of(material, material.name_full in emitting, report)
             values = lobes.values if lobes is not None else ()
+            if any("sheen_weight" in lobe for lobe in values):
+                report.warn(material.name, "its sheen is not baked")
             trees = tuple(leaf.tree for leaf in lobes.leaves) if lobes is not None else ()
             made[material.name_full] = MaterialPlan(material, values, trees)
         return made[material.name_full]
 
     plans = {ob.name: [plan(slot.material) for slot in ob.material_slots] for ob in objects}
     warnings.extend(report.lines())
+    for material in bpy.data.materials:
+        if material.name_full not in emitting:
+            material.cycles.emission_sampling = "NONE"
     return plans
 
 
@@ -141,6 +161,7 @@ def _object(scene, ob, mesh_and_uv, plans, job, folder, progress) -> dict:
     mesh.save(folder / "mesh.npz")
     distinct = list({id(plan): plan for plan in plans}.values())
     record = {"folder": folder.name, "uv": uv_name, "materials": [plan.record() for plan in plans], "maps": False}
+    record["receiver"] = int(ob.get(RECEIVER_PROPERTY, 0))
     record["maps"] = any(plan.count for plan in distinct)
     if not record["maps"] and not job["cycles_samples"]:
         return record

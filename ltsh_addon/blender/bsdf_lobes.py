@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from .aovs import LOBE_AOVS, LOBE_KINDS
-from .shader_graph import cut, is_constant, live_link, value_of
+from .shader_graph import cut, is_constant, is_socket, live_link, product, value_of
 
 PRINCIPLED = "ShaderNodeBsdfPrincipled"
 # BSDF -> kind of lobe, {AOV of aovs.LOBE_AOVS: socket name}.
@@ -22,6 +22,8 @@ LOBE_SOCKETS = {
             "specular_level": "Specular IOR Level",
             "tint": "Specular Tint",
             "transmission": "Transmission Weight",
+            "sheen_weight": "Sheen Weight",
+            "sheen_tint": "Sheen Tint",
             "coat_weight": "Coat Weight",
             "coat_roughness": "Coat Roughness",
             "coat_ior": "Coat IOR",
@@ -37,18 +39,21 @@ LOBE_SOCKETS = {
     "ShaderNodeSubsurfaceScattering": ("diffuse", {"color": "Color"}),
     "ShaderNodeBsdfToon": ("diffuse", {"color": "Color"}),
 }
+# Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
+NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
+CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
 METALLIC_SOCKETS = {
     "F82": ("metal", {"color": "Base Color", "tint": "Edge Tint", "roughness": "Roughness"}),
-    "PHYSICAL_CONDUCTOR": ("conductor", {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
+    "PHYSICAL_CONDUCTOR": (CONDUCTOR, {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}),
 }
-# Node -> what stands in for it where it is not exact.
+# Node -> what is said of it.
 NEAREST = {
-    "ShaderNodeBsdfGlass": "only its reflection is shaded",
-    "ShaderNodeBsdfSheen": "it is shaded as a Diffuse BSDF of the same albedo",
-    "ShaderNodeSubsurfaceScattering": "it is shaded as a Diffuse BSDF",
-    "ShaderNodeBsdfToon": "it is shaded as a Diffuse BSDF of the same albedo",
-    "ShaderNodeBsdfRefraction": "it is not shaded",
+    "ShaderNodeBsdfGlass": "lets no light through, only its reflection is shaded",
+    "ShaderNodeBsdfSheen": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
+    "ShaderNodeSubsurfaceScattering": "is not supported, it is shaded as a Diffuse BSDF",
+    "ShaderNodeBsdfToon": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
 }
+NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> {socket: (value at which it changes nothing, what is done)}; sockets absent in a version are skipped.
 NOT_SHADED = {
     PRINCIPLED: {
@@ -56,7 +61,7 @@ NOT_SHADED = {
         "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
         "Anisotropic": (0.0, "is shaded as 0"),
         "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
-        "Sheen Weight": (0.0, "is shaded as diffuse reflection of the same albedo"),
+        "Sheen Weight": (0.0, "adds diffuse reflection of the same albedo"),
         "Thin Film Thickness": (0.0, "is shaded as 0"),
     },
     "ShaderNodeBsdfAnisotropic": {"Anisotropy": (0.0, "is shaded as 0")},
@@ -68,9 +73,12 @@ NOT_SHADED = {
     },
 }
 # Nodes whose lobe is multiplied by what multiple scattering adds.
-MULTIPLE_SCATTERING_NODES = (PRINCIPLED, "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic")
-# Up to 4.5 an unlinked Coat Normal is the smooth normal, later it is the Normal socket.
-COAT_FOLLOWS_NORMAL = bpy.app.version >= (5, 0, 0)
+MULTIPLE_SCATTERING_NODES = (
+    PRINCIPLED,
+    "ShaderNodeBsdfAnisotropic",
+    "ShaderNodeBsdfMetallic",
+    "ShaderNodeBsdfGlass",
+)
 
 
 def lobe_of(node, warn: Callable[[str], None]) -> dict:
@@ -82,16 +90,19 @@ def lobe_of(node, warn: Callable[[str], None]) -> dict:
     if node.bl_idname == "ShaderNodeBsdfMetallic":
         sockets = METALLIC_SOCKETS[node.fresnel_type]
     if sockets is None or (node.bl_idname == "ShaderNodeBsdfToon" and node.component != "DIFFUSE"):
-        warn(f"node {node.name!r} is not supported, {NEAREST['ShaderNodeBsdfRefraction']}")
+        warn(f"node {node.name!r} {NOT_SUPPORTED}")
         return {}
     _note_unsupported(node, warn)
     kind, names = sockets
     values = {"kind": LOBE_KINDS[kind], **{aov: value_of(node.inputs[name]) for aov, name in names.items()}}
+    nearest_alpha = NEAREST_ALPHA.get(getattr(node, "distribution", ""))
+    if nearest_alpha is not None:
+        values["roughness"] = product(node.id_data, values["roughness"], nearest_alpha**0.5)
     normal = live_link(node.inputs["Normal"])
     if normal is not None:
         values["normal"] = normal.from_socket
     if kind == "principled":
-        _complete_coat(node, values)
+        _drop_absent_layers(node, values)
     if getattr(node, "distribution", "") == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES:
         values["multiple_scattering"] = 1.0
     if kind == "glass" or "transmission" in values:
@@ -109,9 +120,14 @@ def cut_alpha(tree, node, warn: Callable[[str], None]) -> None:
     node.inputs["Alpha"].default_value = 1.0
 
 
+def is_emission(node) -> bool:
+    """True for nodes that do nothing but shine, as a color does that is linked to a shader socket."""
+    return node.bl_idname == "ShaderNodeEmission" or all(socket.type != "SHADER" for socket in node.outputs)
+
+
 def emits(node) -> bool:
-    """True for shader nodes that shine."""
-    if node.bl_idname == "ShaderNodeEmission":
+    """True for nodes that shine."""
+    if is_emission(node):
         return True
     if node.bl_idname != PRINCIPLED:
         return False
@@ -124,15 +140,14 @@ def _is_neutral(name, value) -> bool:
     return neutral is not None and is_constant(value, neutral)
 
 
-def _complete_coat(node, values) -> None:
-    """Leave the coat out where its weight is 0; give it a normal where it has none of its own."""
-    if _is_neutral("coat_weight", values["coat_weight"]):
-        for name in [name for name in values if name.startswith("coat_")]:
-            del values[name]
-    elif live_link(node.inputs["Coat Normal"]) is None:
+def _drop_absent_layers(node, values) -> None:
+    """Leave layers out whose weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
+    for layer in ("coat", "sheen"):
+        if _is_neutral(f"{layer}_weight", values[f"{layer}_weight"]):
+            for name in [name for name in values if name.startswith(f"{layer}_")]:
+                del values[name]
+    if "coat_normal" in values and live_link(node.inputs["Coat Normal"]) is None:
         del values["coat_normal"]
-        if COAT_FOLLOWS_NORMAL and "normal" in values:
-            values["coat_normal"] = values["normal"]
     if _is_neutral("transmission", values["transmission"]):
         del values["transmission"]
 
@@ -140,12 +155,15 @@ def _complete_coat(node, values) -> None:
 def _note_unsupported(node, warn) -> None:
     kind = node.bl_idname
     if kind in NEAREST:
-        warn(f"node {node.name!r} is not supported, {NEAREST[kind]}")
+        warn(f"node {node.name!r} {NEAREST[kind]}")
     for name, (neutral, done) in NOT_SHADED.get(kind, {}).items():
         if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
             warn(f"{name} of {node.name!r} {done}")
-    if getattr(node, "fresnel_type", "") == "PHYSICAL_CONDUCTOR":
-        warn(f"Physical Conductor of {node.name!r} is shaded with the nearest curve of reflectance over angle")
-    distribution = getattr(node, "distribution", "GGX")
-    if distribution not in ("GGX", "MULTI_GGX", "MICROFIBER", "ASHIKHMIN"):
-        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX")
+    if kind == PRINCIPLED:
+        ior = value_of(node.inputs["IOR"])
+        if not is_socket(ior) and ior < 1.0:
+            warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
+    distribution = getattr(node, "distribution", "")
+    if distribution in NEAREST_ALPHA:
+        alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
+        warn(f"distribution {distribution} of {node.name!r} is shaded as GGX of {alpha}")

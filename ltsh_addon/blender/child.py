@@ -22,8 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..scene import REC709, AreaLight, Border, Cancelled, ColorSpace, Film, SurfaceSamples
 from . import gbuffer
+from .specular_horizon import end_at_horizons_of_cycles
 
 WORKER = Path(__file__).with_name("worker.py")
 Progress = Callable[[str, float], "bool | None"]
@@ -54,7 +55,10 @@ class Extraction:
     """What the child found and rendered.
 
     `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
-    W m^-2 sr^-1; `seconds` has "start", "samples" and "cycles".
+    W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
+    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
+    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
+    the lights included, are in `color_space`.
     """
 
     lights: tuple[AreaLight, ...]
@@ -66,6 +70,11 @@ class Extraction:
     frame: int
     camera: str
     seconds: dict[str, float]
+    exposure: float = 1.0
+    border: Border | None = None
+    pixel_aspect: float = 1.0
+    pixel_filter: str = "BOX"
+    color_space: ColorSpace = REC709
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -83,9 +92,10 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     with _temporary_folder() as folder:
         manifest = _run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings = _read_samples(manifest, folder)
+        lights = tuple(AreaLight(**record) for record in manifest["lights"])
         return Extraction(
-            lights=tuple(AreaLight(**record) for record in manifest["lights"]),
-            samples=samples,
+            lights=lights,
+            samples=end_at_horizons_of_cycles(samples, lights),
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
             reference=read_reference(manifest, folder),
@@ -93,6 +103,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             frame=manifest["frame"],
             camera=manifest["camera"],
             seconds=manifest["seconds"],
+            exposure=manifest["exposure"],
+            border=None if manifest["border"] is None else Border(**manifest["border"]),
+            pixel_aspect=manifest["pixel_aspect"],
+            pixel_filter=manifest["pixel_filter"],
+            color_space=_color_space(manifest["color_space"]),
         )
 
 
@@ -280,6 +295,7 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     renders, unusable, unnamed = [], 0, 0
     for index, name in enumerate(manifest["samples"]):
         channels = read_channels(folder / name)
+        gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
         unusable += bad
@@ -296,8 +312,14 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
     return samples, film, warnings
 
 
+def _color_space(record: dict) -> ColorSpace:
+    from ..imaging.color_space import identified
+
+    return identified(record["to_rec709"], record["name"])
+
+
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
-    """The two halves, each the mean of its chunks weighted by their samples."""
+    """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
     from ..imaging.exr import read_channels
 
     if manifest["reference"] is None:
@@ -312,4 +334,5 @@ def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None
             for lobe, image in sums.items():
                 light = gbuffer.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
                 image[half] += count / total * light * gbuffer.read_layer(channels, passes[f"{lobe}_color"], "RGB")
-    return {lobe: image.astype(np.float32) for lobe, image in sums.items()}
+    exposure = manifest.get("exposure", 1.0)
+    return {lobe: (exposure * image).astype(np.float32) for lobe, image in sums.items()}

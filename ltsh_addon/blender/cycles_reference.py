@@ -11,8 +11,12 @@ from pathlib import Path
 
 import bpy
 
+from .cameras import shifted_pixels
 from .inventory import SURFACE_TYPES
-from .render_settings import enable_passes, pin_pixel_filter, render_exr, shifted_pixels, sub_pixel_offsets
+from .mesh_light_faces import SIDE_PROPERTY
+from .mesh_light_shaders import let_light_through
+from .pixel_filter import pinned_pixel_filter, sub_pixel_offsets
+from .render_settings import enable_passes, render_exr
 
 SEEDS = {"A": 1, "B": 7919}
 FIRST_CHUNK = 16
@@ -20,11 +24,18 @@ CHUNK_SECONDS = 4.0
 MAX_CHUNKS = 8
 
 
-def remove_occlusion() -> None:
-    """Make every surface, instances included, invisible to all rays but the camera's."""
+def remove_occlusion(scene) -> None:
+    """Make every surface, instances included, invisible to all rays but the camera's.
+
+    Objects that shine must stay visible to the rays that they light: these go through them instead.
+    """
     for ob in bpy.data.objects:
-        if ob.type in SURFACE_TYPES:
-            ob.visible_shadow = ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = False
+        if ob.type not in SURFACE_TYPES:
+            continue
+        ob.visible_shadow = ob.visible_transmission = False
+        if SIDE_PROPERTY not in ob:
+            ob.visible_diffuse = ob.visible_glossy = False
+    let_light_through(scene)
 
 
 def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
@@ -34,23 +45,23 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
     progress only about once a minute.
     """
-    remove_occlusion()
+    remove_occlusion(scene)
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
-    pin_pixel_filter(scene)
-    samples = max(1, cycles_samples // 2)
-    if sub_samples == 1:
-        return [_render_half(scene, folder, half, seed, samples, progress) for half, seed in SEEDS.items()]
+    samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
-    return [_render_shifted(scene, folder, half, seed, sub_samples, share, progress) for half, seed in SEEDS.items()]
+    with pinned_pixel_filter(scene):
+        if sub_samples == 1:
+            return [_render_half(scene, folder, half, seed, samples, progress) for half, seed in SEEDS.items()]
+        return [_render_shifted(scene, folder, half, seed, offsets, share, progress) for half, seed in SEEDS.items()]
 
 
-def _render_shifted(scene, folder: Path, half: str, seed: int, sub_samples: int, share: int, progress) -> list[list]:
+def _render_shifted(scene, folder: Path, half: str, seed: int, offsets, share: int, progress) -> list[list]:
     """One file per sub-sample, each with the next `share` samples of one sequence."""
     cycles = scene.cycles
-    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, share * sub_samples, True
+    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, share * len(offsets), True
     files = []
-    for index, offset in enumerate(sub_pixel_offsets(sub_samples)):
-        progress(f"Cycles {half}", index / sub_samples)
+    for index, offset in enumerate(offsets):
+        progress(f"Cycles {half}", index / len(offsets))
         cycles.sample_offset, cycles.sample_subset_length = index * share, share
         files.append([f"cycles_{half}_{index:04d}.exr", share])
         with shifted_pixels(scene, offset):

@@ -6,12 +6,14 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 
-from . import render_settings
+from . import cameras, render_settings
 from .child import SceneError
+from .color_management import working_space
 from .cycles_reference import render_reference
 from .inventory import rendered_surfaces, with_render_depsgraph
-from .lights import LightInventory, collect_lights
+from .lights import LightInventory, collect_lights, seen_lights
 from .materials import (
     MaterialReport,
     give_default_material,
@@ -19,6 +21,8 @@ from .materials import (
     materials_in_use,
     objects_without_material,
 )
+from .missing_files import missing_files
+from .pixel_filter import filter_name
 from .pixel_samples import render_pixel_samples
 
 
@@ -34,6 +38,7 @@ def open_scene(path: Path, warnings: list[str]) -> None:
         warnings.append(f"{path.name} was saved by Blender {saved}; {bpy.app.version_string} may miss parts of it")
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
+    warnings.extend(missing_files())
 
 
 def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
@@ -45,17 +50,19 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
         bare = [] if override else objects_without_material(surfaces)
-        return collect_lights(depsgraph), materials_in_use(surfaces, override), bare
+        return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    default = give_default_material(bare)
+    report = MaterialReport()
+    inject_aovs(materials + ([default] if default else []), report, inventory.emitting_materials)
+    inventory.receivers.mark()
+    inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
     if not inventory.lights:
         raise SceneError(
             f"scene {scene.name!r}: no area light that renders, found {describe_lights(scene)}; add an area light"
         )
-    default = give_default_material(bare)
-    report = MaterialReport()
-    inject_aovs(materials + ([default] if default else []), report)
     warnings.extend(report.lines())
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     return inventory
@@ -72,11 +79,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings)
     scene = bpy.context.scene
-    if job["frame"] is not None:
-        scene.frame_set(job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
+    cameras.go_to_frame(scene, job["frame"])
+    camera = cameras.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    picture = _picture(scene, job)
     inventory = prepare_scene(scene, view_layer, camera, warnings)
     seconds["start"] = time.monotonic() - started
 
@@ -92,8 +98,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
         "camera": camera.name,
-        "width": width,
-        "height": height,
+        **picture,
         "lights": [light_record(light) for light in inventory.lights],
         "warnings": warnings,
         "samples": samples,
@@ -103,8 +108,22 @@ def extract(job: dict, folder: Path, progress) -> dict:
     }
 
 
+def _picture(scene, job: dict) -> dict:
+    """Set the size; what the manifest says about the picture."""
+    width, height = cameras.set_resolution(scene, job["width"], job["height"])
+    border = cameras.render_border(scene)
+    cropped = border is not None and border.cropped
+    return {
+        "width": border.width if cropped else width,
+        "height": border.height if cropped else height,
+        "border": None if border is None else vars(border),
+        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
+        "pixel_filter": filter_name(scene),
+        "exposure": scene.cycles.film_exposure,
+        "color_space": working_space(),
+    }
+
+
 def light_record(light) -> dict:
-    record = dict(vars(light))
-    for name in ("center", "half_u", "half_v", "direction", "radiance"):
-        record[name] = record[name].tolist()
-    return record
+    """`light` as JSON has it; AreaLight(**record) reads it back."""
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}

@@ -10,8 +10,12 @@ import numpy as np
 
 from ..scene import Film, SurfaceSamples
 from .aovs import HIT_AOVS, lobe_aov, lobe_names, read_aov, read_layer
-from .lobe_samples import Hits, samples_of_lobes
+from .lobe_samples import samples_of_lobes
+from .lobe_slots import Hits
 from .shading_normals import bump_alpha2, unit, valid_specular_normal
+
+# Arrays of one block stay in the cache.
+HITS_PER_BLOCK = 65536
 
 __all__ = [
     "bump_alpha2",
@@ -48,10 +52,22 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
     for value in (*values.values(), *(value for lobe in lobes for value in lobe.values())):
         usable &= np.isfinite(value) if value.ndim == 1 else np.isfinite(value).all(axis=-1)
     usable &= np.linalg.norm(values["incoming"], axis=-1) > 0.5
-    lobes = [{name: value[usable] for name, value in lobe.items()} for lobe in lobes]
-    hits = _hits_of({name: value[usable] for name, value in values.items()})
-    samples, index = samples_of_lobes(hits, lobes)
-    return samples, pixel[usable][index], int(np.count_nonzero(~usable))
+    pieces, index, usable = [], [], np.flatnonzero(usable)
+    for start in range(0, max(len(usable), 1), HITS_PER_BLOCK):
+        block = usable[start : start + HITS_PER_BLOCK]
+        hits = _hits_of({name: value[block] for name, value in values.items()})
+        samples, of_block = samples_of_lobes(
+            hits, [{name: value[block] for name, value in lobe.items()} for lobe in lobes]
+        )
+        pieces.append(samples)
+        index.append(block[of_block])
+    return joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
+
+
+def joined(pieces: list[SurfaceSamples]) -> SurfaceSamples:
+    """The samples of all `pieces`, one after another."""
+    names = pieces[0].__dataclass_fields__
+    return SurfaceSamples(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
 
 def _hits_of(values: dict[str, np.ndarray]) -> Hits:
@@ -66,6 +82,14 @@ def _hits_of(values: dict[str, np.ndarray]) -> Hits:
     )
 
 
+def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
+    """Take the hits on holdouts out of the `channels` of a render with an opaque background.
+
+    Cycles evaluates the shaders of holdouts, AOVs included, and then shows a hole; nothing else has alpha 0.
+    """
+    read_aov(channels, "hit")[read_layer(channels, "Combined", "A") == 0.0] = 0.0
+
+
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
     """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV."""
     depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")
@@ -74,14 +98,9 @@ def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:
     """All samples of `renders` (samples, pixel), one per sub-sample, and the film they lie on."""
-    first = renders[0][0]
-    merged = {
-        name: np.concatenate([getattr(samples, name) for samples, _ in renders]) for name in first.__dataclass_fields__
-    }
     pixel = np.concatenate([pixel for _, pixel in renders])
     # A render has one hit per pixel, whose samples follow one another.
     of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]
     of_hit = np.concatenate(of_hit)
-    return SurfaceSamples(**merged), Film(
-        width, height, pixel, sub_samples=len(renders), first=None if of_hit.all() else of_hit
-    )
+    first = None if of_hit.all() else of_hit
+    return joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)

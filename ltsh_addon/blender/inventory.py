@@ -7,6 +7,7 @@ and to nobody else, so a render engine that renders nothing takes the inventory.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import bpy
 
@@ -48,11 +49,67 @@ def with_render_depsgraph(scene, visit: Callable):
     return value
 
 
-def rendered_surfaces(depsgraph) -> list:
-    """Evaluated objects with a surface, instances included, each once."""
+@dataclass(frozen=True)
+class EmitterTraits:
+    """What an object gives its light besides power: its light group and the lobes it lights."""
+
+    group: str
+    diffuse: bool
+    glossy: bool
+
+    @classmethod
+    def of(cls, instance) -> EmitterTraits:
+        """Those of a depsgraph instance: as Cycles has it, the outermost instancer may withhold lobes, and its group
+        counts where the object itself has none."""
+        ob = instance.object
+        group, diffuse, glossy = ob.original.lightgroup, ob.visible_diffuse, ob.visible_glossy
+        if instance.is_instance and instance.parent is not None:
+            parent = instance.parent
+            group = group or parent.original.lightgroup
+            diffuse, glossy = diffuse and parent.visible_diffuse, glossy and parent.visible_glossy
+        return cls(group, diffuse, glossy)
+
+
+@dataclass(frozen=True)
+class MaterialSlot:
+    """A slot of a rendered surface; `material` is the original or None."""
+
+    material: object
+
+
+@dataclass(frozen=True)
+class RenderedSurface:
+    """An original object with a surface and what stood in its slots when evaluated.
+
+    The evaluated object itself may be gone: Blender makes those of instances for one step of the iteration.
+    """
+
+    original: object
+    material_slots: tuple[MaterialSlot, ...]
+
+    @classmethod
+    def of(cls, ob) -> RenderedSurface:
+        """That of an evaluated object."""
+        materials = [slot.material for slot in ob.material_slots]
+        slots = (MaterialSlot(None if material is None else material.original) for material in materials)
+        return cls(ob.original, tuple(slots))
+
+
+def surface_instancer(instance) -> RenderedSurface | None:
+    """The outermost instancer of a depsgraph instance where that has a surface itself."""
+    if instance.is_instance and instance.parent is not None and instance.parent.type in SURFACE_TYPES:
+        return RenderedSurface.of(instance.parent)
+    return None
+
+
+def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
+    """Objects with a surface, instances included, each once."""
     found = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type in SURFACE_TYPES and instance.show_self:
-            found.setdefault((ob.original.name_full, ob.data.name_full if ob.data else ""), ob)
+        # Hair grows on emitters that are not shown themselves, and has their materials.
+        if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
+            key = (ob.original.name_full, ob.data.name_full if ob.data else "")
+            if key not in found:
+                found[key] = RenderedSurface.of(ob)
     return list(found.values())

@@ -14,9 +14,20 @@ import bpy
 import numpy as np
 
 from ..scene import AREA_LIGHT_SHAPES, AreaLight
+from .emission_look import open_studio
+from .emission_nodes import Emission, emission_behind
+from .inventory import EmitterTraits, RenderedSurface, surface_instancer
+from .light_linking import Receivers
+from .light_textures import UnseenLight, look_at_area_lights
+from .mesh_light_faces import SIDE_PROPERTY, mark_transparent, mesh_area_lights
+from .mesh_lights import MeshLight, collect_mesh_lights
 
 # Two axes further from a right angle than this (cosine) are called sheared.
 SHEAR_COSINE = 1e-4
+
+
+# Full angle in degrees of the narrowest beam; below, it is a line of light.
+LEAST_SPREAD = 0.1
 
 
 @dataclass
@@ -26,16 +37,33 @@ class LightInventory:
     lights: list[AreaLight] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: set[str] = field(default_factory=set)
+    unseen: dict[int, UnseenLight] = field(default_factory=dict)  # by position in `lights`
+    receivers: Receivers = field(default_factory=lambda: Receivers([]))
+    meshes: list[MeshLight] = field(default_factory=list)
+    instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
+
+    def __post_init__(self):
+        self._noted = set(self.warnings)
+
+    @property
+    def emitting_materials(self) -> frozenset[str]:
+        """Full names of the materials that may emit."""
+        return frozenset(name for mesh in self.meshes for name in mesh.emitting_materials)
 
     def warn(self, message: str) -> None:
         """Note `message` once."""
-        if message not in self.warnings:
+        if message not in self._noted:
+            self._noted.add(message)
             self.warnings.append(message)
 
 
-def collect_lights(depsgraph) -> LightInventory:
-    """All lights that a render of `depsgraph` sees, instances included."""
-    inventory = LightInventory()
+def collect_lights(depsgraph, override=None) -> LightInventory:
+    """All lights that a render of `depsgraph` sees, instances included; `override` is what replaces all materials.
+
+    What `unseen` and `meshes` of the inventory emit is not known before `seen_lights` has looked at them.
+    """
+    receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
+    inventory = LightInventory(receivers=receivers)
     placed = []
     for instance in depsgraph.object_instances:
         ob = instance.object
@@ -46,14 +74,46 @@ def collect_lights(depsgraph) -> LightInventory:
         if problem:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
-        else:
-            placed.append((ob.original.name_full, _area_light(ob, matrix)))
+            continue
+        light = _area_light(ob, matrix, EmitterTraits.of(instance), receivers)
+        if np.any(light.radiance != 0.0):
+            placed.append((ob.original.name_full, light, _unseen(ob, matrix, inventory)))
             _note_unsupported(ob, matrix, inventory)
+            _note_instancer(instance, inventory)
     # One unusable instance takes all instances of the object along: the reference can only drop the object.
-    inventory.lights = [
-        light for name, light in placed if name not in inventory.left_out and np.any(light.radiance != 0.0)
-    ]
+    for name, light, unseen in placed:
+        if name not in inventory.left_out:
+            if unseen is not None:
+                inventory.unseen[len(inventory.lights)] = unseen
+            inventory.lights.append(light)
+    inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, inventory.warn)
+    for mesh in inventory.meshes:
+        inventory.instancers.update(mesh.instancers)
     return inventory
+
+
+def _note_instancer(instance, inventory: LightInventory) -> None:
+    instancer = surface_instancer(instance)
+    if instancer is not None:
+        inventory.instancers[instancer.original.name_full] = instancer
+
+
+def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
+    """The lights of `inventory` with what node trees and materials make of them, which Cycles is asked for.
+
+    Objects that must let light through in the reference get the custom property SIDE_PROPERTY, as do their materials.
+    """
+    for block in (*bpy.data.objects, *bpy.data.materials):
+        if SIDE_PROPERTY in block:
+            del block[SIDE_PROPERTY]
+    for instancer in inventory.instancers.values():
+        mark_transparent(instancer.original, 0, [slot.material for slot in instancer.material_slots])
+    if not inventory.unseen and not inventory.meshes:
+        return inventory.lights
+    eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
+    with open_studio(scene) as studio:
+        lights = look_at_area_lights(inventory.lights, inventory.unseen, studio, inventory.warn)
+        return lights + mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
 
 
 def _reason_to_leave_out(ob, matrix: np.ndarray) -> str:
@@ -69,6 +129,8 @@ def _reason_to_leave_out(ob, matrix: np.ndarray) -> str:
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if min(_sizes(light)) * lengths[:2].min() <= 0.0 or lengths[2] <= 0.0:
         return "its size or scale is zero"
+    if math.degrees(light.spread) < LEAST_SPREAD:
+        return f"its spread is {math.degrees(light.spread):g} degrees, expected at least {LEAST_SPREAD:g}"
     return ""
 
 
@@ -77,7 +139,7 @@ def _sizes(light) -> tuple[float, float]:
     return light.size, light.size if light.shape in ("SQUARE", "DISK") else light.size_y
 
 
-def _area_light(ob, matrix: np.ndarray) -> AreaLight:
+def _area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
     light = ob.data
     size_u, size_v = _sizes(light)
     half_u, half_v = 0.5 * size_u * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
@@ -89,9 +151,11 @@ def _area_light(ob, matrix: np.ndarray) -> AreaLight:
         half_v=half_v,
         direction=-matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]),
         radiance=_radiance(light, half_u, half_v),
-        group=ob.original.lightgroup,
-        affects_diffuse=ob.visible_diffuse,
-        affects_specular=ob.visible_glossy,
+        group=traits.group,
+        affects_diffuse=traits.diffuse,
+        affects_specular=traits.glossy,
+        spread=min(light.spread, math.pi),
+        receivers=receivers.of(ob.original),
     )
 
 
@@ -103,51 +167,32 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     if light.normalize:
         area = 4.0 * np.linalg.norm(half_u) * np.linalg.norm(half_v)
         value /= area * (math.pi / 4.0 if light.shape in ("DISK", "ELLIPSE") else 1.0)
-    factor, _ = node_factor(light)
-    return value * factor
+    return value
 
 
-def node_factor(light) -> tuple[np.ndarray, str]:
-    """What the light's node tree multiplies the radiance by (3,), and the reason if that is not a constant.
-
-    Since 5.0 every light has a node tree, by default one white Emission node of strength 1.
-    """
-    neutral = np.ones(3)
+def _unseen(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
+    """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
+    light = ob.data
     tree = light.node_tree
-    uses_nodes = tree is not None and (bpy.app.version >= (5, 0, 0) or light.use_nodes)
-    if not uses_nodes:
-        return neutral, ""
-    outputs = [
-        node
-        for node in tree.nodes
-        if node.bl_idname == "ShaderNodeOutputLight" and node.is_active_output and not node.mute
-    ]
-    if not outputs or not outputs[0].inputs["Surface"].is_linked:
-        return np.zeros(3), ""
-    emission = outputs[0].inputs["Surface"].links[0].from_node
-    if emission.bl_idname != "ShaderNodeEmission" or emission.mute:
-        return neutral, f"node {emission.name!r}"
-    if emission.inputs["Color"].is_linked or emission.inputs["Strength"].is_linked:
-        return neutral, f"a texture on node {emission.name!r}"
-    color = np.array(emission.inputs["Color"].default_value, dtype=np.float64)[:3]
-    return color * emission.inputs["Strength"].default_value, ""
+    if tree is None or (bpy.app.version < (5, 0, 0) and not light.use_nodes):
+        return None
+    output = tree.get_output_node("CYCLES") or tree.get_output_node("ALL")
+    emission = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
+    if emission.plain:
+        return None
+    if emission.directional:
+        nodes = ", ".join(sorted(emission.directional))
+        inventory.warn(
+            f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
+        )
+    return UnseenLight(light.original, matrix, emission.varies)
 
 
 def _note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     """Warn of what Cycles renders for this light and the techniques do not."""
     light, name = ob.data, ob.original.name
-    if light.spread < math.pi - 1e-4:
-        inventory.warn(f"light {name!r}: spread {math.degrees(light.spread):.0f} degrees is shaded as 180 degrees")
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
     if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE:
         inventory.warn(f"light {name!r}: its transform is sheared, which Cycles itself does not sample correctly")
-    reason = node_factor(light)[1]
-    if reason:
-        inventory.warn(f"light {name!r}: {reason} in its node tree is not shaded")
-    linking = getattr(ob.original, "light_linking", None)
-    if linking is not None and linking.receiver_collection is not None:
-        inventory.warn(
-            f"light {name!r}: light linking to {linking.receiver_collection.name!r} is ignored, it lights everything"
-        )
     if light.energy < 0.0:
         inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")

@@ -6,37 +6,17 @@ reflection of its transmission. The weights are those of Cycles' closures (4.5.1
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..scene import SurfaceSamples
 from . import reflectance
-from .aovs import LOBE_AOVS, LOBE_KINDS
-from .shading_normals import bump_alpha2, unit, valid_specular_normal
+from .aovs import LOBE_KINDS
+from .lobe_slots import SMALLEST_WEIGHT, Hits, LobeSlot
+from .shading_normals import bump_alpha2
 
-# Below this weight Cycles drops a closure.
-SMALLEST_WEIGHT = 1e-5
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
-
-
-@dataclass(frozen=True)
-class Hits:
-    """What each of P hits has once."""
-
-    position: np.ndarray  # (P, 3)
-    view: np.ndarray  # (P, 3)
-    smooth_normal: np.ndarray  # (P, 3)
-    true_normal: np.ndarray  # (P, 3)
-    corrected: np.ndarray  # (P,) bool: specular normals are bent
-    receiver: np.ndarray  # (P,) integers
-    diffuse_albedo: np.ndarray | None  # (P, 3) of all lobes together; None: as estimated from each lobe's own
-
-    def take(self, index) -> Hits:
-        """The hits at `index`."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
 
 
 @dataclass
@@ -64,11 +44,20 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
 
     `lobes` has for each slot the quantities of LOBE_AOVS that were written, (P,) or (P, 3).
     """
-    parts = [part for lobe in lobes for part in _parts_of_slot(hits, lobe)]
+    slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
+    parts_of_slots = [_parts_of(slot) for slot in slots]
+    parts = [part for own in parts_of_slots for part in own]
+    for slot, own in zip(slots, parts_of_slots, strict=True):
+        if slot.has("sheen_weight") and hits.diffuse_albedo is not None:
+            _put_under_sheen(hits, slot, own, parts)
     bare = np.ones(len(hits.position), dtype=bool)
     for part in parts:
         bare[part.index] = False
-    parts.append(_bare_part(hits, np.nonzero(bare)[0]))
+    return _joined(hits, [*parts, _bare_part(hits, np.nonzero(bare)[0])])
+
+
+def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples of all parts and the hit of each, in the order of the hits."""
     index = np.concatenate([part.index for part in parts])
     order = np.argsort(index, kind="stable")
     joined = {
@@ -78,8 +67,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
     specular = np.concatenate([part.specular for part in parts], axis=1)[:, order]
     index, behind = index[order], joined["behind"]
     at_hit = hits.take(index)
-    smooth_normal = np.where(behind[:, None], joined["diffuse_normal"], at_hit.smooth_normal)
-    bumped = at_hit.corrected & ~behind
+    smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -94,7 +82,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,
-        bump_alpha2=np.where(bumped, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
+        bump_alpha2=np.where(at_hit.corrected, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
     )
     return samples, index
 
@@ -118,91 +106,48 @@ def _bare_part(hits, index) -> _Part:
     return _Part(index, normal, normal, ones, ones)
 
 
-def _parts_of_slot(hits: Hits, lobe: dict[str, np.ndarray]) -> list[_Part]:
-    """The parts of one slot."""
+def _slot_of(hits: Hits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
+    """The hits that have a lobe in one slot, or None."""
     weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
     index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
-    if len(index) == 0:
-        return []
-    slot = _Slot(hits, lobe, index, weight[index])
+    return LobeSlot(hits, lobe, index, weight[index]) if len(index) else None
+
+
+def _parts_of(slot: LobeSlot) -> list[_Part]:
+    """The parts of one slot, its base first."""
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
     return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
 
 
-class _Slot:
-    """The hits (Q,) that have a lobe in one slot, and its quantities there."""
+def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
+    """Take away from the slot's `own` parts what its sheen reflects, and let it reflect that as diffuse light.
 
-    def __init__(self, hits: Hits, lobe, index, weight):
-        self.lobe, self.index, self.weight = lobe, index, weight
-        self.hits = hits.take(index)
-        self.kind = np.rint(lobe["kind"][index]).astype(int)
-        self.normal = self._normal("normal")
-        self.specular_normal = self._bent(self.normal)
-        self.roughness = np.clip(self.value("roughness", 1.0), 0.0, 1.0)
-
-    def value(self, name: str, default=None) -> np.ndarray:
-        """The quantity `name`, or what changes nothing, or `default` where there is no such value."""
-        if name in self.lobe:
-            return self.lobe[name][self.index]
-        kind, neutral = LOBE_AOVS[name]
-        neutral = default if neutral is None else neutral
-        return np.broadcast_to(np.float64(neutral), (len(self.index), 3) if kind == "COLOR" else (len(self.index),))
-
-    def has(self, name: str) -> bool:
-        """True where some sample has more than a vanishing `name`."""
-        return name in self.lobe and bool((self.value(name) > SMALLEST_WEIGHT).any())
-
-    def of(self, kind: str) -> np.ndarray:
-        """Mask (Q, 1) of a kind of lobe."""
-        return (self.kind == LOBE_KINDS[kind])[:, None]
-
-    def _normal(self, name):
-        normal = unit(self.value(name))
-        return np.where(np.any(normal != 0.0, axis=-1, keepdims=True), normal, self.hits.smooth_normal)
-
-    def _bent(self, normal):
-        bent = valid_specular_normal(normal, self.hits.true_normal, self.hits.view)
-        return np.where(self.hits.corrected[:, None], bent, normal)
-
-    def coat_normal(self) -> np.ndarray:
-        """Shading normal (Q, 3) of the coat."""
-        return self._bent(self._normal("coat_normal"))
-
-    def cosine(self, normal) -> np.ndarray:
-        """Cosine (Q,) of the view."""
-        return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
-
-    @cached_property
-    def color(self) -> np.ndarray:
-        """(Q, 3), never negative."""
-        return np.maximum(self.value("color", 0.0), 0.0)
-
-    @cached_property
-    def metallic(self) -> np.ndarray:
-        """Share (Q,) of the metal."""
-        clipped = np.clip(self.value("metallic"), 0.0, 1.0)
-        return np.where(self.of("metal")[:, 0], 1.0, np.where(self.of("principled")[:, 0], clipped, 0.0))
-
-    @cached_property
-    def transmission(self) -> np.ndarray:
-        """Share (Q,) of the transmission in what is no metal."""
-        return np.where(self.of("principled")[:, 0], np.clip(self.value("transmission"), 0.0, 1.0), 0.0)
-
-    @cached_property
-    def albedos(self) -> tuple[np.ndarray, np.ndarray]:
-        """Directional and average albedo (Q,) of the lobe without Fresnel."""
-        return reflectance.albedos(self.roughness, self.cosine(self.specular_normal))
-
-    def scattered(self, mean: np.ndarray) -> np.ndarray:
-        """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 where there is none."""
-        if not self.has("multiple_scattering"):
-            return np.ones_like(mean)
-        factor = reflectance.multiple_scattering(mean, *self.albedos)
-        return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
+    The albedo R of the sheen follows from the diffuse albedo of the hit, which is linear in R: without the sheen it
+    would be what all `parts` expect together, with it the slot's own diffuse part D becomes w s R + (1 - max(s) R) D,
+    s the weight times the tint of the sheen, w the weight of the slot.
+    """
+    expected = np.zeros_like(hits.diffuse_albedo)
+    for part in parts:
+        expected[part.index] += part.diffuse
+    base = own[0]
+    shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
+    shine = np.where(slot.of("principled"), shine, 0.0)
+    most = shine.max(axis=1, keepdims=True)
+    change = slot.weight[:, None] * shine - most * base.diffuse
+    missing = (hits.diffuse_albedo - expected)[base.index]
+    square = (change * change).sum(axis=1)
+    albedo = np.divide((missing * change).sum(axis=1), square, out=np.zeros(len(square)), where=square > 1e-9)
+    albedo = np.clip(albedo, 0.0, 1.0)[:, None]
+    left = np.ones((len(hits.position), 1))
+    left[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
+    for part in own:
+        part.specular *= left[part.index]
+        part.diffuse *= left[part.index]
+    base.diffuse += slot.weight[:, None] * shine * albedo
 
 
-def _coat_part(slot: _Slot):
+def _coat_part(slot: LobeSlot):
     """The coat (None without), and the share (Q, 3) of the lobe's weight that is left under it."""
     under = np.repeat(slot.weight[:, None], 3, axis=1)
     if not slot.has("coat_weight"):
@@ -230,35 +175,42 @@ def _coat_part(slot: _Slot):
     return part, under
 
 
-def _transmission_part(slot: _Slot, under: np.ndarray):
-    """What the transmission of a Principled BSDF reflects, None without; single scattering."""
+def _transmission_part(slot: LobeSlot, under: np.ndarray):
+    """What the transmission of a Principled BSDF reflects, None without."""
     if not slot.has("transmission"):
         return None
     weight = slot.transmission * (1.0 - slot.metallic)
     at = np.nonzero(weight > SMALLEST_WEIGHT)[0]
-    specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0))
+    specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0), np.sqrt(np.minimum(slot.color, 1.0)))
     specular = (specular * (weight[:, None] * under))[:, at]
     return _Part(slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular)
 
 
-def _glass_terms(slot: _Slot, tint: np.ndarray):
-    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is."""
+def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
+    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is; `tint` is
+    that of the reflectance at normal incidence, `through` that of the light that passes."""
     ior = np.maximum(slot.value("ior"), 1e-5)
     f0 = np.clip(reflectance.f0_of_ior(ior)[:, None] * tint, 0.0, 1.0)
-    inside = slot.value("backfacing") > 0.5
-    *terms, ior = reflectance.dielectric_terms(f0, np.where(inside, 1.0 / ior, ior))
-    return np.stack(terms), ior
+    ior = np.where(slot.value("backfacing") > 0.5, 1.0 / ior, ior)
+    view = slot.roughness, slot.cosine(slot.specular_normal)
+    factor = np.ones_like(through)
+    if slot.has("multiple_scattering"):
+        scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
+        factor = np.where(scattered, reflectance.glass_scattering(through, ior, *view), 1.0)
+    *terms, ior = reflectance.dielectric_terms(f0, ior, view[1])
+    return np.stack(terms) * factor, ior
 
 
-def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
+def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
     """Everything but coat and transmission."""
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
     ior = np.full(len(slot.index), reflectance.CONDUCTOR_FIT_IOR)
-    if slot.of("conductor").any():
-        specular += _conductor_terms(slot)
+    for kind in ("conductor", "conductor_4_5"):
+        if slot.of(kind).any():
+            specular += np.where(slot.of(kind), _conductor_terms(slot, kind == "conductor"), 0.0)
     if slot.of("glass").any():
-        terms, own_ior = _glass_terms(slot, np.ones_like(slot.color))
+        terms, own_ior = _glass_terms(slot, np.ones_like(slot.color), slot.color)
         specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
         ior = np.where(slot.of("glass")[:, 0], own_ior, ior)
     if slot.of("principled").any():
@@ -281,7 +233,7 @@ def _base_part(slot: _Slot, under: np.ndarray) -> _Part:
     )
 
 
-def _metal_terms(slot: _Slot) -> np.ndarray:
+def _metal_terms(slot: LobeSlot) -> np.ndarray:
     """Specular terms (4, Q, 3) of F82 metals and of Glossy BSDF, which reflects its color at all angles."""
     terms = np.zeros((4, len(slot.index), 3))
     if slot.metallic.any():
@@ -294,23 +246,23 @@ def _metal_terms(slot: _Slot) -> np.ndarray:
     return terms
 
 
-def _conductor_terms(slot: _Slot) -> np.ndarray:
+def _conductor_terms(slot: LobeSlot, exact: bool) -> np.ndarray:
     """Specular terms (4, Q, 3) of conductors, whose complex index is `color` + i `tint`."""
     extinction = np.maximum(slot.value("tint"), 0.0)
-    terms = np.stack(reflectance.conductor_fit(slot.color, extinction))
-    factor = slot.scattered(reflectance.conductor_average(slot.color, extinction))
-    return np.where(slot.of("conductor"), terms * factor, 0.0)
+    terms = np.stack(reflectance.conductor_fit(slot.color, extinction, exact))
+    return terms * slot.scattered(reflectance.conductor_average(slot.color, extinction, exact))
 
 
-def _dielectric_terms(slot: _Slot):
+def _dielectric_terms(slot: LobeSlot):
     """Specular terms (4, Q, 3) of the dielectric part of Principled BSDF, its index (Q,), and the share (Q, 1) of the
     light that is left for the diffuse part."""
     ior, f0 = reflectance.specular_level_applied(np.maximum(slot.value("ior"), 1e-5), slot.value("specular_level"))
     f0 = np.clip(f0[:, None] * np.maximum(slot.value("tint"), 0.0), 0.0, 1.0)
     factor = slot.scattered(reflectance.dielectric_blend_average(f0, ior))
-    albedo = reflectance.dielectric_albedo(f0, ior, slot.roughness, slot.cosine(slot.specular_normal))
+    cosine = slot.cosine(slot.specular_normal)
+    albedo = reflectance.dielectric_albedo(f0, ior, slot.roughness, cosine)
     scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
     albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
     left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
-    *terms, ior = reflectance.dielectric_terms(f0, ior)
+    *terms, ior = reflectance.dielectric_terms(f0, ior, cosine)
     return np.stack(terms) * factor, ior, left

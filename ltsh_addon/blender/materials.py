@@ -13,7 +13,8 @@ import bpy
 from .aov_injection import write_aov, write_lobe
 from .aovs import MAX_LOBES
 from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves
-from .bsdf_lobes import cut_alpha, emits, lobe_of
+from .bsdf_lobes import cut_alpha, emits, is_emission, lobe_of
+from .hair import bends_normals
 from .shader_graph import ensure_nodes, fill_with_bsdf, is_constant, live_link, material_output
 
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
@@ -118,19 +119,24 @@ def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes |
     tree = material.node_tree
     output = material_output(tree)
     if output is None:
-        return MaterialLobes(material, (), ())
+        output = tree.nodes.new("ShaderNodeOutputMaterial")
     volume = live_link(output.inputs["Volume"])
     if volume is not None:
         tree.links.remove(volume)
         warn("its volume is not shaded; left out of the Cycles reference as well")
     leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
-    if leaves and all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
+    if not leaves:
+        # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
+        black = tree.nodes.new("ShaderNodeBsdfDiffuse")
+        black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+        tree.links.new(black.outputs[0], output.inputs["Surface"])
+    elif all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
         return None
     if not emitter and any(emits(leaf.node) for leaf in leaves):
         warn("emission is not shaded and lights nothing, in the Cycles reference neither")
     pairs = []
     for leaf in leaves:
-        if leaf.node.bl_idname == "ShaderNodeEmission":
+        if is_emission(leaf.node):
             continue
         cut_alpha(leaf.tree, leaf.node, warn)
         values = lobe_of(leaf.node, warn)
@@ -156,10 +162,11 @@ def _write_hit(material) -> None:
     tree = material.node_tree
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
     receiver = tree.nodes.new("ShaderNodeAttribute")
-    receiver.attribute_type, receiver.attribute_name = "OBJECT", RECEIVER_PROPERTY
+    # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
+    receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
     write_aov(tree, "hit", 1.0)
     write_aov(tree, "receiver", receiver.outputs["Fac"])
-    write_aov(tree, "correct_normal", float(material.cycles.use_bump_map_correction))
+    write_aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
     write_aov(tree, "position", geometry.outputs["Position"])
     write_aov(tree, "incoming", geometry.outputs["Incoming"])
     write_aov(tree, "smooth_normal", geometry.outputs["Normal"])

@@ -13,16 +13,12 @@ import numpy as np
 
 from .. import shading
 from ..shading.brdf import dielectric_reflectance, schlick_curve
+from .glass_albedos import MAX_F0, NODES, SMALLEST_COSINE, glass_albedos, internal_reflectance
 
 ALBEDO_NODES = 32
-BLEND_NODES = 16
-# The largest reflectance at normal incidence that Cycles turns into an index of refraction.
-MAX_F0 = 0.99
-SMALLEST_COSINE = 1e-4
-# Cosines at which curves are fitted, and the index of the dielectric curve among those that fit a conductor.
+# Cosines at which conductors are fitted (fewer at grazing angles), and the index of the dielectric curve in the fit.
 FIT_COSINES = (np.arange(64) + 0.5) / 64.0
 CONDUCTOR_FIT_IOR = 1.5
-INTERNAL_IORS = np.linspace(0.2, 1.0, 81)
 
 
 def f0_of_ior(ior: np.ndarray) -> np.ndarray:
@@ -52,7 +48,7 @@ def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
 
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
     """Integral of 2 c F(c) of a dielectric, by the fit of Kulla and Conty 2017 ("Revisiting physically based shading at
-    Imageworks"), which Cycles uses; good to 1e-3 for an `ior` above 1."""
+    Imageworks"), which Cycles uses; good to 0.006 for an `ior` of 1 to 3."""
     below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607))
     return np.where(ior < 1.0, below, (ior - 1.0) / (4.08567 + 1.00071 * ior))
 
@@ -75,45 +71,68 @@ def multiple_scattering(average: np.ndarray, albedo: np.ndarray, average_albedo:
     return 1.0 + scattered * ((1.0 - albedo) / albedo)[:, None]
 
 
-def conductor_reflectance(cosine: np.ndarray, index: np.ndarray, extinction: np.ndarray) -> np.ndarray:
-    """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts."""
-    squares = index * index + extinction * extinction
-    double = 2.0 * index * cosine
-    parallel = (squares * cosine**2 - double + 1.0) / (squares * cosine**2 + double + 1.0)
-    perpendicular = (squares - double + cosine**2) / (squares + double + cosine**2)
-    return 0.5 * (parallel + perpendicular)
+def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exact: bool = True) -> np.ndarray:
+    """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts.
+
+    Cycles 5 has the exact formula (Born and Wolf, "Principles of optics", section 14.2), Cycles 4.5 its limit for
+    |index + i extinction| much larger than 1.
+    """
+    index, extinction = np.maximum(index, 1e-6), np.maximum(extinction, 0.0)
+    squares, cosine2 = index * index + extinction * extinction, cosine * cosine
+    if not exact:
+        double = 2.0 * index * cosine
+        parallel = (squares * cosine2 - double + 1.0) / (squares * cosine2 + double + 1.0)
+        return 0.5 * (parallel + (squares - double + cosine2) / (squares + double + cosine2))
+    sine2 = 1.0 - cosine2
+    difference = index * index - extinction * extinction - sine2
+    length = np.sqrt(difference * difference + 4.0 * np.square(index * extinction))
+    double = 2.0 * cosine * np.sqrt(np.maximum(0.5 * (length + difference), 0.0))
+    perpendicular = (length + cosine2 - double) / (length + cosine2 + double)
+    upper = cosine2 * length + sine2 * sine2
+    return 0.5 * perpendicular * (1.0 + (upper - double * sine2) / (upper + double * sine2))
 
 
-def conductor_fit(index: np.ndarray, extinction: np.ndarray):
+def conductor_fit(index: np.ndarray, extinction: np.ndarray, exact: bool):
     """(f0, f90, dip, dielectric), each (Q, 3): least squares for the reflectance of a conductor, with the dielectric
     curve of CONDUCTOR_FIT_IOR."""
-    values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction)
-    constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(CONDUCTOR_FIT_IOR), values)
+    values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction, exact)
+    constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)
     return constant, constant + schlick, -dip, dielectric
 
 
-def conductor_average(index: np.ndarray, extinction: np.ndarray) -> np.ndarray:
+def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) -> np.ndarray:
     """Mean reflectance (Q, 3) by which Cycles scales multiple scattering of conductors: of an F82 metal that agrees at
     the cosines 1 and 1 / 7."""
-    f0, low = (conductor_reflectance(cosine, index, extinction) for cosine in (1.0, 1.0 / 7.0))
+    f0, low = (conductor_reflectance(cosine, index, extinction, exact) for cosine in (1.0, 1.0 / 7.0))
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5
     return np.clip(metal_average(f0, (schlick - low) * 7.0 / (6.0 / 7.0) ** 6), 0.0, 1.0)
 
 
-def dielectric_terms(f0: np.ndarray, ior: np.ndarray):
+def dielectric_terms(f0: np.ndarray, ior: np.ndarray, cosine: np.ndarray):
     """(f0, f90, dip, dielectric) (Q, 3) and ior (Q,) >= 1 of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
 
     Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), f_d the value of F_d at normal incidence; that is linear in F_d.
-    Below an `ior` of 1, where total reflection puts a kink into F_d, a fit with the curve of 1 / `ior` stands in.
+    Below an `ior` of 1 total reflection makes F_d nearly a step, which no curve of the lobes follows: its value for the
+    mirror direction of a view under `cosine` (Q,) stands in for it.
     """
     plain = f0_of_ior(ior)[:, None]
     constant, factor = (f0 - plain) / (1.0 - plain), (1.0 - f0) / (1.0 - plain)
-    inside = (ior < 1.0)[:, None]
-    fit = np.stack([np.interp(ior, INTERNAL_IORS, column) for column in _internal_fits().T])[:, :, None]
-    low = np.where(inside, factor * fit[0], 0.0) + constant
-    high = low + np.where(inside, factor * fit[1], 0.0)
-    dip = np.where(inside, -factor * fit[2], 0.0)
-    return low, high, dip, np.where(inside, factor * fit[3], factor), np.where(ior < 1.0, 1.0 / ior, ior)
+    below = (ior < 1.0)[:, None]
+    if below.any():
+        constant = constant + factor * np.where(below, internal_reflectance(cosine, np.minimum(ior, 1.0))[:, None], 0.0)
+    return constant, constant, np.zeros_like(constant), np.where(below, 0.0, factor), np.maximum(ior, 1.0)
+
+
+def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+    """Factor (Q, 3) that Multiscatter GGX puts on the reflection of glass of color `tint` (Q, 3)."""
+    factor = np.empty_like(tint)
+    for inside in (False, True):
+        at = np.nonzero((ior < 1.0) == inside)[0]
+        if len(at):
+            tables, coordinate = glass_albedos(inside), _ior_coordinate(ior[at])
+            albedo = _interpolate(tables.albedo, roughness[at], cosine[at], coordinate)
+            factor[at] = multiple_scattering(tint[at], albedo, _interpolate(tables.average, roughness[at], coordinate))
+    return factor
 
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -124,8 +143,7 @@ def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.n
 
 def dielectric_albedo(f0: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """Albedo (Q, 3) divided by E of a dielectric whose reflectance runs from `f0` (Q, 3) to 1, as Cycles has it."""
-    parameter = np.sqrt(np.abs((ior - 1.0) / (ior + 1.0)))
-    share = _interpolate(_blend_table(), roughness, cosine, parameter)[:, None]
+    share = _interpolate(_blend_table(), roughness, cosine, _ior_coordinate(ior))[:, None]
     return f0 + (1.0 - f0) * share
 
 
@@ -142,37 +160,27 @@ def _albedo_tables():
 def _blend_table():
     """Where between f0 and 1 the albedo of a dielectric lies: roughness, cosine, ((ior - 1) / (ior + 1))^(1/2)."""
     table = shading.load_table("ltsh4")
-    nodes = np.clip(np.linspace(0.0, 1.0, BLEND_NODES), SMALLEST_COSINE, 1.0)
+    nodes = np.clip(np.linspace(0.0, 1.0, NODES), SMALLEST_COSINE, 1.0)
     roughness, cosine = np.meshgrid(nodes, nodes, indexing="ij")
     curves = table.lookup(cosine.ravel(), roughness.ravel()).albedo()
     f0 = np.minimum(nodes**4, MAX_F0)
     ior = np.clip((1.0 + np.sqrt(f0)) / (1.0 - np.sqrt(f0)), table.fresnel_ior[0], table.fresnel_ior[-1])
     f0 = f0_of_ior(ior)
     share = (np.einsum("fz,fq->qz", table.dielectric_weights(ior), curves / curves[0]) - f0) / (1.0 - f0)
-    return np.clip(share, 0.0, 1.0).reshape(*roughness.shape, BLEND_NODES)
+    return np.clip(share, 0.0, 1.0).reshape(*roughness.shape, NODES)
+
+
+def _ior_coordinate(ior):
+    return np.sqrt(np.abs((ior - 1.0) / (ior + 1.0)))
 
 
 @cache
-def _internal_fits():
-    """Coefficients (I, 4) of 1, (1 - c)^5, c (1 - c)^6 and F_d(c, 1 / ior) for the indices INTERNAL_IORS below 1."""
-    return np.stack([_fit_matrix(1.0 / ior) @ _internal_reflectance(FIT_COSINES, ior) for ior in INTERNAL_IORS])
-
-
-def _internal_reflectance(cosine, ior):
-    """Reflectance of a dielectric of relative `ior` below 1, seen from inside."""
-    square = ior * ior - 1.0 + cosine * cosine
-    g = np.sqrt(np.maximum(square, 0.0))
-    first = (g - cosine) / (g + cosine)
-    second = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
-    return np.where(square > 0.0, 0.5 * first**2 * (1.0 + second**2), 1.0)
-
-
-@cache
-def _fit_matrix(ior):
+def _fit_matrix():
     """Matrix (4, C): values at FIT_COSINES -> coefficients of the four curves that samples have."""
-    c = FIT_COSINES
-    curves = [np.ones_like(c), schlick_curve(c), schlick_curve(c) * c * (1.0 - c), dielectric_reflectance(c, ior)]
-    return np.linalg.pinv(np.stack(curves, axis=1), rcond=1e-4)
+    c, weight = FIT_COSINES, np.sqrt(FIT_COSINES)
+    curves = [np.ones_like(c), schlick_curve(c), schlick_curve(c) * c * (1.0 - c)]
+    curves.append(dielectric_reflectance(c, CONDUCTOR_FIT_IOR))
+    return np.linalg.pinv(np.stack(curves, axis=1) * weight[:, None], rcond=1e-6) * weight
 
 
 def _interpolate(table: np.ndarray, *coordinates: np.ndarray) -> np.ndarray:

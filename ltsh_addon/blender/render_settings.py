@@ -2,44 +2,15 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
-import numpy as np
 
+from .cameras import hold_still
 from .child import SceneError
 from .inventory import SURFACE_TYPES
 
 VIEW_LAYER = "ltsh"
-CAMERA_TYPES = ("PERSP", "ORTHO")
-# In pixels. The interface ends at 0.01, which is too wide: reference rays then cross edges that the central sample
-# does not (measured: 1 % of the pixels of a detailed picture, 6 % relative L2). What
-# remains: 1 in 1000 rays per axis strays by up to half a pixel, by the first cell of Cycles' filter table.
-CENTER_FILTER_WIDTH = 1e-6
-
-
-def choose_camera(scene, name: str | None):
-    """The camera object to render from: by `name`, or the scene's."""
-    if name is None:
-        camera = scene.camera
-        if camera is None:
-            raise SceneError(f"scene {scene.name!r} has no active camera: set one, or name one")
-    else:
-        camera = scene.objects.get(name)
-        if camera is None or camera.type != "CAMERA":
-            cameras = ", ".join(repr(ob.name) for ob in scene.objects if ob.type == "CAMERA") or "none"
-            raise SceneError(f"camera {name!r} is not in scene {scene.name!r}; cameras there: {cameras}")
-    if camera.type != "CAMERA":
-        raise SceneError(
-            f"scene {scene.name!r}: its camera {camera.name!r} is a {camera.type} object, expected a camera"
-        )
-    if camera.data.type not in CAMERA_TYPES:
-        raise SceneError(
-            f"camera {camera.name!r} is of type {camera.data.type}, expected a perspective or orthographic one"
-        )
-    scene.camera = camera
-    return camera
 
 
 def choose_view_layer(scene, warnings: list[str]):
@@ -49,35 +20,23 @@ def choose_view_layer(scene, warnings: list[str]):
         warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is shaded")
     for layer in scene.view_layers:
         layer.use = layer == used[0]
-    used[0].name = VIEW_LAYER
-    return used[0]
-
-
-def set_resolution(scene, width: int | None, height: int | None) -> tuple[int, int]:
-    """Set and return the size of the picture in pixels; a missing side keeps the file's aspect."""
-    render = scene.render
-    own_width = max(1, int(render.resolution_x * render.resolution_percentage / 100))
-    own_height = max(1, int(render.resolution_y * render.resolution_percentage / 100))
-    if width is None and height is None:
-        width, height = own_width, own_height
-    elif width is None:
-        width = max(1, round(height * own_width / own_height))
-    elif height is None:
-        height = max(1, round(width * own_height / own_width))
-    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
-    if (render.resolution_x, render.resolution_y) != (width, height):
-        raise SceneError(
-            f"resolution {width}x{height} is not possible in Blender, the nearest is "
-            f"{render.resolution_x}x{render.resolution_y}"
-        )
-    return width, height
+    layer = used[0]
+    layer.name = VIEW_LAYER
+    # Passes that nobody reads, and that could have the names of those that are read.
+    for extra in (layer.aovs, layer.lightgroups):
+        for item in list(extra):
+            extra.remove(item)
+    return layer
 
 
 def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
-    """Switch off all that stands between one camera ray per sample and the passes, with a warning where it shows."""
+    """Switch off all that stands between one camera ray per sample and the passes, with a warning where it shows.
+
+    What is left on purpose: the border, holdouts, material overrides and excluded or indirect-only collections, which
+    samples and reference both show as any render does.
+    """
     render, cycles = scene.render, scene.cycles
     for owner, name, label in (
-        (render, "use_border", "the render region"),
         (render, "use_motion_blur", "motion blur"),
         (render, "use_multiview", "stereoscopy"),
         (camera.data.dof, "use_dof", f"depth of field of camera {camera.name!r}"),
@@ -85,15 +44,19 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
         if getattr(owner, name):
             warnings.append(f"{label} is switched off, in the Cycles reference as well")
             setattr(owner, name, False)
+    warnings.extend(_steps_after_rendering(scene))
     _leave_out_world(scene, view_layer, warnings)
     scene.camera = camera
-    _hold_lens_still(camera)
+    hold_still(scene, camera)
     render.engine = "CYCLES"
     render.threads_mode = "AUTO"
-    render.use_compositing = render.use_sequencer = render.film_transparent = False
+    render.use_compositing = render.use_sequencer = False
+    # Alpha 0 then means a holdout and nothing else; the passes are the same.
+    render.film_transparent = False
     render.use_freestyle = render.use_persistent_data = False
     render.use_file_extension = render.use_overwrite = True
     cycles.device = "CPU"
+    # Multiplied into the result where it is read: the limits of the property and float32 have no say then.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
     cycles.use_animated_seed = False
@@ -105,10 +68,21 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     view_layer.samples = 0
 
 
-def _hold_lens_still(camera) -> None:
-    """Keep the lens at its values of this frame: an animated shift would undo `shifted_pixels`."""
-    if camera.data.animation_data is not None:
-        camera.data.animation_data_clear()
+def _steps_after_rendering(scene) -> list[str]:
+    """Warnings about what Blender would do to the rendered picture and is switched off."""
+    render, found = scene.render, []
+    if render.use_freestyle:
+        found.append("Freestyle")
+    if bpy.app.version >= (5, 0, 0):
+        tree = scene.compositing_node_group
+    else:
+        tree = scene.node_tree if scene.use_nodes else None
+    if render.use_compositing and tree is not None:
+        found.append(f"compositing by {tree.name!r}")
+    editor = scene.sequence_editor
+    if render.use_sequencer and editor is not None and len(editor.strips):
+        found.append("the video sequencer")
+    return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in found]
 
 
 def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
@@ -150,49 +124,12 @@ def prepare_surfaces(warnings: list[str]) -> None:
             ob.visible_camera = False
         if ob.type not in SURFACE_TYPES:
             continue
-        for name, label in (("is_shadow_catcher", "shadow catcher"), ("is_holdout", "holdout")):
-            if getattr(ob, name):
-                warnings.append(f"object {ob.name!r}: {label} is switched off")
-                setattr(ob, name, False)
+        if ob.is_shadow_catcher:
+            warnings.append(f"object {ob.name!r}: shadow catcher is switched off, it is shaded like any surface")
+            ob.is_shadow_catcher = False
         if ob.shadow_terminator_shading_offset:
             warnings.append(f"object {ob.name!r}: the shading offset of its shadow terminator is switched off")
             ob.shadow_terminator_shading_offset = 0.0
-
-
-def pin_pixel_filter(scene) -> None:
-    """Put all camera rays of a pixel through its center; sub-samples come from shifting the camera."""
-    cycles = scene.cycles
-    cycles.pixel_filter_type = "GAUSSIAN"
-    # Written past the property's limits, into what stores it.
-    stored = cycles.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else cycles
-    stored["filter_width"] = CENTER_FILTER_WIDTH
-
-
-def sub_pixel_offsets(count: int) -> np.ndarray:
-    """Offsets (count, 2) from the pixel's center, right and up, in pixels: evenly over the pixel, 0 for a single one.
-
-    The R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences").
-    """
-    if count == 1:
-        return np.zeros((1, 2))
-    steps = np.array([0.7548776662466927, 0.5698402909980532])
-    return (np.arange(count)[:, None] * steps + 0.5) % 1.0 - 0.5
-
-
-@contextmanager
-def shifted_pixels(scene, offset: np.ndarray):
-    """Meanwhile the rays of `scene` go through the points `offset` (2,) pixels from the pixels' centers."""
-    render, lens = scene.render, scene.camera.data
-    width, height = render.resolution_x * render.pixel_aspect_x, render.resolution_y * render.pixel_aspect_y
-    fits_width = lens.sensor_fit == "HORIZONTAL" or (lens.sensor_fit == "AUTO" and width >= height)
-    unit = width if fits_width else height
-    before = lens.shift_x, lens.shift_y
-    try:
-        lens.shift_x += offset[0] * render.pixel_aspect_x / unit
-        lens.shift_y += offset[1] * render.pixel_aspect_y / unit
-        yield
-    finally:
-        lens.shift_x, lens.shift_y = before
 
 
 def enable_passes(view_layer, names: tuple[str, ...]) -> None:

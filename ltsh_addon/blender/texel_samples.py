@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import SurfaceSamples
+from ..scene import AreaLight, SurfaceSamples
 from .aovs import LOBE_AOVS
-from .lobe_samples import Hits, samples_of_lobes
+from .gbuffer import HITS_PER_BLOCK, joined
+from .lobe_samples import samples_of_lobes
+from .lobe_slots import Hits
 from .shading_normals import unit
+from .specular_horizon import end_at_horizons_of_cycles
 from .uv_raster import Texels
 
 # Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
@@ -81,31 +84,46 @@ def texel_samples(
     texels: Texels,
     read_map,
     view: BakeView,
+    lights: tuple[AreaLight, ...],
     receiver: int = 0,
 ) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (S) of texels (Q) and the texel (S,), 0 to Q - 1, of each; those of a texel follow one another.
 
-    read_map(name) returns the baked map of that name at the texels, (Q, 3).
+    read_map(number) returns the baked map of that number at the texels, (Q, 3).
     """
-    triangle, weights = texels.triangle, texels.barycentric
-    position = _interpolated(mesh.corners, triangle, weights)
-    smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
     sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
-    true_normal = unit(np.cross(sides[:, 0], sides[:, 1]))[triangle]
-    flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
-    true_normal = np.where(flipped, -true_normal, true_normal)
-    number = mesh.material[triangle]
+    facets = unit(np.cross(sides[:, 0], sides[:, 1]))
     corrected = np.array([material.corrected for material in materials], dtype=bool)
-    hits = Hits(
-        position=position,
-        view=view.towards(position, smooth_normal),
-        smooth_normal=smooth_normal,
-        true_normal=true_normal,
-        corrected=corrected[number],
-        receiver=np.full(len(position), receiver),
-        diffuse_albedo=None,
-    )
-    return samples_of_lobes(hits, _lobes(materials, number, read_map))
+    maps = {number: read_map(number) for number in _maps_read(materials)}
+    pieces, index = [], []
+    for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
+        block = slice(start, start + HITS_PER_BLOCK)
+        triangle, weights = texels.triangle[block], texels.barycentric[block]
+        position = _interpolated(mesh.corners, triangle, weights)
+        smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
+        true_normal = facets[triangle]
+        flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
+        number = mesh.material[triangle]
+        hits = Hits(
+            position=position,
+            view=view.towards(position, smooth_normal),
+            smooth_normal=smooth_normal,
+            true_normal=np.where(flipped, -true_normal, true_normal),
+            corrected=corrected[number],
+            receiver=np.full(len(position), receiver),
+            diffuse_albedo=None,
+        )
+        of_block = {name: values[block] for name, values in maps.items()}
+        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block))
+        pieces.append(end_at_horizons_of_cycles(samples, lights))
+        index.append(texel + start)
+    return joined(pieces), np.concatenate(index)
+
+
+def _maps_read(materials) -> set[int]:
+    """Numbers of the maps that some material reads."""
+    values = (value for material in materials for lobe in material.lobes for value in lobe.values())
+    return {value["map"] for value in values if isinstance(value, dict)}
 
 
 def _interpolated(values, triangle, weights):
@@ -113,15 +131,8 @@ def _interpolated(values, triangle, weights):
     return sum(values[triangle, corner] * weights[:, corner, None] for corner in range(3))
 
 
-def _lobes(materials, number, read_map) -> list[dict[str, np.ndarray]]:
-    """For each slot its quantities at texels of materials `number` (Q,)."""
-    maps = {}
-
-    def channel(name):
-        if name not in maps:
-            maps[name] = np.asarray(read_map(name), dtype=np.float64)
-        return maps[name]
-
+def _lobes(materials, number, maps) -> list[dict[str, np.ndarray]]:
+    """For each slot its quantities at texels of materials `number` (Q,), of which `maps` has the baked ones (Q, 3)."""
     slots = []
     for slot in range(max((len(material.lobes) for material in materials), default=0)):
         names = {name for material in materials if len(material.lobes) > slot for name in material.lobes[slot]}
@@ -136,7 +147,7 @@ def _lobes(materials, number, read_map) -> list[dict[str, np.ndarray]]:
                 at = np.flatnonzero(number == which)
                 value = material.lobes[slot][name]
                 if isinstance(value, dict):
-                    found = channel(value["map"])[at]
+                    found = maps[value["map"]][at]
                     value = found if kind == "COLOR" else found[:, value["channel"]]
                 elif kind == "COLOR":
                     value = np.asarray(value)[:3]

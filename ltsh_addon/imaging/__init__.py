@@ -1,9 +1,11 @@
 """Images and figures: multi-layer EXR, PNG, error metrics, false color, the comparison sheet, the report.
 
 numpy and OpenEXR only; nothing here knows Blender. Conventions: images are (H, W) or (H, W, C) with row 0 on top,
-scene-referred linear Rec.709 unless a name says sRGB; error = technique - reference, red too bright, blue too dark.
+scene-referred linear RGB, Rec.709 where a function says nothing else, unless a name says sRGB; error = technique -
+reference, red too bright, blue too dark.
 """
 
+from .color_space import chromaticities
 from .exr import Layer, read_channels, read_layers, write_layers
 from .false_color import signed_error_colors
 from .metrics import (
@@ -22,6 +24,7 @@ __all__ = [
     "ErrorStatistics",
     "Layer",
     "Tile",
+    "chromaticities",
     "comparison_sheet",
     "error_statistics",
     "exposure_factor",

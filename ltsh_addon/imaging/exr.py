@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,19 +47,29 @@ class Layer:
 
 
 def write_layers(
-    path: str | os.PathLike, layers: Mapping[str, np.ndarray | Layer], metadata: Mapping[str, str] | None = None
+    path: str | os.PathLike,
+    layers: Mapping[str, np.ndarray | Layer],
+    metadata: Mapping[str, str] | None = None,
+    chromaticities: Sequence[float] | None = None,
+    pixel_aspect: float = 1.0,
 ) -> None:
     """Write `layers` as one single-part float32 scanline EXR with ZIP compression and channels ``<layer>.<letter>``.
 
     Plain arrays of 1, 3 or 4 channels become V, RGB or RGBA. float32 values are kept bit for bit, NaN and Inf
-    included. `metadata` becomes string attributes of the header. The file appears complete or not at all.
+    included. `metadata` becomes string attributes of the header, `chromaticities` (xy of red, green, blue and white)
+    the one that tells readers the color space; `pixel_aspect` is width / height of a pixel. The file appears complete
+    or not at all.
     Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
     """
-    write_channels(path, _planes(layers), metadata)
+    write_channels(path, _planes(layers), metadata, chromaticities, pixel_aspect)
 
 
 def write_channels(
-    path: str | os.PathLike, channels: Mapping[str, np.ndarray], metadata: Mapping[str, str] | None = None
+    path: str | os.PathLike,
+    channels: Mapping[str, np.ndarray],
+    metadata: Mapping[str, str] | None = None,
+    chromaticities: Sequence[float] | None = None,
+    pixel_aspect: float = 1.0,
 ) -> None:
     """Write `channels` (H, W) by full name, which need not end in a single letter; else as `write_layers`."""
     planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
@@ -67,6 +77,12 @@ def write_channels(
     OpenEXR = _openexr()
     header = check_metadata(metadata)
     header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    if pixel_aspect != 1.0:
+        header["pixelAspectRatio"] = float(pixel_aspect)
+    if chromaticities is not None:
+        if np.shape(chromaticities) != (8,) or not np.isfinite(chromaticities).all():
+            raise ValueError(f"chromaticities {chromaticities!r}: expected xy of red, green, blue and white, 8 numbers")
+        header["chromaticities"] = tuple(float(value) for value in chromaticities)
     with replacing(path) as temporary:
         try:
             with OpenEXR.File(header, planes) as file:
@@ -79,7 +95,8 @@ def write_channels(
 def check_metadata(metadata: Mapping[str, str] | None) -> dict[str, str]:
     """`metadata` as strings; raises ValueError for names that belong to the format."""
     header = {str(key): str(value) for key, value in (metadata or {}).items()}
-    reserved = {"channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version"}
+    reserved = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name",
+                "pixelAspectRatio", "version"}  # fmt: skip
     if clash := reserved & header.keys():
         raise ValueError(f"metadata {sorted(clash)[0]!r}: that name belongs to the EXR format itself, use another one")
     return header

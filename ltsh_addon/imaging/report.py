@@ -57,7 +57,8 @@ def write_html(path: str | os.PathLike, report: Mapping) -> None:
             f"camera {report['camera']}",
             f"frame {report['frame']}",
             f"{width} x {height} pixels",
-            f"{report['sub_samples']} sub-samples",
+            *_picture_facts(report),
+            f"{report['sub_samples']} sub-samples ({report['pixel_filter']})",
             f"{report['cycles_samples']} Cycles samples",
             *(f"{name} {version}" for name, version in report["versions"].items()),
         )
@@ -76,6 +77,20 @@ def write_html(path: str | os.PathLike, report: Mapping) -> None:
         f"<body>{''.join(body)}</body></html>\n"
     )
     write_bytes(path, page.encode())
+
+
+def _picture_facts(report: Mapping) -> list[str]:
+    """What to know about the picture where it is not the plain one."""
+    facts, border = [f"colors in {report['color_space']}"], report["border"]
+    if border is not None:
+        facts.append(
+            f"render region at {border['left']}, {border['top']} of {border['full_width']} x {border['full_height']}"
+        )
+    if report["pixel_aspect"] != 1.0:
+        facts.append(f"pixels {report['pixel_aspect']:g} times as wide as high")
+    if report["exposure"] != 1.0:
+        facts.append(f"film exposure {report['exposure']:g}")
+    return facts
 
 
 def _pass_table(name: str, figures: Mapping) -> str:

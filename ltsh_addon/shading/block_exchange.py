@@ -26,6 +26,8 @@ class ParentSide:
             unread |= _ONLY_DIFFUSE
         if "specular" not in task.passes:
             unread |= _ONLY_SPECULAR
+        if all(light.receivers is None for light in task.lights):
+            unread.add("receiver")
         self.sent, self.same, first = [], {}, {}
         for field in fields(samples):
             values = getattr(samples, field.name)

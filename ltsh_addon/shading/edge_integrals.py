@@ -22,7 +22,8 @@ from .polygon import edge_sums, one_plus_cosine, solid_angle
 
 RIDGE_DIRECTIONS = np.array([[1, 0], [0, 1], [1, 1], [1, -1], [1, 2], [2, 1], [1, -2], [2, -1], [1, 3]], dtype=float)
 MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
-_ARC_QUADRATURE = np.polynomial.legendre.leggauss(24)
+# 6e-15 on half a circle for powers up to 7.
+_ARC_QUADRATURE = np.polynomial.legendre.leggauss(18)
 
 
 @cache
@@ -85,12 +86,19 @@ def moments(unit: np.ndarray, degree: int) -> np.ndarray:
     normal_z = unit[0] * total[1] - unit[1] * total[0]
     result = np.empty((spherical_harmonics.coefficient_count(degree), unit.shape[2]), dtype=unit.dtype)
     result[0] = solid_angle(unit)
+    nodes = _ArcNodes(q) if degree > 4 else None
     for j, (u_x, u_z) in enumerate(RIDGE_DIRECTIONS[: degree + 1]):
         start, both = u_x * unit[0] + u_z * unit[2], u_x * total[0] + u_z * total[2]
         normal = u_x * normal_x + u_z * normal_z
-        for k in range(max(j - 1, 0), degree):
+        for k in range(max(j - 1, 0), min(degree, 4)):
             row = 1 + k * (k + 3) // 2 + j
             result[row] = (normal * _arc_power(k, start, both, phi, psi, q)).sum(axis=0)
+        first = max(j - 1, 4)
+        if first < degree:
+            powers = nodes.powers(start, both, first, degree)
+            normal *= phi
+            for k, power in enumerate(powers, first):
+                result[1 + k * (k + 3) // 2 + j] = (normal * power).sum(axis=0)
     return result
 
 
@@ -103,18 +111,39 @@ def _arc_power(k, start, total, phi, psi, q):
     product = start * (total - start)
     if k == 2:
         return 0.5 * q * (1.0 + psi) * total * total - psi * product
-    if k == 3:
-        return q * total * ((q + 1.0) / 3.0 * total * total - product)
-    # Along the edge u.w is a sinusoid, so K_k is a trigonometric polynomial: Gauss-Legendre is exact to rounding.
-    theta = 2.0 * np.arctan2(np.sqrt(np.maximum(1.0 - 0.5 / q, 0.0)), np.sqrt(0.5 / q))
-    middle, half_difference = 0.5 * total, 0.5 * total - start
-    cos_half, sin_half = np.cos(0.5 * theta), np.sin(0.5 * theta)
-    across = np.where(sin_half > 0.0, half_difference / np.where(sin_half > 0.0, sin_half, 1.0), 0.0)
-    result = np.zeros_like(phi)
-    for node, weight in zip(*_ARC_QUADRATURE, strict=True):
-        angle = 0.5 * theta * node
-        result += 0.5 * weight * (middle / cos_half * np.cos(angle) + across * np.sin(angle)) ** k
-    return phi * result
+    return q * total * ((q + 1.0) / 3.0 * total * total - product)
+
+
+class _ArcNodes:
+    """Gauss-Legendre nodes along edges: there u.w is a sinusoid, so that K_k / phi, a mean, is exact to rounding."""
+
+    def __init__(self, q):
+        half = np.arctan2(np.sqrt(np.maximum(1.0 - 0.5 / q, 0.0)), np.sqrt(0.5 / q))
+        sine = np.sin(half)
+        per_cosine = 1.0 / np.cos(half)
+        per_sine = np.where(sine > 0.0, 1.0 / np.where(sine > 0.0, sine, 1.0), 0.0)
+        nodes, self.weights = _ARC_QUADRATURE
+        # The nodes come in pairs of opposite sign.
+        angles = [half * node for node in nodes[: len(nodes) // 2]]
+        self.cosines = [np.cos(angle) * per_cosine for angle in angles]
+        self.sines = [np.sin(angle) * per_sine for angle in angles]
+
+    def powers(self, start, total, first, last):
+        """Means (V, P) of (u.w)^k along the edges for k = first .. last - 1, u.w from `start` to `total - start`."""
+        middle, half_difference = 0.5 * total, 0.5 * total - start
+        result = [np.zeros_like(middle) for _ in range(first, last)]
+        for cosine, sine, weight in zip(self.cosines, self.sines, self.weights, strict=False):
+            across, along = half_difference * sine, middle * cosine
+            for value in (along + across, along - across):
+                squared = value * value
+                power = squared * squared * (0.5 * weight)
+                for _ in range(4, first):
+                    power *= value
+                for k in range(len(result)):
+                    result[k] += power
+                    if k + 1 < len(result):
+                        power *= value
+        return result
 
 
 @cache

@@ -23,6 +23,8 @@ SMALLEST_SAFE = 0.08
 NEAREST_SAFE = 0.01
 # Solid angles close to 2 pi are close to the branch cut of the arc tangent.
 LARGEST_SAFE_ANGLE = 5.9
+# Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
+MANY_CORNERS = 64
 VIEWS_KEPT = 1000
 _TINY = np.float32(1e-30)
 _PHI_DEGREE, _PSI_DEGREE = 7, 8
@@ -109,8 +111,9 @@ def project(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarr
     return unit, fragile
 
 
-def shifted_cosines(unit: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
-    """1 + cos(theta) (V, P) of the edges, kept positive, and the mask (P,) of fragile polygons."""
+def shifted_cosines(unit: np.ndarray, scratch: Scratch, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+    """1 + cos(theta) (V, P) of the edges, kept positive, and the mask (P,) of fragile polygons, among them those whose
+    edges are shorter than `smallest` in all."""
     _, count, points = unit.shape
     products = np.multiply(unit[:, :-1], unit[:, 1:], out=scratch("three", (3, count - 1, points)))
     shifted = np.add.reduce(products, axis=0, out=scratch("shifted", (count - 1, points)))
@@ -118,8 +121,10 @@ def shifted_cosines(unit: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.
     least = np.minimum.reduce(shifted, axis=0)
     np.absolute(shifted, out=shifted)
     shifted += np.float32(1e-12)
-    tiny = 2.0 - 0.5 * (SMALLEST_SAFE / (count - 1)) ** 2
-    return shifted, (least < np.float32(SHORTEST_SAFE)) | (least > np.float32(tiny))
+    fragile = least < np.float32(SHORTEST_SAFE)
+    if smallest > 0.0:
+        fragile |= least > np.float32(2.0 - 0.5 * (smallest / min(count - 1, MANY_CORNERS)) ** 2)
+    return shifted, fragile
 
 
 def _cross_component(unit, first, second, scratch, out):
@@ -129,10 +134,12 @@ def _cross_component(unit, first, second, scratch, out):
     return out
 
 
-def cosine_integral(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def cosine_integral(
+    corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
     """Signed integral (P,) of z over polygons (>= 3 rows, V, P) in z >= 0, and the mask (P,) of fragile points."""
     unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
     normal = _cross_component(unit, 0, 1, scratch, scratch("normal", shifted.shape))
     normal *= _phi_of(shifted, scratch)
@@ -141,10 +148,12 @@ def cosine_integral(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, 
     return integral, fragile
 
 
-def vector_irradiance(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def vector_irradiance(
+    corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
     """Signed integrals (3, P) of the direction over polygons (>= 3 rows, V, P), and the mask (P,) of fragile points."""
     unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
     phi = _phi_of(shifted, scratch)
     integrals = np.empty((3, corners.shape[2]), dtype=np.float32)
@@ -164,11 +173,13 @@ def _phi_of(shifted, scratch):
     return phi
 
 
-def moments(corners: np.ndarray, degree: int, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+def moments(
+    corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
     """Moments (K, P) in the order of `edge_integrals.moments` of polygons (>= 3 rows, V, P) in z >= 0 that need not be
     unit, and the mask (P,) of fragile points. `degree` 1 to 4. The result is overwritten by the next call."""
     unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
     result = scratch("moments", (coefficient_count(degree), shifted.shape[1]))
     normal, total, start, end = _along_ridges(unit, degree, scratch)
@@ -249,11 +260,21 @@ class _Factors:
             self.cube *= np.float32(1.0 / 3.0)
 
 
+def _normalize(real, imaginary, scratch):
+    """Divide complex numbers (V, P) by about their magnitude: only their arguments matter."""
+    size = np.abs(real, out=scratch("one", real.shape))
+    size += np.abs(imaginary)
+    size += _TINY
+    real /= size
+    imaginary /= size
+
+
 def _solid_angle(shifted, total_z, normal_z, scratch):
     """Signed solid angle (P,): the product over the edges of (1 + a_z + b_z + a.b) + i X_z has half of it."""
     count, points = shifted.shape
     real = np.add(shifted, total_z, out=scratch("real", shifted.shape))
     imaginary = scratch("imaginary", shifted.shape)
+    many = count > MANY_CORNERS
     if count > 8:  # keep the product of many factors in range
         real *= np.float32(0.5)
         np.multiply(normal_z, np.float32(0.5), out=imaginary)
@@ -261,6 +282,8 @@ def _solid_angle(shifted, total_z, normal_z, scratch):
         np.copyto(imaginary, normal_z)
     while count > 1:
         half = count // 2
+        if many:
+            _normalize(real[:count], imaginary[:count], scratch)
         a, b = real[:half], imaginary[:half]
         c, d = real[half : 2 * half], imaginary[half : 2 * half]
         new_real = np.multiply(a, c, out=scratch("product_real", (half, points)))

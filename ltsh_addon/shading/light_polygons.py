@@ -2,23 +2,68 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from . import light_cone
 from .polygon import split_at_horizon
 
 # Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
 MOSTLY_WHOLE = 0.6
 
 
+# Corners of a round light by how far it reaches, in units of the lobe's width where it meets the light: below 8 of them
+# 32 corners are within 0.1 % of an ellipse, and so on.
+ROUND_CORNERS = (32, 64, 128, 256)
+_ROUND_LIMITS = (8.0, 40.0, 300.0)
+_FOCUSED_ROUND_CORNERS = (32, 64)
+
+
+def light_levels(light, corners, position, width):
+    """Yield (corners (V, 3), effort for its cone, chosen (Q',) of the points, None for all) as lobes need them.
+
+    The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q), all in double
+    precision, so that both paths come to the same decisions.
+    """
+    if light.is_focused:
+        for effort, chosen in light_cone.efforts(light, position, width):
+            if light.is_round:
+                corners = light.polygon(_FOCUSED_ROUND_CORNERS[effort.chords > 2])
+                effort = replace(effort, chords=2)
+            yield corners, effort, chosen
+    elif light.is_round:
+        for outline, chosen in round_levels(light, position, width):
+            yield outline, None, chosen
+    else:
+        yield corners, None, None
+
+
+def round_levels(light, position, width):
+    """Yield (corners (V, 3), chosen (Q',), None for all) of a round light for points with x, y, z in `position`
+    (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    offset = [position[axis] - light.center[axis] for axis in range(3)]
+    height = np.abs(sum(offset[axis] * light.direction[axis] for axis in range(3)))
+    reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
+    beyond = np.sqrt(sum(component * component for component in offset)) - reach
+    distance = np.maximum(np.maximum(height, beyond), 1e-12 * reach)
+    level = np.searchsorted(_ROUND_LIMITS, reach / (distance * width))
+    for number in np.unique(level):
+        corners = light.polygon(ROUND_CORNERS[number])
+        chosen = np.nonzero(level == number)[0]
+        yield corners, None if len(chosen) == len(level) else chosen
+
+
 def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
     """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
 
-    corners (V, 3) in the world; offset (3, P) from the points to the light's center.
+    corners (V, 3) in the world; offset (3, P) from the points to the light's center, which for "POLYGON" may lie
+    anywhere near.
     """
     coordinates, _, points = rows.shape
     center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
     result = scratch("corners", (coordinates, len(corners), points))
-    if light.is_round:
+    if light.is_round or light.shape == "POLYGON":
         for number, corner in enumerate((corners - light.center).astype(np.float32)):
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
             np.add(center, out, out=result[:, number])

@@ -108,12 +108,16 @@ def integrals_on_sphere(integral, vertices: np.ndarray) -> np.ndarray:
     return result
 
 
+def tilted(warped: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    """Vectors (3, V, P) or (3, P) turned so that the axis (sin tilt, 0, cos tilt) becomes e_z."""
+    sine, cosine = np.sin(tilt), np.cos(tilt)
+    return np.stack([cosine * warped[0] - sine * warped[2], warped[1], sine * warped[0] + cosine * warped[2]])
+
+
 def _tilted_cosine_integral(warped, tilt):
     """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt): clipped a second time."""
-    sine, cosine = np.sin(tilt), np.cos(tilt)
-    turned = np.stack([cosine * warped[0] - sine * warped[2], warped[1], sine * warped[0] + cosine * warped[2]])
     result = np.zeros_like(tilt)
-    for index, polygon in split_at_horizon(turned):
+    for index, polygon in split_at_horizon(tilted(warped, tilt)):
         result[index] = form_factor(polygon)
     return result
 

@@ -123,17 +123,42 @@ class EllipseBoundary:
         return self.center[:, None] + np.cos(angle) * self.half_u[:, None] + np.sin(angle) * self.half_v[:, None]
 
 
-def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
+@dataclass(frozen=True)
+class Cone:
+    """The factor max(0, (tangent - tan theta) / share) of lights with a spread, theta the angle from `axis`."""
+
+    axis: np.ndarray  # (3, P) from the points straight to the lights' planes
+    tangent: float
+    share: float
+    at_foot: np.ndarray  # (P,) points whose lights are best integrated around the axis, where the factor has its tip
+
+    def take(self, index) -> Cone:
+        return Cone(self.axis[:, index], self.tangent, self.share, self.at_foot[index])
+
+    def factor(self, direction: np.ndarray) -> np.ndarray:
+        """Factors (..., P) for unit directions (3, ..., P)."""
+        across = np.cross(direction, np.broadcast_to(self._axis_for(direction), direction.shape), axis=0)
+        along = _dot(direction, self._axis_for(direction))
+        tangent = np.sqrt(_dot(across, across)) / np.maximum(along, 1e-30)
+        return np.maximum((self.tangent - tangent) / self.share, 0.0)
+
+    def _axis_for(self, direction):
+        return self.axis.reshape(3, *[1] * (direction.ndim - 2), -1)
+
+
+def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4, cone: Cone | None = None):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
     `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
     cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
     `ior` (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6;
-    the estimate is the last difference. Lights must be convex.
+    the estimate is the last difference. Lights must be convex. With a `cone` the integrand has its factor, too.
     """
-    warp = _limit_warp(cos_theta_o, np.maximum(alpha, MIN_ALPHA))
+    warp = limit_warp(cos_theta_o, alpha)
     boundary = make_boundary(warp)
     apex = boundary.apex()
+    if cone is not None:
+        apex = np.where(cone.at_foot, project_to_sphere(warp.to_original_domain(cone.axis)), apex)
     count = len(cos_theta_o)
     result, error = np.zeros((4, count)), np.full(count, np.inf)
     open_points = np.arange(count)
@@ -142,7 +167,8 @@ def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
         for start in range(0, len(open_points), batch):
             index = open_points[start : start + batch]
             setting = (warp.take(index), cos_theta_o[index], np.maximum(alpha[index], MIN_ALPHA), ior[index])
-            value = _fixed_order(order, boundary.take(index), apex[:, index], *setting)
+            its_cone = None if cone is None else cone.take(index)
+            value = _fixed_order(order, boundary.take(index), apex[:, index], *setting, its_cone)
             if level > 0:
                 error[index] = np.abs(value - result[:, index]).max(axis=0)
             result[:, index] = value
@@ -152,7 +178,9 @@ def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4):
     return np.maximum(result, 0.0), error
 
 
-def _limit_warp(cosine, alpha):
+def limit_warp(cosine, alpha) -> Lobe:
+    """The warp of the limit alpha -> 0 for cosines (P,) of theta_o and alpha (P,)."""
+    alpha = np.maximum(alpha, MIN_ALPHA)
     squared = cosine**2 + WARP_REGULARIZATION**2 * alpha**2
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
     return Lobe(squared, np.sqrt(squared) * sine, np.ones_like(alpha), 2.0 * alpha, None, np.empty((0, 0, len(alpha))))
@@ -167,7 +195,7 @@ def _peak_or_mean(inside, unit):
     return np.where(inside, np.array([0.0, 0.0, 1.0])[:, None], mean)
 
 
-def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior):
+def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior, cone):
     """Integrals (4, P) with fixed Gauss-Legendre orders."""
     points, measure = boundary.nodes(order[0])
     wedge = _dot(measure, apex[:, None])  # (B, P)
@@ -179,8 +207,10 @@ def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior):
     near, far = np.sin(rho * (1.0 - fractions)) / sine, inner_sine / sine  # (B, m, P)
     weight = wedge[:, None] * weights[:, None] * rho / sine * far
     warped = [near * apex[axis] + far * points[axis][:, None] for axis in range(3)]
-    values, half = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
+    values, half, direction = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
     values *= weight
+    if cone is not None:
+        values *= cone.factor(np.moveaxis(direction, -1, 0))
     schlick = values * brdf.schlick_curve(half)
     dip = (schlick * (half * (1.0 - half))).sum(axis=(0, 1))
     schlick = schlick.sum(axis=(0, 1))
@@ -204,7 +234,8 @@ def _slerp(start, end, angle, fraction):
 
 
 def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
-    """BRDF times cosine times Jacobian, and the cosine of the half angle, at warped unit vectors [x, y, z]."""
+    """BRDF times cosine times Jacobian, the cosine of the half angle, and the unit direction, last axis, at warped unit
+    vectors [x, y, z]."""
     z = warped[2] / warp.zz
     x = (warped[0] - warp.xz * z) / warp.xx
     y = warped[1] / warp.yy
@@ -213,4 +244,4 @@ def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
     # Axes (B, m, P): the kernels of `brdf` broadcast over leading axes and end with the sample axis.
     values = brdf.ggx_brdf_cosine(cos_theta_o, alpha, direction[..., None, :])[..., 0]
     half = brdf.half_angle_cosine(cos_theta_o, direction[..., None, :])[..., 0]
-    return values / ((warp.xx * warp.yy * warp.zz) * length**3), half
+    return values / ((warp.xx * warp.yy * warp.zz) * length**3), half, direction

@@ -11,37 +11,38 @@ from functools import partial
 
 import numpy as np
 
-from . import double_precision, edge_loop, ridge_table
-from .light_polygons import integrate_visible, local_corners
+from . import double_precision, edge_loop, light_cone, ridge_table
+from .fresnel_kinds import any_component, columns, fresnel_kinds
+from .light_polygons import integrate_visible, light_levels, local_corners
 
 # Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
 # multiple of a page long, where the cache would hold few of them.
 CHUNK = 24592
 CORNERS = 4 * CHUNK
 DOUBLE_CHUNK = 4096
-# With more different indices of refraction in a block the dielectric's weights are summed up per sample.
-SEPARATE_IORS = 8
+# The light of narrower cones, in rad, is too bright for the absolute error of single precision.
+NARROW_SPREAD = 0.35
 
 
 def shade_diffuse(samples, lights, radiance, scratch):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     lights = [item for item in lights if item[0].affects_diffuse]
-    lit = np.nonzero(_any(samples.diffuse_albedo))[0]
+    lit = np.nonzero(any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
     if samples.diffuse_normal is not samples.smooth_normal:
-        bumped = _any(samples.diffuse_normal != samples.smooth_normal)[lit]
+        bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     fragile = [[] for _ in lights]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
-            rows = _normal_frame(_columns(samples.diffuse_normal, index))
+            rows = _normal_frame(columns(samples.diffuse_normal, index))
             clip_rows, integrate = (2,), None
             if is_bumped:
-                smooth = _columns(samples.smooth_normal, index)
+                smooth = columns(samples.smooth_normal, index)
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
                 integrate = _ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
-            colors = _columns(samples.diffuse_albedo, index)[None]
+            colors = columns(samples.diffuse_albedo, index)[None]
             integrate = integrate or _Cosine(scratch)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, 1.0, radiance, fragile, scratch)
     _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
 
 
@@ -50,16 +51,16 @@ def shade_specular(samples, lights, table, radiance, scratch):
     lights = [item for item in lights if item[0].affects_specular]
     ridges = ridge_table.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
-    reflective = np.logical_or.reduce([_any(term) for term in terms])
+    reflective = np.logical_or.reduce([any_component(term) for term in terms])
     lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
     fragile = [[] for _ in lights]
-    for vectors, members, color_rows in _fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
+    for vectors, members, color_rows in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
             integrate = _LobeIntegral(ridges, weights, scratch)
-            colors = color_rows(index)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch)
+            colors, width = color_rows(index), double_precision.lobe_width(samples, index)
+            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch)
 
     def in_double(part, items, target):
         double_precision.shade_specular(part, items, table, target)
@@ -68,18 +69,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
     _add_fragile(samples, lights, fragile, radiance, in_double)
 
 
-def _any(vectors):
-    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
-    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
-
-
 def _chunks(members):
     return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
-
-
-def _columns(vectors, index):
-    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
-    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
 
 
 def _add_double(samples, members, lights, radiance, shade):
@@ -92,16 +83,15 @@ def _add_double(samples, members, lights, radiance, shade):
 
 
 def _add_fragile(samples, lights, fragile, radiance, shade):
-    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all lights with equally
-    many corners in one batch, for there are few such samples."""
-    for count in sorted({len(corners) for _, _, corners in lights}):
-        chosen = [
-            (item, np.concatenate(parts))
-            for item, parts in zip(lights, fragile, strict=True)
-            if parts and len(item[2]) == count
-        ]
-        if not chosen:
-            continue
+    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all plain lights with
+    equally many corners in one batch, for there are few such samples."""
+    found = [(item, np.concatenate(parts)) for item, parts in zip(lights, fragile, strict=True) if parts]
+    for item, index in found:
+        if item[0].is_focused or item[0].is_round:
+            _add_double(samples, index, [item], radiance, shade)
+    found = [(item, index) for item, index in found if not (item[0].is_focused or item[0].is_round)]
+    for count in sorted({len(item[2]) for item, _ in found}):
+        chosen = [(item, index) for item, index in found if len(item[2]) == count]
         members = np.concatenate([index for _, index in chosen])
         number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
         group = np.array([item[1] for item, _ in chosen])[number]
@@ -120,23 +110,33 @@ def _add_fragile(samples, lights, fragile, radiance, shade):
             np.add.at(radiance, (group[part], members[part]), target[0].astype(np.float32))
 
 
-def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radiance, fragile, scratch):
+def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch):
     """Add the light of all `lights` at the samples `index` (Q,) to radiance (G, P, 3).
 
     rows (C, 3, Q) are the axes of the coordinates that `integrate` wants, colors (F, 3, Q) the reflectances of its
-    integrals. Points left to double precision are appended to `fragile`, per light.
+    integrals, `width` that of the lobes as for `round_levels`. Points left to double precision are appended to
+    `fragile`, per light.
     """
     position = np.ascontiguousarray(samples.position[index].T)
     sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
     for number, (light, group, corners) in enumerate(lights):
-        step = max(CORNERS // len(corners), 512)
-        for start in range(0, len(index), step):
-            part = slice(start, start + step)
+        allowed = light.receives(samples.receiver, index)
+        if light.is_focused:
+            near = light_cone.may_reach(light, position)
+            allowed = near if allowed is None else allowed & near
+        if light.spread < NARROW_SPREAD:
+            fragile[number].append(index[allowed])
+            continue
+        for part, outline, effort in _batches(light, corners, position, width):
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
-            axes = rows[:, :, part]
-            polygons = local_corners(light, corners, offset, axes, scratch)
             facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
-            of_part = partial(integrate, part)
+            if allowed is not None:
+                facing &= allowed[part]
+            axes, of_part = rows[:, :, part], partial(integrate, part)
+            if light.is_focused:
+                of_part = _Focused(light, effort, offset, axes, of_part, len(colors))
+                axes = of_part.rows
+            polygons = local_corners(light, outline, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
             if redo.any():
                 found[:, redo] = 0.0
@@ -153,6 +153,16 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, radi
         radiance[group, index] += reflected.T
 
 
+def _batches(light, corners, position, width):
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
+    for outline, effort, chosen in light_levels(light, corners, position, width):
+        count = position.shape[1] if chosen is None else len(chosen)
+        step = max(CORNERS // len(outline), 512)
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            yield part if chosen is None else chosen[part], outline, effort
+
+
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -163,14 +173,49 @@ def _selected(values, part, index):
     return values if index is None else np.take(values, index, axis=-1)
 
 
+class _Focused:
+    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
+
+    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
+    """
+
+    def __init__(self, light, effort, offset, axes, integrate, count):
+        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
+        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
+        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
+        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
+
+    def __call__(self, corners, index):
+        index = np.arange(corners.shape[2]) if index is None else index
+        values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
+        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
+        for start in range(0, len(index), step):
+            part = slice(start, start + step)
+            flat, view = corners[-2:, :, part], self.view.take(index[part])
+            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
+            for number, (near, weights, polygons) in enumerate(layers):
+                # The small disks count little, so that the rounding of their edges is lost in the sum.
+                smallest = 0.0 if number < self.effort.layers - 1 else edge_loop.SMALLEST_SAFE
+                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
+                values[:, start + near] += weights * found
+                fragile[start + near] |= redo
+        return values, fragile
+
+
+def _along_rows(axes, vector):
+    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
+    x, y, z = vector.astype(np.float32)
+    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]
+
+
 class _Cosine:
     """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch
 
-    def __call__(self, part, corners, index):
-        integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
+        integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
         integral *= np.float32(-1.0 / np.pi)
         return np.maximum(integral, np.float32(0.0))[None], fragile
 
@@ -182,9 +227,9 @@ class _ShadowedCosine:
         self.smooth = np.stack([_dot(row, rows[3]) for row in rows[:3]])
         self.bump_alpha2, self.scratch = bump_alpha2, scratch
 
-    def __call__(self, part, corners, index):
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
         smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch)
+        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch, smallest)
         direction = np.negative(integrals, out=integrals)
         along = np.maximum(_dot(direction, smooth), np.float32(1e-15))
         tangent2 = np.maximum(_dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
@@ -199,68 +244,18 @@ class _LobeIntegral:
     def __init__(self, ridges, weights, scratch):
         self.ridges, self.weights, self.scratch = ridges, weights, scratch
 
-    def __call__(self, part, corners, index):
+    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
         weights = _selected(self.weights, part, index)
         if self.ridges.source.family == "ltc":
-            integral, fragile = edge_loop.cosine_integral(corners, self.scratch)
+            integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
             values = weights[:, 0] * integral
             values *= np.float32(-1.0 / np.pi)
         else:
-            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch)
+            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch, smallest)
             products = np.multiply(weights, moments, out=self.scratch("weighted", weights.shape))
             values = np.add.reduce(products, axis=1)
             np.negative(values, out=values)
         return np.maximum(values, np.float32(0.0), out=values), fragile
-
-
-def _fresnel_kinds(samples, members):
-    """Yield (vectors, members, colors): what part of the Fresnel terms the samples `members` need.
-
-    `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
-    """
-    dipped = _any(samples.specular_dip)[members]
-    metal = (_any(samples.specular_f90) | _any(samples.specular_f0))[members] | dipped
-    flat = ~_any(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
-    dielectric = _any(samples.dielectric)[members]
-
-    def white(index):
-        return _columns(samples.specular_f0, index)[None]
-
-    def schlick(index):
-        f0 = _columns(samples.specular_f0, index)
-        return np.stack([f0, _columns(samples.specular_f90, index) - f0])
-
-    def f82(index):
-        return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
-
-    def coat(index):
-        return _columns(samples.dielectric, index)[None]
-
-    yield (0,), members[~dielectric & flat], white
-    yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
-    yield (0, 1, 2), members[~dielectric & dipped], f82
-    for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
-        yield (vector,), with_ior, coat
-    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
-        first = f82 if 2 in own else schlick
-        for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
-            yield (*own, vector), with_ior, lambda index, first=first: np.concatenate([first(index), coat(index)])
-
-
-def _by_ior(ior, members):
-    """Yield (vector, members): the dielectric's weight vector, one per index of refraction where there are few."""
-    values = ior[members]
-    if len(members) == 0:
-        return
-    if values.min() == values.max():
-        yield ("dielectric", float(values[0])), members
-        return
-    distinct, number = np.unique(values, return_inverse=True)
-    if len(distinct) > SEPARATE_IORS:
-        yield "dielectric", members
-        return
-    for position, value in enumerate(distinct):
-        yield ("dielectric", float(value)), members[number == position]
 
 
 def _normal_frame(normal):
@@ -275,7 +270,7 @@ def _normal_frame(normal):
 
 def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
-    normal, view = _columns(samples.normal, index), _columns(samples.view, index)
+    normal, view = columns(samples.normal, index), columns(samples.view, index)
     cosine = _dot(normal, view)
     tangent = view - cosine * normal
     sine = np.sqrt(_dot(tangent, tangent))

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
-from . import double_precision, single_precision
+from . import double_precision, light_cone, single_precision
 from .lookup_table import LookupTable
 
-ROUND_LIGHT_CORNERS = 32
 # Double precision arrays of this many samples stay in the cache.
 DOUBLE_CHUNK = 4096
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
@@ -44,13 +43,13 @@ class Task:
     def seconds(self, count: int) -> float:
         """About how long `count` samples take one process."""
         per_light, per_corner = _REFERENCE_COST if self.is_reference else _SINGLE_COST if self.single else _DOUBLE_COST
-        corners = sum(ROUND_LIGHT_CORNERS if light.is_round else 4 for light in self.lights)
+        corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
         prepared = [
-            (light, self.groups.index(light.group), light.polygon(ROUND_LIGHT_CORNERS)) for light in self.lights
+            (light, self.groups.index(light.group), light.polygon()) for light in self.lights
         ]
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
@@ -70,3 +69,12 @@ class Task:
                 estimates = None if error is None else error[chunk]
                 double_precision.shade_specular(part, prepared, self.table, views["specular"], estimates)
         return radiance, error
+
+
+def _corners_integrated(light, is_reference):
+    """About how many corners the integrals over a light have."""
+    count = len(light.polygon())
+    if light.is_focused:
+        effort = light_cone.EFFORTS[1]
+        count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
+    return count

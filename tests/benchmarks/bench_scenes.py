@@ -38,7 +38,8 @@ def random_polygons(count, kind, corners=4, seed=0):
 def floor_scene(count, lights=4, fresnel="white", seed=0):
     """Samples on a bumpy floor of 6 m, seen from one side, and `lights` rectangles hanging over it and around it.
 
-    `fresnel`: "white" (F = 1), "schlick", "dielectric" (all of one IOR), "both" (Schlick and a dielectric).
+    `fresnel`: "white" (F = 1), "schlick", "f82" (a metal with a tint), "dielectric" (all of one IOR), "both" (Schlick
+    and a dielectric).
     """
     generator = np.random.default_rng(seed)
     position = np.zeros((count, 3))
@@ -54,7 +55,8 @@ def floor_scene(count, lights=4, fresnel="white", seed=0):
         roughness=0.1 + 0.9 * generator.random(count),
         specular_f0=(ones if fresnel == "white" else 0.6 * ones) if metal else none,
         specular_f90=ones if metal else none,
-        dielectric=np.full(count, 0.0 if fresnel in ("white", "schlick") else 1.0),
+        specular_dip=0.8 * ones if fresnel == "f82" else None,
+        dielectric=np.full(count, 1.0 if fresnel in ("dielectric", "both") else 0.0),
         ior=np.full(count, 1.5),
         diffuse_albedo=0.5 * ones,
     )

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -34,7 +35,7 @@ def heading(text):
 
 
 def row(name, nanoseconds, ratio=None, note=""):
-    print(f"  {name:<34}{nanoseconds:>9.1f} ns{'' if ratio is None else f'{ratio:>8.2f} x'}  {note}")
+    print(f"  {name:<42}{nanoseconds:>9.1f} ns{'' if ratio is None else f'{ratio:>8.2f} x'}  {note}")
 
 
 def polygons(options):
@@ -77,8 +78,8 @@ def zonal(peer, table, cosine, roughness, vertices):
 def shade(options):
     """`shade` with four rectangles: frames, lookup, clip and integrals, one process."""
     count = 50_000 if options.quick else 200_000
-    for fresnel, label in (("white", "F = 1"), ("schlick", "Schlick"), ("dielectric", "dielectric, one IOR"),
-                           ("both", "Schlick + dielectric")):  # fmt: skip
+    for fresnel, label in (("white", "F = 1"), ("schlick", "Schlick"), ("f82", "F82"),
+                           ("dielectric", "dielectric, one IOR"), ("both", "Schlick + dielectric")):  # fmt: skip
         samples, lights = floor_scene(count, 4, fresnel)
         heading(f"shade, {count} samples, 4 rectangles, specular, {label}: ns per sample and light")
         cases = {}
@@ -92,6 +93,32 @@ def shade(options):
             row(name, seconds / count / 4 * 1e9, ratio[name])
         if fresnel == "white":
             targets(ratio)
+
+
+def light_kinds(options):
+    """What shapes, spread and light linking cost."""
+    count = 10_000 if options.quick else 40_000
+    heading(f"kinds of lights: ltsh4, F = 1, {count} samples, 4 lights, one process: ns per sample and light")
+    samples, lights = floor_scene(count, 4)
+    samples = replace(samples, receiver=np.arange(count) % 2)
+    hexagon = [replace(light, shape="POLYGON", corners=replace(light, shape="DISK").polygon(6)) for light in lights]
+    kinds = {
+        "rectangle": lights,
+        "rectangle, half of the samples": [replace(light, receivers=(1,)) for light in lights],
+        "hexagon": hexagon,
+        "ellipse": [replace(light, shape="ELLIPSE") for light in lights],
+        "rectangle, spread 90 degrees": [replace(light, spread=0.5 * np.pi) for light in lights],
+        "ellipse, spread 90 degrees": [replace(light, shape="ELLIPSE", spread=0.5 * np.pi) for light in lights],
+        "rectangle, spread 15 degrees": [replace(light, spread=np.pi / 12) for light in lights],
+    }
+    for part in ("specular", "diffuse"):
+        cases = {
+            f"{name}, {part}": partial(shading.shade, samples, its, TABLES["ltsh4"], passes=[part], workers=1)
+            for name, its in kinds.items()
+        }
+        medians, ratio = measure.ratios(cases, f"rectangle, {part}", 3)
+        for name, seconds in medians.items():
+            row(name, seconds / count / 4 * 1e9, ratio[name])
 
 
 def specular(samples, lights, table, **options):
@@ -240,6 +267,7 @@ def cycles(options):
 SECTIONS = {
     "polygons": polygons,
     "shade": shade,
+    "lights": light_kinds,
     "bounds": bounds,
     "growth": growth,
     "processes": processes,

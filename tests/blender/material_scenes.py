@@ -11,7 +11,7 @@ from ltsh_addon.blender import gbuffer
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.shading import shade
 
-SIZE = (32, 20)
+SIZE = (24, 16)
 # Techniques are judged where the surface is not seen at a grazing angle.
 STEEP_COSINE = 0.2
 

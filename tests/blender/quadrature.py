@@ -9,8 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 
-def patch_centers(light, count=64) -> tuple[np.ndarray, float]:
-    """Points (S, 3) on the light, and its area in m^2."""
+def patches_of(light, count=64) -> tuple[np.ndarray, np.ndarray]:
+    """Points (S, 3) on the light and the area (S,) in m^2 that each stands for, negative where a fan of triangles over
+    a concave polygon counts what is outside once more and takes it off again."""
+    if light.shape == "POLYGON":
+        first, *others = light.corners
+        fans = [_triangle_patches(light, first, *pair, count) for pair in zip(others, others[1:], strict=False)]
+        return tuple(np.concatenate(parts) for parts in zip(*fans, strict=True))
     steps = (np.arange(count) + 0.5) / count
     area = np.linalg.norm(np.cross(light.half_u, light.half_v))
     if light.is_round:
@@ -19,7 +24,28 @@ def patch_centers(light, count=64) -> tuple[np.ndarray, float]:
     else:
         s, t = np.meshgrid(2.0 * steps - 1.0, 2.0 * steps - 1.0)
         area = 4.0 * area
-    return light.center + s.ravel()[:, None] * light.half_u + t.ravel()[:, None] * light.half_v, area
+    centers = light.center + s.ravel()[:, None] * light.half_u + t.ravel()[:, None] * light.half_v
+    return centers, np.full(count**2, area / count**2)
+
+
+def _triangle_patches(light, a, b, c, count):
+    """Centers of count^2 equal triangles, the upright ones and those upside down."""
+    i, j = np.nonzero(np.add.outer(np.arange(count), np.arange(count)) < count)
+    inner = i + j < count - 1
+    u = np.concatenate([i + 1.0 / 3.0, i[inner] + 2.0 / 3.0]) / count
+    v = np.concatenate([j + 1.0 / 3.0, j[inner] + 2.0 / 3.0]) / count
+    centers = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    area = 0.5 * np.dot(np.cross(b - a, c - a), light.direction)
+    return centers, np.full(count**2, area / count**2)
+
+
+def spread_factor(light, cosine) -> np.ndarray:
+    """What the spread of the light makes of its radiance; `cosine` is that of the angle from its direction."""
+    if light.spread >= np.pi - 1e-6:
+        return np.ones_like(cosine)
+    limit = np.tan(0.5 * light.spread)
+    tangent = np.sqrt(np.maximum(1.0 / np.maximum(cosine, 1e-6) ** 2 - 1.0, 0.0))
+    return np.maximum(limit - tangent, 0.0) / (limit - 0.5 * light.spread)
 
 
 def lambert(directions, samples):
@@ -59,14 +85,17 @@ def radiance(samples, lights, brdf, count=64, weight=None) -> np.ndarray:
     """Reflected radiance (P, 3); `weight(directions)` (P, S) multiplies the BRDF."""
     total = np.zeros((len(samples), 3))
     for light in lights:
-        centers, area = patch_centers(light, count)
+        centers, area = patches_of(light, count)
         offset = centers - samples.position[:, None]
         distance2 = np.sum(offset**2, axis=-1)
         directions = offset / np.sqrt(distance2)[..., None]
-        geometry = np.maximum(-(directions @ light.direction), 0.0) / distance2
+        cosine = np.maximum(-(directions @ light.direction), 0.0)
+        geometry = area * cosine / distance2 * spread_factor(light, cosine)
+        if light.receivers is not None:
+            geometry = geometry * np.isin(samples.receiver, light.receivers)[:, None]
         if weight is not None:
             geometry = geometry * weight(directions)
-        total += np.einsum("ps,psc->pc", geometry, brdf(directions, samples)) * area / len(centers) * light.radiance
+        total += np.einsum("ps,psc->pc", geometry, brdf(directions, samples)) * light.radiance
     return total
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ltsh_addon.blender import child, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
+from ltsh_addon.blender import cameras, child, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
 from ltsh_addon.imaging.exr import read_channels
 
 SIZE = (24, 16)
@@ -99,7 +99,7 @@ def bsdf_material(node_type, name="Material", **inputs):
     """A material of one BSDF with GGX distribution; (material, node). Underscores in input names stand for spaces."""
     material, tree, output = new_material(name)
     node = tree.nodes.new(node_type)
-    if hasattr(node, "distribution"):
+    if hasattr(node, "distribution") and node_type != "ShaderNodeBsdfSheen":
         node.distribution = "GGX"
     for key, value in inputs.items():
         node.inputs[key.replace("_", " ")].default_value = value
@@ -128,7 +128,7 @@ def add_bump(tree, node, strength=1.0, scale=6.0, distance=0.3):
 def prepare():
     """The scene's preparation as the child does it; (scene, view layer, light inventory, warnings)."""
     scene, warnings = bpy.context.scene, []
-    camera = render_settings.choose_camera(scene, None)
+    camera = cameras.choose_camera(scene, None)
     layer = render_settings.choose_view_layer(scene, warnings)
     inventory = extraction.prepare_scene(scene, layer, camera, warnings)
     return scene, layer, inventory, warnings
@@ -143,6 +143,8 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
     scene, layer = prepared[:2]
     files = pixel_samples.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
     channels = [read_channels(folder / name) for name in files]
+    for image in channels:
+        gbuffer.clear_holdouts(image)
     albedo = render_settings.pass_names()["diffuse_color"]
     return [gbuffer.surface_samples(image, albedo) for image in channels], channels
 

@@ -8,6 +8,7 @@ import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
 from ltsh_addon.blender import gbuffer, render_settings
+from ltsh_addon.blender.materials import MaterialReport, inject_aovs
 
 # Texture coordinates and colors pass through float32 a few times.
 EXACT = 2e-6
@@ -253,43 +254,47 @@ def test_every_unsupported_input_is_named_once(tmp_path, plane_scene):
     wanted = {
         "Diffuse Roughness": 0.5,
         "Subsurface Weight": 0.2,
-        "Specular Tint": (1.0, 0.5, 0.5, 1.0),
         "Anisotropic": 0.3,
         "Transmission Weight": 0.1,
-        "Coat Weight": 0.2,
         "Sheen Weight": 0.3,
         "Thin Film Thickness": 100.0,
+        "IOR": 0.8,
     }
     material, node = principled("Rich")
     for name, value in wanted.items():
         node.inputs[name].default_value = value
+    node.inputs["Coat Weight"].default_value, node.inputs["Specular Tint"].default_value = 0.2, (1.0, 0.5, 0.5, 1.0)
     node.inputs["Emission Strength"].default_value = 2.0
-    _, warnings = plane_scene(tmp_path, material)
-    assert len(warnings) == len(wanted) + 1
+    scene_parts.add_area_light()
+    add_plane(material)
+    warnings = scene_parts.prepare()[3]
+    assert len(warnings) == len(wanted)
     for name in wanted:
         assert sum(f"{name} of 'Principled BSDF'" in line for line in warnings) == 1, (name, warnings)
     assert all(line.startswith("material 'Rich': ") for line in warnings)
-    assert sum("emission" in line for line in warnings) == 1
+    assert not any("emission" in line for line in warnings)  # it is a light
 
 
 def test_other_shaders_are_named_and_shaded_as_the_nearest(tmp_path, plane_scene):
-    material, nodes, output = new_material("Blend")
-    mix = nodes.nodes.new("ShaderNodeMixShader")
-    mix.inputs[0].default_value = 0.8
-    glass, shader = nodes.nodes.new("ShaderNodeBsdfGlass"), nodes.nodes.new("ShaderNodeBsdfPrincipled")
-    shader.distribution, shader.inputs["Roughness"].default_value = "GGX", 0.55
-    nodes.links.new(shader.outputs[0], mix.inputs[1])
-    nodes.links.new(glass.outputs[0], mix.inputs[2])
-    nodes.links.new(mix.outputs[0], output.inputs["Surface"])
-    surface, warnings = plane_scene(tmp_path, material)
-    assert np.allclose(surface.roughness, 0.55)
-    assert len(warnings) == 1 and "'Mix Shader'" in warnings[0] and "'Principled BSDF'" in warnings[0]
+    kinds = {
+        "ShaderNodeBsdfGlass": "only its reflection",
+        "ShaderNodeBsdfRefraction": "not shaded",
+        "ShaderNodeBsdfHair": "not shaded",
+        "ShaderNodeBsdfSheen": "as a Diffuse BSDF",
+        "ShaderNodeSubsurfaceScattering": "as a Diffuse BSDF",
+        "ShaderNodeBsdfToon": "as a Diffuse BSDF",
+    }
+    for number, kind in enumerate(kinds):
+        add_plane(bsdf_material(kind, f"Material {number}")[0])
+    surface, warnings = plane_scene(tmp_path, principled()[0])
+    assert len(warnings) == len(kinds) and len(surface) == 24 * 16
+    for number, (line, done) in enumerate(zip(warnings, kinds.values(), strict=True)):
+        assert line.startswith(f"material 'Material {number}': node '") and done in line
 
 
-def test_multiscatter_materials_share_one_line(tmp_path, plane_scene):
-    materials = [principled(name)[0] for name in ("One", "Two")]
-    for material in materials:
-        node = next(item for item in material.node_tree.nodes if item.bl_idname == "ShaderNodeBsdfPrincipled")
-        node.distribution = "MULTI_GGX"
-    _, warnings = plane_scene(tmp_path, *materials)
-    assert len(warnings) == 1 and "'One', 'Two'" in warnings[0] and "Multiscatter" in warnings[0]
+def test_materials_that_shine_into_the_scene_keep_their_emission():
+    quiet, shining = (principled(name, **{"Emission Strength": 2.0})[0] for name in ("Quiet", "Shining"))
+    report = MaterialReport()
+    inject_aovs([quiet, shining], report, frozenset({"Shining"}))
+    assert quiet.cycles.emission_sampling == "NONE" and shining.cycles.emission_sampling != "NONE"
+    assert len(report.lines()) == 1 and "'Quiet'" in report.lines()[0] and "emission" in report.lines()[0]

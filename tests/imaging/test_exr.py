@@ -134,3 +134,17 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, m
 def test_a_missing_folder_is_said(tmp_path):
     with pytest.raises(OSError, match="nowhere does not exist"):
         write_layers(tmp_path / "nowhere" / "a.exr", layers())
+
+
+def test_chromaticities_stand_in_the_header(tmp_path):
+    given = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+    write_layers(tmp_path / "a.exr", {"a": np.zeros((2, 3))}, chromaticities=given, pixel_aspect=1.5)
+    header = OpenEXR.File(str(tmp_path / "a.exr"), header_only=True).header()
+    assert np.allclose(header["chromaticities"], given, atol=1e-7) and header["pixelAspectRatio"] == 1.5
+
+
+@pytest.mark.parametrize("wrong", [(0.3,) * 7, (0.3,) * 7 + (np.nan,)])
+def test_chromaticities_are_eight_numbers(tmp_path, wrong):
+    with pytest.raises(ValueError, match="chromaticities"):
+        write_layers(tmp_path / "a.exr", {"a": np.zeros((2, 3))}, chromaticities=wrong)
+    assert list(tmp_path.iterdir()) == []

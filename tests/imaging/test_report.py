@@ -19,6 +19,11 @@ def document(scene="room.blend", noise=True):
         "camera": "Camera",
         "frame": 3,
         "resolution": [48, 27],
+        "border": {"left": 3, "top": 2, "width": 48, "height": 27, "full_width": 96, "full_height": 54},
+        "pixel_aspect": 1.5,
+        "pixel_filter": "GAUSSIAN 2 px",
+        "exposure": 0.5,
+        "color_space": "ACEScg",
         "sub_samples": 1,
         "cycles_samples": 16,
         "versions": {"blender": "5.2.3"},
@@ -63,6 +68,8 @@ def test_page_is_well_formed_and_escapes_names(tmp_path, noise):
     assert "script" not in page.seen and "b" not in page.seen
     assert "<b>&.blend" in page.text and "<script>alert(1)</script>" in page.text
     assert "1.230 %" in page.text
+    assert "GAUSSIAN 2 px" in page.text and "pixels 1.5 times as wide" in page.text
+    assert "ACEScg" in page.text and "3, 2 of 96 x 54" in page.text and "film exposure 0.5" in page.text
 
 
 def test_files_are_replaced_as_a_whole(tmp_path):

@@ -8,7 +8,7 @@ from surface_scenes import area_light, four_lights, random_samples, single_sampl
 from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
-from ltsh_addon.shading import edge_integrals, edge_loop, ridge_table, single_precision
+from ltsh_addon.shading import edge_integrals, edge_loop, fresnel_kinds, ridge_table
 from ltsh_addon.shading.lookup_table import LookupTable
 from ltsh_addon.shading.polygon import project_to_sphere
 
@@ -98,7 +98,7 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     many = replace(few, ior=few.ior + np.where(np.arange(300) < 150, 0.0, 1e-3 * np.arange(300)))
     apart = shading.shade(few, lights, name, workers=1).specular[:, :150]
     together = shading.shade(many, lights, name, workers=1).specular[:, :150]
-    assert len(np.unique(many.ior)) > single_precision.SEPARATE_IORS
+    assert len(np.unique(many.ior)) > fresnel_kinds.SEPARATE_IORS
     assert np.abs(apart - together).max() < 2e-6
 
 

@@ -1,0 +1,213 @@
+"""Flat polygons of a triangle mesh, as large as they come, and which side of it is outside. Needs no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Triangles that share an edge are in one plane up to this angle in rad, and this distance by edge length: vertices are
+# stored in single precision.
+PLANE_ANGLE = 1e-3
+PLANE_DISTANCE = 1e-5
+# A union of triangles is flat up to this distance by its extent.
+FLATNESS = 1e-4
+# A corner this close to the line between its neighbors is on a straight edge, by the size of the coordinates.
+STRAIGHT = 1e-6
+# Volume by the cube of its extent below which a closed surface is a sheet.
+SHEET = 1e-6
+# Products of triangles and vertices in the test for hollows; beyond, it looks at a share of the triangles.
+HOLLOW_PRODUCTS = 20_000_000
+MOST_ISLANDS = 64
+
+
+@dataclass(frozen=True)
+class FlatPolygon:
+    """A simple polygon, counterclockwise around its unit normal."""
+
+    corners: np.ndarray  # (V, 3)
+    normal: np.ndarray  # (3,)
+    label: int
+
+
+def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray) -> list[FlatPolygon]:
+    """Polygons that cover the `triangles` (T, 3), indices of `vertices` (N, 3); none has two labels (T,).
+
+    Neighbors in one plane become one polygon where their union has one outline that meets itself nowhere.
+    """
+    crossed = np.cross(
+        vertices[triangles[:, 1]] - vertices[triangles[:, 0]], vertices[triangles[:, 2]] - vertices[triangles[:, 0]]
+    )
+    area = np.linalg.norm(crossed, axis=-1)
+    solid = area > 1e-12 * max(area.max(initial=0.0), 1e-300)
+    triangles, labels, normals = triangles[solid], labels[solid], crossed[solid] / area[solid, None]
+    neighbors = _coplanar_neighbors(vertices, triangles, labels, normals)
+    groups = _connected(len(triangles), neighbors)
+    order = np.argsort(groups, kind="stable")
+    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+    polygons = []
+    for members in np.split(order, starts[1:]):
+        if len(members) == 0:
+            continue
+        outline = _outline(vertices, triangles[members]) if len(members) > 1 else None
+        if outline is not None:
+            polygons.append(FlatPolygon(outline, _normal(outline), int(labels[members[0]])))
+            continue
+        for index in members:
+            polygons.append(FlatPolygon(vertices[triangles[index]], normals[index], int(labels[index])))
+    return polygons
+
+
+def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:
+    """Pairs (M, 2) of triangles with a common edge, run through in opposite directions, in one plane."""
+    count = len(triangles)
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    owner, apex = np.repeat(np.arange(count), 3), np.roll(triangles, -2, axis=1).ravel()
+    keys = np.stack([np.minimum(start, end), np.maximum(start, end)], axis=-1)
+    _, edge, uses = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    edge = edge.ravel()
+    order = np.argsort(edge, kind="stable")
+    order = order[uses[edge[order]] == 2]
+    one, other = order[0::2], order[1::2]
+    first, second = owner[one], owner[other]
+    length = np.linalg.norm(vertices[start[one]] - vertices[end[one]], axis=-1)
+    height = np.abs(np.sum((vertices[apex[other]] - vertices[start[one]]) * normals[first], axis=-1))
+    turn = np.linalg.norm(normals[first] - normals[second], axis=-1)
+    reach = np.maximum(length, np.linalg.norm(vertices[apex[other]] - vertices[start[one]], axis=-1))
+    flat = (turn < PLANE_ANGLE) & (height <= PLANE_DISTANCE * reach)
+    fits = flat & (start[one] == end[other]) & (labels[first] == labels[second])
+    return np.stack([first[fits], second[fits]], axis=-1)
+
+
+def _connected(count: int, pairs: np.ndarray) -> np.ndarray:
+    """The smallest index (count,) that each item is connected with by `pairs` (M, 2)."""
+    group = np.arange(count)
+    while len(pairs):
+        least = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
+        before = group.copy()
+        for side in (0, 1):
+            np.minimum.at(group, group[pairs[:, side]], least)
+            np.minimum.at(group, pairs[:, side], least)
+        group = group[group]
+        if np.array_equal(group, before):
+            break
+    return group
+
+
+def _outline(vertices, triangles) -> np.ndarray | None:
+    """Corners (V, 3) of the union of coplanar `triangles`, or None where they are no simple, flat polygon."""
+    edges = {(int(a), int(b)) for triangle in triangles for a, b in zip(triangle, np.roll(triangle, -1), strict=True)}
+    follow: dict[int, int] = {}
+    for a, b in edges:
+        if (b, a) not in edges:
+            if a in follow:
+                return None
+            follow[a] = b
+    loop = [next(iter(follow))] if follow else []
+    while loop and follow.get(loop[-1]) is not None and follow[loop[-1]] != loop[0]:
+        loop.append(follow[loop[-1]])
+    if len(loop) < 3 or len(loop) != len(follow):
+        return None
+    corners = _without_straight_corners(vertices[loop])
+    if len(corners) < 3:
+        return None
+    offset = corners - corners.mean(axis=0)
+    flat = np.abs(offset @ _normal(corners)).max() <= FLATNESS * np.linalg.norm(offset, axis=-1).max()
+    return corners if flat else None
+
+
+def _without_straight_corners(corners):
+    before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
+    chord = np.linalg.norm(before + after, axis=-1)
+    area = np.linalg.norm(np.cross(before, after), axis=-1)
+    limit = STRAIGHT * max(np.abs(corners).max(), np.ptp(corners, axis=0).max())
+    return corners[area > limit * chord]
+
+
+def _normal(corners: np.ndarray) -> np.ndarray:
+    """Unit normal (3,) around which `corners` run counterclockwise."""
+    offset = corners - corners.mean(axis=0)
+    normal = np.cross(offset, np.roll(offset, -1, axis=0)).sum(axis=0)
+    return normal / np.linalg.norm(normal)
+
+
+def welded(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """The `triangles` (T, 3) with one index for all vertices (N, 3) in the same place."""
+    _, first, number = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    return first[number.ravel()[triangles]]
+
+
+def outward_side(vertices: np.ndarray, triangles: np.ndarray) -> int:
+    """The side on which closed `triangles` (T, 3) are seen: 1 where their normals point, -1 the other.
+
+    A sheet of two layers, front and back, has no volume: each layer is seen from where its normal points.
+    """
+    return -1 if signed_volume(vertices, triangles) < -SHEET * np.ptp(vertices, axis=0).max() ** 3 else 1
+
+
+def is_closed(triangles: np.ndarray) -> bool:
+    """True if every edge of `triangles` (T, 3) belongs to two of them that run through it in opposite directions."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    directed = np.stack([start, end], axis=-1)
+    unique, uses = np.unique(directed, axis=0, return_counts=True)
+    if len(unique) == 0 or uses.max() > 1:
+        return False
+    reverse = unique[:, ::-1]
+    return np.array_equal(unique, reverse[np.lexsort((reverse[:, 1], reverse[:, 0]))])
+
+
+def signed_volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
+    """Volume inside closed `triangles` (T, 3), positive if their normals point outward."""
+    offset = vertices - vertices.mean(axis=0)
+    a, b, c = (offset[triangles[:, side]] for side in range(3))
+    return float(np.sum(a * np.cross(b, c)) / 6.0)
+
+
+def is_inside(point: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> bool:
+    """True if closed `triangles` (T, 3) surround `point` (3,).
+
+    By the sum of their solid angles (Van Oosterom and Strackee 1983, doi:10.1109/TBME.1983.325207).
+    """
+    a, b, c = (vertices[triangles[:, side]] - point for side in range(3))
+    la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+    volume = np.sum(a * np.cross(b, c), axis=-1)
+    plane = la * lb * lc + np.sum(a * b, -1) * lc + np.sum(b * c, -1) * la + np.sum(c * a, -1) * lb
+    return bool(abs(2.0 * np.arctan2(volume, plane).sum()) > 2.0 * np.pi)
+
+
+def hides_itself(vertices: np.ndarray, triangles: np.ndarray, closed: bool) -> bool:
+    """True if a part of the surface may stand in the light of another part that it hangs together with."""
+    islands = _islands(triangles)
+    names = np.unique(islands)
+    return any(_is_hollow(vertices, triangles[islands == name], closed) for name in names[:MOST_ISLANDS])
+
+
+def _islands(triangles: np.ndarray) -> np.ndarray:
+    """A number (T,) that is the same for triangles which common edges connect."""
+    edges = np.sort(np.stack([triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()], axis=-1), axis=-1)
+    _, edge = np.unique(edges, axis=0, return_inverse=True)
+    order = np.argsort(edge.ravel(), kind="stable")
+    owner, sorted_edge = order // 3, edge.ravel()[order]
+    same = sorted_edge[1:] == sorted_edge[:-1]
+    return _connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
+
+
+def _is_hollow(vertices, triangles, closed: bool) -> bool:
+    """True unless all vertices are behind (or, of an open surface, in) the plane of every triangle."""
+    used = vertices[np.unique(triangles)]
+    used_center = used.mean(axis=0)
+    extent = np.ptp(used, axis=0).max(initial=0.0)
+    some = triangles[:: max(1, len(triangles) * len(used) // HOLLOW_PRODUCTS)]
+    first = vertices[some[:, 0]]
+    normals = np.cross(vertices[some[:, 1]] - first, vertices[some[:, 2]] - first)
+    lengths = np.linalg.norm(normals, axis=-1)
+    solid = lengths > 0.0
+    normals, first = normals[solid] / lengths[solid, None], first[solid] - used_center
+    outward = outward_side(vertices, triangles) if closed else 1
+    for start in range(0, len(first), 256):
+        part = slice(start, start + 256)
+        height = (used - used_center) @ normals[part].T - np.sum(first[part] * normals[part], axis=-1)
+        height *= outward
+        if height.max(initial=0.0) > FLATNESS * extent or (not closed and height.min() < -FLATNESS * extent):
+            return True
+    return False

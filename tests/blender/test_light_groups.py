@@ -1,0 +1,94 @@
+"""Light groups: the shaded group layers are what Cycles writes per group, and sum up to the whole."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+from lit_plane import add_instancer, add_lamp_plane, into_collection, start
+
+from ltsh_addon.blender import gbuffer
+from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.shading import shade
+
+GROUPS = ("Keys", "Lamps")
+
+
+def combined_by_group(folder, prepared, samples):
+    """Halves (2, P, 3) of Cycles' Combined pass by light group ("" for all light), at the pixels of the samples."""
+    # The preparation takes passes of the user's own out, these among them.
+    for name in GROUPS:
+        prepared[1].lightgroups.add(name=name)
+    scene_parts.reference(folder, prepared, samples)
+    halves = {}
+    for half in "AB":
+        chunks = [read_channels(path) for path in sorted(folder.glob(f"cycles_{half}_*.exr"))]
+        for group in ("", *GROUPS):
+            name = f"Combined_{group}" if group else "Combined"
+            # Chunks hold 16 samples first and the rest after: weighted as `render_reference` says.
+            weights = np.array([16.0] + [(samples / 2.0 - 16.0) / (len(chunks) - 1)] * (len(chunks) - 1))
+            images = [gbuffer.read_layer(chunk, name, "RGB").reshape(-1, 3).astype(np.float64) for chunk in chunks]
+            halves.setdefault(group, []).append(np.average(images, axis=0, weights=weights))
+    return {group: np.array(images) for group, images in halves.items()}
+
+
+@pytest.fixture
+def grouped_scene():
+    """Area lights and an emissive mesh in a group each, one light in none; the mesh has its group from an instancer."""
+    scene = start()
+    for name in GROUPS:
+        scene.view_layers[0].lightgroups.add(name=name)
+    scene_parts.add_area_light("Key").lightgroup = "Keys"
+    scene_parts.add_area_light("Second key", location=(-0.6, 0.5, 1.2), color=(0.2, 1.0, 0.3)).lightgroup = "Keys"
+    scene_parts.add_area_light("Loose", location=(0.9, 0.9, 1.4), energy=40.0)
+    add_instancer(into_collection("Of lamp", add_lamp_plane())).lightgroup = "Lamps"
+    return scene
+
+
+def test_groups_are_those_of_cycles_and_sum_up(tmp_path, grouped_scene):
+    prepared = scene_parts.prepare()
+    lights = prepared[2].lights
+    assert {light.name: light.group for light in lights} == {
+        **{"Key": "Keys", "Second key": "Keys", "Loose": "", "Lamp": "Lamps"}
+    }
+    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
+    found = combined_by_group(tmp_path, prepared, 512)
+    shaded = shade(surface, lights, "reference")
+    assert set(shaded.groups) == {"", *GROUPS}
+    image = {name: shaded.specular[k] + shaded.diffuse[k] for k, name in enumerate(shaded.groups)}
+    pairs = [(image[name], found[name][:, pixel]) for name in GROUPS] + [(shaded.combined, found[""][:, pixel])]
+    for shade_image, halves in pairs:
+        difference = np.sum((shade_image - halves[0]) * (shade_image - halves[1]))
+        # The noise of a half is 1 %: its trace in the estimate is 2e-3. A light in the wrong group is off by 20 %.
+        assert difference < (4e-3) ** 2 * np.sum(halves[0] * halves[1])
+
+
+def test_an_object_keeps_its_own_group_inside_an_instancer_with_another():
+    start()
+    key = scene_parts.add_area_light("Key")
+    key.lightgroup = "Own"
+    outer = add_instancer(into_collection("Of key", key))
+    outer.lightgroup = "Instancer's"
+    assert [light.group for light in scene_parts.prepare()[2].lights] == ["Own"]
+
+
+def test_of_nested_instancers_the_outermost_gives_group_and_lobes(tmp_path):
+    start()
+    inner = add_instancer(into_collection("Of light", scene_parts.add_area_light()), "Inner")
+    inner.lightgroup, inner.visible_diffuse = "Inner", False
+    outer = add_instancer(into_collection("Of inner", inner), "Outer")
+    outer.lightgroup, outer.visible_glossy = "Outer", False
+    prepared = scene_parts.prepare()
+    (light,) = prepared[2].lights
+    assert (light.group, light.affects_diffuse, light.affects_specular) == ("Outer", True, False)
+    images = scene_parts.reference(tmp_path, prepared, 64)
+    # Rays that sample the diffuse lobe leave a trace in the other, 0.2 % here.
+    everything = shade(scene_parts.sample(tmp_path, prepared)[0][0][0], [light], "ltsh4")
+    assert images["diffuse"].sum() / 2.0 == pytest.approx(everything.diffuse.sum(), rel=0.01)
+    assert images["specular"].sum() < 0.01 * images["diffuse"].sum() and not everything.specular.any()
+
+
+def test_groups_without_a_pass_in_the_file_are_kept():
+    start()
+    scene_parts.add_area_light("Key").lightgroup = "Nowhere else"
+    assert bpy.context.view_layer.lightgroups.get("Nowhere else") is None
+    assert [light.group for light in scene_parts.prepare()[2].lights] == ["Nowhere else"]

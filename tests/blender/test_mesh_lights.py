@@ -1,0 +1,326 @@
+"""Objects with emissive materials light as in Cycles, whatever their transform, closed or open, among other lights."""
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+from lit_plane import (
+    add_image,
+    add_instancer,
+    add_lamp_ball,
+    add_lamp_plane,
+    add_surface,
+    assert_agrees,
+    into_collection,
+    lamp_material,
+    start,
+)
+
+from ltsh_addon.blender import cycles_reference, mesh_light_faces
+from ltsh_addon.blender.child import SceneError
+from ltsh_addon.shading import shade
+
+L_SHAPE = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (0.3, 0.3, 0), (0.3, 1, 0), (0, 1, 0)]
+
+
+def add_l_shape():
+    ob = scene_parts.add_mesh(
+        "Lamp", L_SHAPE, [(0, 1, 2, 3, 4, 5)], location=(-0.3, 0.5, 1.2), rotation=(-0.5, 0.2, 0.0)
+    )
+    ob.data.materials.append(lamp_material()[0])
+    ob.visible_camera = False
+
+
+def add_flipped_ball():
+    add_lamp_ball().data.flip_normals()
+
+
+# Faces of a ball of 6 segments and 3 rings, of which only the outer side shines.
+BALL = 18
+CASES = {
+    "plane, front down": (add_lamp_plane, 2),
+    "plane, back down": (lambda: add_lamp_plane(rotation=(math.pi - 0.7, 0.0, 0.0)), 2),
+    "mirrored and stretched plane": (lambda: add_lamp_plane(scale=(-1.5, 0.7, 2.0)), 2),
+    "concave polygon": (add_l_shape, 2),
+    "closed ball": (add_lamp_ball, BALL),
+    "mirrored and stretched ball": (lambda: add_lamp_ball(scale=(-1.2, 0.6, 1.0)), BALL),
+    "ball with its normals inward": (add_flipped_ball, BALL),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_mesh_lights_as_in_cycles(tmp_path, name):
+    start(16, 12)
+    build, count = CASES[name]
+    build()
+    _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8 if count == BALL else 24)
+    assert len(inventory.lights) == count and warnings == []
+
+
+def test_only_the_lit_side_of_a_closed_mesh_shines():
+    start()
+    add_lamp_ball()
+    center = np.array([0.0, 1.0, 1.2])
+    for light in scene_parts.prepare()[2].lights:
+        assert np.dot(light.center - center, light.direction) > 0.0
+        corners = light.polygon()
+        normal = np.cross(corners - light.center, np.roll(corners, -1, axis=0) - light.center).sum(axis=0)
+        assert np.dot(normal, light.direction) > 0.0
+
+
+def test_a_shell_around_the_camera_shines_inward(tmp_path):
+    scene_parts.empty_scene(16, 12)
+    scene_parts.add_camera()
+    add_surface(size=4.0)
+    dome = scene_parts.add_sphere(lamp_material()[0], 9.0, "Dome", smooth=False, segments=6, location=(0.0, 0.0, 7.0))
+    dome.visible_camera = False
+    prepared = assert_agrees(tmp_path, samples=1024)
+    assert len(prepared[2].lights) == BALL
+    assert all(np.dot(light.center - (0.0, 0.0, 7.0), light.direction) < 0.0 for light in prepared[2].lights)
+
+
+def test_lamps_do_not_stand_in_the_light_of_others(tmp_path):
+    """The ball stands between the area light and the highlight on the plane; its dark foot is part of the object."""
+    start()
+    scene_parts.add_area_light(location=(0.0, 1.5, 1.6), rotation=(-0.9, 0.0, 0.0))
+    ball = add_lamp_ball()
+    ball.data.materials.append(scene_parts.principled("Foot")[0])
+    ball.data.polygons.foreach_set("material_index", [int(face.center.z < -0.1) for face in ball.data.polygons])
+    prepared = assert_agrees(tmp_path, samples=512, count=16)
+    assert 1 < len(prepared[2].lights) < 1 + BALL
+
+
+def test_shading_agrees_with_cycles_on_a_mesh_light(tmp_path):
+    """Polygons, both sides and instances go through `shade`: the reference technique is exact."""
+    start(12, 8)
+    add_lamp_plane(scale=(-1.5, 0.7, 2.0))
+    prepared = scene_parts.prepare()
+    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
+    images = scene_parts.reference(tmp_path, prepared, 2048)
+    shaded = shade(surface, prepared[2].lights, "reference")
+    for lobe in ("diffuse", "specular"):
+        halves = images[lobe].reshape(2, -1, 3)[:, pixel].astype(np.float64)
+        difference = np.sum((getattr(shaded, lobe)[0] - halves[0]) * (getattr(shaded, lobe)[0] - halves[1]))
+        assert difference < (3e-3) ** 2 * np.sum(halves[0] * halves[1])
+
+
+def test_emission_through_mixes_sums_and_groups_is_what_cycles_sees(tmp_path):
+    start()
+    material, tree, output = scene_parts.new_material("Mixed")
+    nodes = {kind: tree.nodes.new("ShaderNode" + kind) for kind in ("MixShader", "AddShader", "Blackbody", "Math")}
+    emitters = [tree.nodes.new("ShaderNodeEmission") for _ in range(2)]
+    surface = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    nodes["MixShader"].inputs[0].default_value = 0.25
+    nodes["Blackbody"].inputs[0].default_value = 3000.0
+    nodes["Math"].operation = "MULTIPLY"
+    nodes["Math"].inputs[0].default_value, nodes["Math"].inputs[1].default_value = 5.0, 3.0
+    tree.links.new(nodes["Blackbody"].outputs[0], emitters[0].inputs["Color"])
+    tree.links.new(nodes["Math"].outputs[0], emitters[0].inputs["Strength"])
+    tree.links.new(surface.outputs[0], nodes["MixShader"].inputs[1])
+    tree.links.new(emitters[0].outputs[0], nodes["MixShader"].inputs[2])
+    tree.links.new(nodes["MixShader"].outputs[0], nodes["AddShader"].inputs[0])
+    tree.links.new(emitters[1].outputs[0], nodes["AddShader"].inputs[1])
+    tree.links.new(nodes["AddShader"].outputs[0], output.inputs["Surface"])
+    emitters[1].inputs["Color"].default_value = (0.0, 0.0, 4.0, 1.0)
+    add_lamp_plane(material)
+    inventory = assert_agrees(tmp_path)[2]
+    # Cycles' black body of 3000 K is (1.77, 0.84, 0.27) in the linear colors of Rec.709.
+    assert np.allclose(
+        inventory.lights[0].radiance, (0.25 * 15 * 1.77, 0.25 * 15 * 0.84, 0.25 * 15 * 0.27 + 4), rtol=0.02
+    )
+
+
+def test_a_principled_surface_that_emits_is_a_light(tmp_path):
+    start()
+    material, _ = scene_parts.principled("Screen", Emission_Color=(0.2, 1.0, 0.4, 1.0), Emission_Strength=15.0)
+    add_lamp_plane(material)
+    _, _, inventory, warnings = assert_agrees(tmp_path)
+    assert np.allclose(inventory.lights[0].radiance, (3.0, 15.0, 6.0), rtol=1e-4)
+    assert not any("Screen" in line for line in warnings), warnings
+
+
+@pytest.mark.parametrize("sampling", ["NONE", "AUTO", "FRONT", "BACK", "FRONT_BACK"])
+def test_how_cycles_samples_the_emission_changes_nothing(tmp_path, sampling):
+    start()
+    material, _ = lamp_material()
+    material.cycles.emission_sampling = sampling
+    add_lamp_plane(material)
+    inventory = assert_agrees(tmp_path, samples=128, tolerance=5e-3)[2]
+    assert len(inventory.lights) == 2
+
+
+def test_emission_of_one_side_only(tmp_path):
+    start()
+    material, node = lamp_material()
+    tree = material.node_tree
+    scaled = tree.nodes.new("ShaderNodeMath")
+    scaled.operation, scaled.inputs[1].default_value = "MULTIPLY", 20.0
+    tree.links.new(tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"], scaled.inputs[0])
+    tree.links.new(scaled.outputs[0], node.inputs["Strength"])
+    add_lamp_plane(material)
+    (light,) = assert_agrees(tmp_path)[2].lights
+    assert light.direction[2] < 0.0
+
+
+def test_a_textured_screen_becomes_patches(tmp_path):
+    start()
+    material, node = lamp_material()
+    pixels = np.random.default_rng(5).random((4, 8, 3)) ** 3
+    tree = material.node_tree
+    tree.links.new(add_image(tree, pixels).outputs["Color"], node.inputs["Color"])
+    add_lamp_plane(material)
+    _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8)
+    assert warnings == [] and 32 <= len(inventory.lights) <= 64
+    total = sum(
+        4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * light.radiance for light in inventory.lights
+    )
+    # Both sides of 0.6 square meters; patches may leave 2 %.
+    assert np.allclose(total, 2.0 * 0.6 * 20.0 * pixels.mean(axis=(0, 1)), rtol=0.02)
+
+
+def test_a_texture_over_many_faces_is_shaded_as_its_mean(monkeypatch):
+    monkeypatch.setattr(mesh_light_faces, "MOST_LOOKS", 8)
+    start()
+    material, node = lamp_material()
+    tree = material.node_tree
+    tree.links.new(tree.nodes.new("ShaderNodeTexNoise").outputs[0], node.inputs["Strength"])
+    add_lamp_ball(material)
+    _, _, inventory, warnings = scene_parts.prepare()
+    assert len(inventory.lights) == BALL and any("'Lamp'" in line and "mean" in line for line in warnings)
+    assert len({tuple(light.radiance) for light in inventory.lights}) == 1
+
+
+def test_too_many_faces_are_refused_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_light_faces, "MOST_POLYGONS", 10)
+    start()
+    scene_parts.add_area_light("Key")
+    add_lamp_ball()
+    prepared = assert_agrees(tmp_path)
+    assert [light.name for light in prepared[2].lights] == ["Key"]
+    assert sum("'Lamp'" in line and f"{BALL} flat faces" in line for line in prepared[3]) == 1, prepared[3]
+
+
+def test_a_hollow_lamp_is_named():
+    start()
+    bpy.ops.mesh.primitive_torus_add(location=(0.0, 1.0, 1.2), major_radius=0.3, minor_radius=0.1, major_segments=12)
+    torus = bpy.context.object
+    torus.name = "Ring"
+    torus.data.materials.append(lamp_material()[0])
+    warnings = scene_parts.prepare()[3]
+    assert sum("'Ring'" in line and "stand in their own light" in line for line in warnings) == 1, warnings
+
+
+def test_dark_materials_are_no_lights():
+    start()
+    for number, settings in enumerate(({"strength": 0.0}, {"color": (0.0, 0.0, 0.0, 1.0)})):
+        add_lamp_plane(lamp_material(f"Dark {number}", **settings)[0])
+    hidden = add_lamp_plane()
+    hidden.visible_diffuse = hidden.visible_glossy = False
+    with pytest.raises(SceneError, match="no area light"):
+        scene_parts.prepare()
+
+
+def test_visibility_to_lobes_is_kept(tmp_path):
+    start()
+    add_lamp_plane().visible_glossy = False
+    prepared = scene_parts.prepare()
+    assert {(light.affects_diffuse, light.affects_specular) for light in prepared[2].lights} == {(True, False)}
+    images = scene_parts.reference(tmp_path, prepared, 64)
+    # Directions that Cycles samples for the diffuse lobe also count the glossy one: a trace remains.
+    assert images["specular"].sum() < 0.01 * images["diffuse"].sum()
+
+
+def test_evaluated_geometry_and_all_instances_shine(tmp_path):
+    """Modifiers count, text is a surface, and each instance stands where it is."""
+    start()
+    lamp = add_lamp_plane(scale=(0.4, 0.4, 0.4))
+    array = lamp.modifiers.new("Array", "ARRAY")
+    array.count, array.relative_offset_displace = 2, (1.5, 0.0, 0.0)
+    collection = into_collection("Lamps", lamp)
+    add_instancer(collection, "One", location=(-0.8, 0.0, 0.0))
+    add_instancer(collection, "Two", location=(0.6, 0.0, 0.1), scale=(-1.0, 1.0, 1.0))
+    prepared = assert_agrees(tmp_path, samples=512, count=12)
+    assert len(prepared[2].lights) == 8
+
+
+@pytest.mark.parametrize("extrude", [0.0, 0.03])
+def test_text_shines_once(tmp_path, extrude):
+    """Blender shows renders a text and the mesh that it makes."""
+    start()
+    text = bpy.data.curves.new("Sign", "FONT")
+    text.body, text.extrude = "LI", extrude
+    text.materials.append(lamp_material()[0])
+    sign = scene_parts.link(
+        bpy.data.objects.new("Sign", text), location=(-0.4, 1.2, 1.0), rotation=(math.pi - 0.7, 0.0, 0.0)
+    )
+    sign.visible_camera = False
+    lights = assert_agrees(tmp_path, samples=1024, count=16, tolerance=6e-3)[2].lights
+    assert {light.name for light in lights} == {"Sign"}
+
+
+def test_a_sheet_of_two_layers_shines_once_to_each_side(tmp_path):
+    start()
+    corners = [(-0.5, -0.3, 0.0), (0.5, -0.3, 0.0), (0.5, 0.3, 0.0), (-0.5, 0.3, 0.0)]
+    sheet = scene_parts.add_mesh(
+        "Sheet", corners * 2, [(0, 1, 2, 3), (7, 6, 5, 4)], location=(0.0, 1.0, 1.2), rotation=(-0.7, 0.0, 0.0)
+    )
+    sheet.data.materials.append(lamp_material()[0])
+    sheet.visible_camera = False
+    assert len(assert_agrees(tmp_path, samples=1024, tolerance=6e-3)[2].lights) == 2
+
+
+def test_the_reference_leaves_other_surfaces_hidden(tmp_path):
+    """A plain wall in front of a lamp takes nothing from its light."""
+    start()
+    add_lamp_plane()
+    wall = scene_parts.add_plane(scene_parts.principled("Wall")[0], 2.0, "Wall", location=(0.0, 0.9, 0.8))
+    wall.visible_camera = False
+    assert_agrees(tmp_path, samples=512)
+
+
+def test_a_material_override_that_emits_makes_lamps_of_all_surfaces(tmp_path):
+    start()
+    add_lamp_plane(scene_parts.principled("Not lit")[0])
+    material, _ = scene_parts.principled("Override", Roughness=0.5, Emission_Strength=3.0)
+    bpy.context.view_layer.material_override = material
+    prepared = assert_agrees(tmp_path, samples=512)
+    assert [light.name for light in prepared[2].lights] == ["Plane", "Plane", "Lamp", "Lamp"]
+
+
+def test_transparency_over_emission_is_cut_in_both(tmp_path):
+    """Half transparent lamps shine as Cycles' reference shows them, which has them opaque and says so."""
+    start()
+    material, tree, output = scene_parts.new_material("Veil")
+    mix, emission = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeEmission")
+    emission.inputs["Strength"].default_value = 20.0
+    tree.links.new(tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+    tree.links.new(emission.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    add_lamp_plane(material)
+    assert_agrees(tmp_path)
+
+
+def test_displacement_of_a_lamp_is_named():
+    start()
+    material, _ = lamp_material()
+    material.displacement_method = "DISPLACEMENT"
+    tree = material.node_tree
+    output = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputMaterial")
+    tree.links.new(tree.nodes.new("ShaderNodeDisplacement").outputs[0], output.inputs["Displacement"])
+    add_lamp_plane(material)
+    assert sum("'Lamp'" in line and "displacement" in line for line in scene_parts.prepare()[3]) == 1
+
+
+def test_the_camera_sees_lamps_as_before(tmp_path):
+    """Letting light through is for rays that light, not for the camera's."""
+    start()
+    ball = add_lamp_ball()
+    ball.visible_camera = True
+    ball.location = (0.0, 0.0, 0.5)
+    prepared = scene_parts.prepare()
+    before = scene_parts.sample(tmp_path, prepared)[0][0][0]
+    cycles_reference.remove_occlusion(prepared[0])
+    after = scene_parts.sample(tmp_path, prepared)[0][0][0]
+    assert np.array_equal(before.position, after.position)

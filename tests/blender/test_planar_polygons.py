@@ -1,0 +1,137 @@
+"""Flat polygons of triangle meshes, without Blender: area, outline, sides."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ltsh_addon.blender.planar_polygons import flat_polygons, hides_itself, is_closed, is_inside, signed_volume
+
+CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+CUBE_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CUBE_TRIANGLES = np.array([triangle for a, b, c, d in CUBE_QUADS for triangle in ((a, b, c), (a, c, d))])
+
+
+def grid(columns, rows, missing=()):
+    """A grid of squares in the xy plane, each two triangles; (vertices, triangles)."""
+    vertices = np.array([[x, y, 0.0] for y in range(rows + 1) for x in range(columns + 1)], dtype=float)
+    triangles = []
+    for y in range(rows):
+        for x in range(columns):
+            if (x, y) not in missing:
+                a = y * (columns + 1) + x
+                b, c, d = a + 1, a + columns + 2, a + columns + 1
+                triangles += [(a, b, c), (a, c, d)]
+    return vertices, np.array(triangles)
+
+
+def area(polygon):
+    corners = polygon.corners - polygon.corners[0]
+    return 0.5 * np.dot(np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0), polygon.normal)
+
+
+def labels(triangles):
+    return np.zeros(len(triangles), dtype=int)
+
+
+def rotation(generator):
+    return np.linalg.qr(generator.normal(size=(3, 3)))[0]
+
+
+def test_a_fine_grid_is_one_rectangle():
+    vertices, triangles = grid(40, 30)
+    (polygon,) = flat_polygons(vertices, triangles, labels(triangles))
+    assert len(polygon.corners) == 4 and area(polygon) == pytest.approx(1200.0)
+    assert np.allclose(polygon.normal, (0.0, 0.0, 1.0))
+
+
+def test_single_precision_in_any_pose_does_not_break_the_plane():
+    generator = np.random.default_rng(6)
+    for _ in range(20):
+        vertices, triangles = grid(9, 7)
+        moved = 0.1 * vertices @ rotation(generator).T + generator.normal(size=3)
+        polygons = flat_polygons(moved.astype(np.float32).astype(float), triangles, labels(triangles))
+        assert len(polygons) == 1 and len(polygons[0].corners) == 4
+
+
+def test_an_l_keeps_its_six_corners_and_a_hole_leaves_pieces():
+    vertices, triangles = grid(2, 2, missing={(1, 1)})
+    (polygon,) = flat_polygons(vertices, triangles, labels(triangles))
+    assert len(polygon.corners) == 6 and area(polygon) == pytest.approx(3.0)
+    vertices, triangles = grid(3, 3, missing={(1, 1)})
+    pieces = flat_polygons(vertices, triangles, labels(triangles))
+    assert len(pieces) == 16 and sum(area(piece) for piece in pieces) == pytest.approx(8.0)
+
+
+def test_corners_that_touch_are_no_simple_outline():
+    vertices, triangles = grid(2, 2, missing={(0, 1), (1, 0)})
+    pieces = flat_polygons(vertices, triangles, labels(triangles))
+    assert len(pieces) == 2 and sorted(area(piece) for piece in pieces) == pytest.approx([1.0, 1.0])
+
+
+def test_labels_are_not_mixed():
+    vertices, triangles = grid(4, 1)
+    colors = np.repeat([0, 1, 1, 0], 2)
+    polygons = flat_polygons(vertices, triangles, colors)
+    assert sorted((polygon.label, round(area(polygon))) for polygon in polygons) == [(0, 1), (0, 1), (1, 2)]
+
+
+def test_a_cube_has_six_faces_that_look_outward():
+    polygons = flat_polygons(CUBE, CUBE_TRIANGLES, labels(CUBE_TRIANGLES))
+    assert len(polygons) == 6 and all(len(polygon.corners) == 4 for polygon in polygons)
+    for polygon in polygons:
+        assert np.dot(polygon.corners.mean(axis=0) - 0.5, polygon.normal) == pytest.approx(0.5)
+
+
+@given(st.integers(0, 10_000))
+def test_the_area_is_that_of_the_triangles(seed):
+    """Random height fields over a random subset of a grid: flat, bent and degenerate parts."""
+    generator = np.random.default_rng(seed)
+    missing = {(x, y) for x in range(4) for y in range(3) if generator.random() < 0.3}
+    vertices, triangles = grid(4, 3, missing)
+    if len(triangles) == 0:
+        return
+    vertices[:, 2] = generator.choice([0.0, 0.0, 0.0, 0.5], len(vertices))
+    pieces = flat_polygons(vertices, triangles, labels(triangles))
+    a, b, c = (vertices[triangles[:, side]] for side in range(3))
+    expected = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum()
+    assert sum(area(piece) for piece in pieces) == pytest.approx(expected, rel=1e-9)
+    assert min(area(piece) for piece in pieces) > 0.0
+    assert all(np.abs((piece.corners - piece.corners[0]) @ piece.normal).max() < 1e-9 for piece in pieces)
+
+
+def test_triangles_without_area_are_left_out():
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]], dtype=float)
+    (polygon,) = flat_polygons(vertices, np.array([(0, 1, 2), (0, 2, 3)]), np.zeros(2, dtype=int))
+    assert area(polygon) == pytest.approx(1.0)
+    assert flat_polygons(vertices, np.array([(0, 1, 2)]), np.zeros(1, dtype=int)) == []
+
+
+def test_closed_means_that_every_edge_has_two_sides():
+    assert is_closed(CUBE_TRIANGLES) and not is_closed(CUBE_TRIANGLES[1:])
+    turned = CUBE_TRIANGLES.copy()
+    turned[0] = turned[0][::-1]
+    assert not is_closed(turned) and not is_closed(grid(2, 2)[1])
+
+
+def test_volume_tells_the_side_and_the_solid_angle_the_inside():
+    assert signed_volume(CUBE, CUBE_TRIANGLES) == pytest.approx(1.0)
+    assert signed_volume(CUBE + 5.0, CUBE_TRIANGLES[:, ::-1]) == pytest.approx(-1.0)
+    for point, inside in (((0.9, 0.1, 0.5), True), ((1.1, 0.1, 0.5), False), ((-4.0, 9.0, 2.0), False)):
+        assert is_inside(np.array(point), CUBE, CUBE_TRIANGLES) == inside
+        assert is_inside(np.array(point), CUBE, CUBE_TRIANGLES[:, ::-1]) == inside
+
+
+def test_what_can_hide_itself():
+    assert not hides_itself(CUBE, CUBE_TRIANGLES, True)
+    assert not hides_itself(CUBE, CUBE_TRIANGLES[:, ::-1], True)
+    # A lid taken off: an open surface that bends.
+    assert hides_itself(CUBE, CUBE_TRIANGLES[2:], False)
+    flat, triangles = grid(3, 3)
+    assert not hides_itself(flat, triangles, False)
+    # Two flat islands are two lamps that may stand in each other's light like any others.
+    both = np.concatenate([flat, flat + (0.0, 0.0, 1.0)])
+    assert not hides_itself(both, np.concatenate([triangles, triangles + len(flat)]), False)
+    dented = CUBE.copy()
+    dented[7] = 0.4
+    assert hides_itself(dented, CUBE_TRIANGLES, True)

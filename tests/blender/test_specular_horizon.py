@@ -1,0 +1,77 @@
+"""Which horizon ends a specular lobe, by numbers and against Cycles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scene_parts
+from scene_parts import add_bump, add_sphere, bsdf_material
+
+from ltsh_addon.blender.specular_horizon import end_at_horizons_of_cycles
+from ltsh_addon.imaging import unbiased_relative_error
+from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.shading import shade
+
+
+def samples_near_the_horizon(roughness, count=4):
+    """Points at the origin, seen obliquely, whose geometric and smooth normals differ."""
+    tilted, up = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
+    view = np.array([-0.96, 0.0, 0.28])
+    vectors = {"view": view, "normal": up, "diffuse_normal": up, "smooth_normal": up, "geometric_normal": tilted}
+    zero = np.zeros((count, 3))
+    return SurfaceSamples(
+        **{name: np.tile(vector, (count, 1)) for name, vector in vectors.items()},
+        position=zero,
+        roughness=np.full(count, roughness),
+        specular_f0=zero + 1.0,
+        specular_f90=zero + 1.0,
+        dielectric=zero,
+        ior=np.full(count, 1.5),
+        diffuse_albedo=zero,
+    )
+
+
+def light_at(distance, half):
+    """A square light on the x axis that faces the origin, its center on the horizon."""
+    axes = {"half_u": (0.0, half, 0.0), "half_v": (0.0, 0.0, half), "direction": (-1.0, 0.0, 0.0)}
+    return AreaLight("Light", "SQUARE", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
+
+
+@pytest.mark.parametrize("roughness, light, smooth", [(0.6, (3.0, 0.3), True), (0.15, (0.5, 3.0), False)])
+def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, light, smooth):
+    samples = samples_near_the_horizon(roughness)
+    found = end_at_horizons_of_cycles(samples, (light_at(*light),)).geometric_normal
+    assert np.array_equal(found, samples.smooth_normal if smooth else samples.geometric_normal)
+
+
+def test_without_lights_or_differences_nothing_changes():
+    samples = samples_near_the_horizon(0.5)
+    assert end_at_horizons_of_cycles(samples, ()) is samples
+    flat = replace(samples, geometric_normal=samples.smooth_normal)
+    assert end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),)) is flat
+
+
+@pytest.mark.parametrize("mesh, roughness, size", [("bumps", 0.6, 1.0), ("bumps", 0.2, 4.0), ("coarse", 0.9, 1.0)])
+def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, size):
+    scene_parts.empty_scene()
+    scene_parts.add_camera()
+    height = 1.0 if size < 2.0 else 0.5
+    scene_parts.add_area_light(location=(2.5, 0.0, height), rotation=(0.0, 1.2, 0.0), size=size, size_y=0.75 * size)
+    material, node = bsdf_material("ShaderNodeBsdfAnisotropic", Color=(1.0, 1.0, 1.0, 1.0), Roughness=roughness)
+    if mesh == "bumps":
+        add_bump(material.node_tree, node, scale=4.0, distance=0.15)
+    add_sphere(material, radius=1.3, segments=32 if mesh == "bumps" else 12)
+    prepared = scene_parts.prepare()
+    ((samples, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
+    halves = scene_parts.reference(tmp_path, prepared, 2048)["specular"].reshape(2, -1, 3)[:, pixel]
+    lights = tuple(prepared[2].lights)
+
+    def error(horizon):
+        ended = replace(samples, geometric_normal=horizon)
+        image = shade(ended, lights, "reference", passes=("specular",), workers=1).specular.sum(axis=0)
+        return unbiased_relative_error(image, *halves)[0]
+
+    chosen = error(end_at_horizons_of_cycles(samples, lights).geometric_normal)
+    # Measured: 0.1 to 0.5 %, noise included; the other horizon is wrong by 2 to 7 %.
+    assert chosen < 8e-3
+    assert 1.5e-2 < max(error(samples.geometric_normal), error(samples.smooth_normal))

@@ -1,0 +1,191 @@
+"""Lights with a spread, against sums over patches of their surface."""
+
+from dataclasses import replace
+
+import numpy as np
+import patch_quadrature
+import pytest
+import surface_scenes
+from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
+from test_single_precision import PROMISED, all_kinds_of_samples
+
+from ltsh_addon import shading
+from ltsh_addon.shading import light_cone
+
+DEGREES = (1.0, 20.0, 60.0, 120.0, 170.0)
+# Of a result, or of a hundredth of the largest one: what the spread of the closed forms may be off, and the reference.
+CLOSED, QUADRATURE = 3e-3, 1e-3
+TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
+techniques = pytest.mark.parametrize("technique", TECHNIQUES)
+
+
+def focused_lights(degrees):
+    return [replace(light, spread=np.radians(degrees), radiance=np.ones(3)) for light in four_lights()]
+
+
+def cases(degrees, shape, count, seed=0, roughness=(0.2, 1.0)):
+    """(sample, light): points in and around the cone, lobes on the light and beside it, lights above the horizon."""
+    generator = np.random.default_rng(seed)
+    found = []
+    while len(found) < count:
+        half, distance = np.array([0.5, 0.3]), 10.0 ** generator.uniform(-0.5, 0.5)
+        reach = min(distance * np.tan(0.5 * np.radians(degrees)), 2.0)
+        center = np.array([*(generator.uniform(-1.0, 1.0, 2) * (half + 0.7 * reach)), distance])
+        options = {"half_u": (0.5, 0, 0), "half_v": (0, -0.3, 0), "radiance": (1, 1, 1)}
+        light = area_light(shape=shape, center=center, spread=np.radians(degrees), **options)
+        mirrored = unit(center + 0.3 * generator.normal(size=3) * np.array([1, 1, 0]))
+        cosine = generator.uniform(0.2, 0.98)
+        normal = cosine * mirrored + np.sqrt(1.0 - cosine**2) * unit(np.cross(mirrored, generator.normal(size=3)))
+        view = 2.0 * (mirrored @ normal) * normal - mirrored
+        if (light.polygon(64) @ normal).min() > 0.02:
+            white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": generator.uniform(*roughness)}
+            found.append((single_sample(normal=normal, view=view, **white), light))
+    return found
+
+
+def lobe_over_patches(table, sample, light):
+    """Radiance of the table's lobe, by the sum over patches."""
+    direction, measure = patch_quadrature.incident(sample, light, 300)
+    local, view = patch_quadrature.in_frame(sample, direction)
+    return shading.evaluate_lobe(table, view[2:], sample.roughness, local[None])[0] @ measure
+
+
+def assert_close(found, expected, tolerance, what):
+    found, expected = np.array(found), np.array(expected)
+    error = np.abs(found - expected) / np.maximum(expected, 0.01 * expected.max())
+    assert error.max() < tolerance, (what, error.argmax(), found[error.argmax()], expected[error.argmax()])
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
+@pytest.mark.parametrize("degrees", DEGREES[1:])
+def test_lights_with_a_spread_match_patches(degrees, shape):
+    """The closed forms in both precisions and the quadrature; the oracle leaves 1e-4."""
+    pairs = cases(degrees, shape, 4, seed=int(degrees))
+    table = shading.load_table("ltsh4")
+    expected = {
+        "lobe": [lobe_over_patches(table, *pair) for pair in pairs],
+        "diffuse": [patch_quadrature.diffuse(*pair)[0] for pair in pairs],
+        "true lobe": [patch_quadrature.specular(*pair)[0] for pair in pairs],
+    }
+    for dtype in (np.float32, np.float64):
+        shaded = [shading.shade(sample, [light], table, workers=1, dtype=dtype) for sample, light in pairs]
+        assert_close([part.specular[0, 0, 0] for part in shaded], expected["lobe"], CLOSED, ("lobe", dtype))
+        assert_close([part.diffuse[0, 0, 0] for part in shaded], expected["diffuse"], CLOSED, ("diffuse", dtype))
+    shaded = [shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]) for sample, light in pairs]
+    assert_close([part.specular[0, 0, 0] for part in shaded], expected["true lobe"], QUADRATURE, "true lobe")
+
+
+@pytest.mark.parametrize("degrees", [1.0, 4.0])
+def test_narrow_cones_match_patches(degrees):
+    """Of a rectangle: the oracle resolves their cones."""
+    pairs = cases(degrees, "RECTANGLE", 6, seed=7)
+    table = shading.load_table("ltsh2")
+    shaded = [shading.shade(sample, [light], table) for sample, light in pairs]
+    expected = [lobe_over_patches(table, *pair) for pair in pairs]
+    assert_close([part.specular[0, 0, 0] for part in shaded], expected, CLOSED, "lobe")
+    expected = [patch_quadrature.diffuse(*pair)[0] for pair in pairs]
+    assert_close([part.diffuse[0, 0, 0] for part in shaded], expected, CLOSED, "diffuse")
+    shaded = [shading.shade(sample, [light], shading.REFERENCE) for sample, light in pairs]
+    expected = [patch_quadrature.specular(*pair)[0] for pair in pairs]
+    assert_close([part.specular[0, 0, 0] for part in shaded], expected, QUADRATURE, "true lobe")
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "DISK"])
+@pytest.mark.parametrize("degrees", [3.0, 45.0, 90.0])
+def test_the_spread_keeps_the_flux(degrees, shape):
+    """A floor below the light receives pi times area times radiance, whatever the spread."""
+    light = area_light(shape=shape, half_u=(0.4, 0, 0), half_v=(0, -0.4, 0), center=(0, 0, 1.0), radiance=(1, 1, 1))
+    light = replace(light, spread=np.radians(degrees))
+    reach = 0.42 + np.tan(0.5 * light.spread)
+    steps = (np.arange(50) + 0.5) / 25 - 1.0
+    x, y = (reach * grid.ravel() for grid in np.meshgrid(steps, steps))
+    samples = repeated(single_sample(diffuse_albedo=(np.pi,) * 3), np.stack([x, y, 0 * x], axis=1))
+    flux = shading.shade(samples, [light], "ltc", passes=["diffuse"]).diffuse.sum(axis=(0, 1))[0]
+    area = 0.16 * (4.0 if shape == "RECTANGLE" else np.pi)
+    # 50 x 50 points over the cone's footprint, and the spread's own error
+    assert flux * (reach / 25) ** 2 == pytest.approx(np.pi * area, rel=2e-3)
+
+
+def repeated(sample, position):
+    """The one sample at each of the positions (P, 3)."""
+    fields = {name: np.repeat(getattr(sample, name), len(position), axis=0) for name in sample.__dataclass_fields__}
+    return type(sample)(**{**fields, "position": position})
+
+
+@pytest.mark.parametrize("degrees", [2.0, 30.0, 100.0, 175.0])
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_single_precision_keeps_its_promise(name, degrees):
+    """Horizons, bump maps and all Fresnel terms; the promise is per unit of the radiance straight ahead."""
+    samples, lights = all_kinds_of_samples(120, seed=5), focused_lights(degrees)
+    single = shading.shade(samples, lights, name, workers=1)
+    double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
+    limit = PROMISED * light_cone.peak_factor(np.radians(degrees))
+    for part in shading.PASSES:
+        found, expected = getattr(single, part), getattr(double, part)
+        assert np.isfinite(found).all() and (found >= 0.0).all() and expected.max() > 0.0
+        assert np.abs(found - expected).max() < limit, part
+
+
+@techniques
+def test_a_spread_of_pi_is_no_spread(technique):
+    """Just below pi the factor differs from 1 by tan(theta) times what is missing."""
+    samples = random_samples(30, seed=3)
+    full, almost = (
+        shading.shade(samples, focused_lights(degrees), technique, dtype=np.float64) for degrees in (180.0, 179.99)
+    )
+    scale = full.combined.max()
+    assert np.abs(full.combined - almost.combined).max() < 1e-3 * scale
+    assert not np.array_equal(full.combined, almost.combined)
+
+
+@techniques
+@pytest.mark.parametrize("degrees", [15.0, 70.0, 140.0])
+def test_splitting_a_light_adds_up(technique, degrees):
+    samples = random_samples(30, seed=4, lowest_roughness=0.2)
+    light = area_light(spread=np.radians(degrees), radiance=(1, 1, 1))
+    halves = [
+        replace(light, center=light.center + side * 0.5 * light.half_u, half_u=0.5 * light.half_u)
+        for side in (-1.0, 1.0)
+    ]
+    whole = shading.shade(samples, [light], technique, dtype=np.float64).combined
+    parts = sum(shading.shade(samples, [half], technique, dtype=np.float64).combined for half in halves)
+    assert whole.max() > 0.0
+    assert np.abs(whole - parts).max() < CLOSED * whole.max()
+
+
+@techniques
+def test_rotating_and_moving_everything_changes_nothing(technique):
+    samples = random_samples(30, seed=2, lowest_roughness=0.2)
+    lights = focused_lights(50.0)
+    expected = shading.shade(samples, lights, technique, dtype=np.float64).combined
+    turned, moved = surface_scenes.moved(samples, lights, surface_scenes.random_rotation(3), shift=(3.0, -2.0, 1.0))
+    moved = [replace(light, spread=np.radians(50.0)) for light in moved]
+    found = shading.shade(turned, moved, technique, dtype=np.float64).combined
+    # A circle that touches an edge meets it at the root of a rounding error.
+    limit = 2e-4 if technique == shading.REFERENCE else 1e-7
+    assert np.abs(found - expected).max() < limit * expected.max()
+
+
+@techniques
+@pytest.mark.parametrize("degrees", DEGREES)
+def test_hostile_places_give_finite_radiance(technique, degrees):
+    """On the light's axis, at its edge and corner, in its plane, on its surface, mirrors, grazing views."""
+    places = [(0, 0, 0), (1, 0, 0), (1, 0.6, 0), (1, 0.6, 2.9999), (0.2, 0.1, 3), (4, 0, 3), (0, 0, 2.999999)]
+    places.append((9, 9, 0))
+    for shape in ("RECTANGLE", "DISK"):
+        light = area_light(shape=shape, spread=np.radians(degrees), radiance=(1, 1, 1))
+        for roughness, view in ((0.0, (0, 0, 1)), (0.3, (1, 0, 1e-7)), (1.0, (0.3, 0.2, 1))):
+            white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1)}
+            sample = single_sample(view=view, roughness=roughness, **white)
+            samples = repeated(sample, np.array(places, dtype=float))
+            radiance = shading.shade(samples, [light], technique, workers=1).combined
+            assert np.isfinite(radiance).all() and (radiance >= 0.0).all()
+            assert radiance.max() < 3.0 * light_cone.peak_factor(light.spread)
+            # The last one is outside of every cone but the widest.
+            assert degrees == 170.0 or not radiance[-1].any()
+
+
+def test_polygons_have_no_spread():
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    with pytest.raises(ValueError, match="spread is 1.0 rad, expected pi for shape POLYGON"):
+        area_light(shape="POLYGON", corners=corners, spread=1.0)

@@ -11,7 +11,7 @@ from .imaging.exr_rows import writing_rows
 from .imaging.margin import nearest_covered
 
 # Texels that are in memory while the file is written.
-WRITTEN_TEXELS = 1 << 20
+WRITTEN_TEXELS = 1 << 18
 COVERAGE = "coverage.hit.V"
 
 

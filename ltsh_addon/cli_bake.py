@@ -46,7 +46,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--passes", type=_passes, default=BakeOptions.passes,
         help=f"some of {','.join(BAKE_PASSES)} (default: {','.join(BakeOptions.passes)})",
     )  # fmt: skip
-    parser.add_argument("--frame", type=values.frame, metavar="F", help="default: the file's current frame")
+    frame = "default: the file's current frame"
+    parser.add_argument("--frames", "--frame", dest="frame", type=values.frame, metavar="F", help=frame)
     parser.add_argument("--camera", metavar="NAME", help="default: the scene's camera")
     parser.add_argument("--error", action="store_true", help="beside Cycles' bake: signed errors, also as pictures")
     parser.add_argument(

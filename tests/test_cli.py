@@ -12,7 +12,7 @@ import fake_scene
 import numpy as np
 import pytest
 
-from ltsh_addon import __version__, cli, shading
+from ltsh_addon import __version__, argument_values, cli, shading
 from ltsh_addon.blender.child import Cancelled, SceneError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -338,4 +338,4 @@ sys.exit(cli.main(["compare", {room!r}, "-o", {str(out)!r}, "--quiet"]))
 
 
 def test_every_shipped_table_is_a_technique():
-    assert cli._techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES
+    assert argument_values.techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES

@@ -15,7 +15,7 @@ import quadrature
 import scene_parts
 from scene_parts import add_plane, add_sphere, principled
 
-from ltsh_addon import bake, imaging
+from ltsh_addon import bake_object, imaging
 from ltsh_addon.bake import BakeOptions, bake_scene
 from ltsh_addon.blender import child, gbuffer, render_settings
 from ltsh_addon.imaging.exr import read_metadata
@@ -217,7 +217,7 @@ def test_blocks_of_rows_change_nothing(tmp_path, monkeypatch):
     textured_scene()
     path = save(tmp_path)
     _, whole = baked(path, tmp_path / "whole", margin=3)
-    monkeypatch.setattr(bake, "BLOCK_TEXELS", 7 * SIZE)
+    monkeypatch.setattr(bake_object, "BLOCK_TEXELS", 7 * SIZE)
     _, parts = baked(path, tmp_path / "parts", margin=3)
     for name, layers in whole.items():
         assert np.array_equal(layers["coverage.hit"], parts[name]["coverage.hit"])

@@ -19,7 +19,8 @@ PASSES = ("specular", "diffuse")
 # A block is what one process takes at a time, and what is shaded between two calls of `progress`: a share of the
 # samples, within these limits.
 BLOCKS = 16
-BLOCK_LIMITS = (32768, 131072)
+# At most two chunks: processes end at about the same time only where blocks are short.
+BLOCK_LIMITS = (32768, 49184)
 REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 

@@ -13,7 +13,9 @@ from .lookup_table import LookupTable
 # Double precision arrays of this many samples stay in the cache.
 DOUBLE_CHUNK = 4096
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
-_SINGLE_COST, _DOUBLE_COST, _REFERENCE_COST = (10.0, 12.0), (100.0, 120.0), (20_000.0, 1000.0)
+# In single precision for degree 0, and that for every degree more.
+_SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
+_DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,12 @@ class Task:
 
     def seconds(self, count: int) -> float:
         """About how long `count` samples take one process."""
-        per_light, per_corner = _REFERENCE_COST if self.is_reference else _SINGLE_COST if self.single else _DOUBLE_COST
+        per_light, per_corner = _REFERENCE_COST if self.is_reference else _DOUBLE_COST
+        if self.single:
+            degree = self.table.degree if "specular" in self.passes else 0
+            per_light, per_corner = (
+                base + degree * more for base, more in zip(_SINGLE_COST, _COST_PER_DEGREE, strict=True)
+            )
         corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 

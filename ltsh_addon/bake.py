@@ -51,7 +51,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
     but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
     """
-    from .blender import child
+    from .blender import bake_child, child
 
     start = time.perf_counter()
     _check(options)
@@ -61,7 +61,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     finished = finished_tiles(options.output, key) if options.resume else {}
     with tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        manifest = child.extract_bake(_job(options, finished), folder, progress=progress)
+        manifest = bake_child.extract_bake(_job(options, finished), folder, progress=progress)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         stems = _file_stems([record["name"] for record in manifest["objects"]])
         records, seconds = [], {"blender": manifest["seconds"]}
@@ -89,10 +89,10 @@ def _check(options: BakeOptions) -> None:
 
 
 def _job(options, finished):
-    from .blender import child
+    from .blender import bake_child
 
     shaded = tuple(name for name in ("specular", "diffuse") if name in shaded_passes(options))
-    return child.BakeJob(
+    return bake_child.BakeJob(
         scene=options.scene,
         objects=options.objects,
         uv=options.uv,
@@ -123,7 +123,7 @@ def _file_stems(names: list[str]) -> list[str]:
 
 def _apply(options, tables, records, progress) -> str:
     """Save the .blend that shows the textures; its name."""
-    from .blender import child
+    from .blender import bake_child
 
     textures = []
     for record in records:
@@ -134,7 +134,7 @@ def _apply(options, tables, records, progress) -> str:
         name = f"{record['name']} {applied_layer(options, tables)}"
         textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
     path = options.output / f"{Path(options.scene).stem}_baked.blend"
-    child.apply_bake(options.scene, path, textures, progress=progress)
+    bake_child.apply_bake(options.scene, path, textures, progress=progress)
     return path.name
 
 

@@ -14,8 +14,8 @@ GROUP_PREFIX = "LTSH Bake"
 
 
 def apply_bake(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `child.apply_bake`): open the scene, give every baked object copies of its materials that show
-    the texture, save the file `job["path"]`; the manifest."""
+    """Do the `job` (see `bake_child.apply_bake`): open the scene, give every baked object copies of its materials that
+    show the texture, save the file `job["path"]`; the manifest."""
     warnings = []
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings)

@@ -36,7 +36,7 @@ from .uv_raster import tiles_of
 
 
 def extract_bake(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `child.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `bake_child.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
     started, warnings = time.monotonic(), []
     progress("open scene", 0.0)
     extraction.open_scene(Path(job["scene"]), warnings)

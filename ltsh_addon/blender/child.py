@@ -89,8 +89,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         )
     scene = Path(options.scene).absolute()
     check_readable(scene)
-    with _temporary_folder() as folder:
-        manifest = _run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
+    with temporary_folder() as folder:
+        manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings = _read_samples(manifest, folder)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         return Extraction(
@@ -111,60 +111,13 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         )
 
 
-@dataclass(frozen=True)
-class BakeJob:
-    """What to take from which file for a bake; None means as in the file."""
-
-    scene: Path
-    objects: tuple[str, ...] | str  # names, "selected" or "all"
-    uv: str | None
-    width: int
-    height: int
-    block_rows: int
-    view: tuple[float, float, float] | str  # a position, "camera" or "above"
-    camera: str | None
-    frame: int | None
-    cycles_samples: int
-    passes: tuple[str, ...]  # of Cycles
-    finished: tuple[tuple[str, int], ...] = ()  # (object, tile): of these no maps are needed
-
-
-def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
-    """Meshes, materials, maps and Cycles' bake of a .blend as files in `folder`; the manifest.
-
-    Raises as `extract` does.
-    """
-    scene = Path(job.scene).absolute()
-    check_readable(scene)
-    with _termination_as_exception():
-        return _run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
-
-
-def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
-    """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
-
-    Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
-    not at all. Raises as `extract` does.
-    """
-    path = Path(path).absolute()
-    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
-    job = {"task": "apply", "scene": str(Path(scene).absolute()), "path": str(unfinished), "textures": textures}
-    try:
-        with _temporary_folder() as folder:
-            manifest = _run_child(job, folder, progress)
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
-    return manifest["warnings"]
-
-
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
     """Build the example scene and save it as the .blend `path`, at once or not at all."""
     path = Path(path).absolute()
     unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
     try:
-        with _temporary_folder() as folder:
-            _run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
+        with temporary_folder() as folder:
+            run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
         if not unfinished.is_file():
             raise SceneError(f"{path}: Blender built the example scene but saved no file")
         os.replace(unfinished, path)
@@ -186,13 +139,13 @@ def check_readable(scene: Path) -> None:
 
 
 @contextlib.contextmanager
-def _temporary_folder():
-    with _termination_as_exception(), tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
+def temporary_folder():
+    with termination_as_exception(), tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
         yield Path(name)
 
 
 @contextlib.contextmanager
-def _termination_as_exception():
+def termination_as_exception():
     """Turn SIGTERM into SystemExit meanwhile, so that child and folder are cleaned up; leaves other handlers alone."""
 
     def stop(number, frame):
@@ -225,7 +178,7 @@ def child_command(job: Path) -> list[str]:
     return [sys.executable, str(WORKER), str(job)]
 
 
-def _run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
+def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
     """Run worker.py on `job` in `folder`, report its progress; the manifest it wrote."""
     job_path = folder / "job.json"
     job_path.write_text(json.dumps({**job, "watch_parent": True}), encoding="utf-8")

@@ -1,49 +1,19 @@
-"""Baked lighting: against quadrature written out, against Cycles' bake, through real children; what cannot be baked."""
+"""Baked lighting: against quadrature written out, against Cycles' bake, through real children."""
 
-import json
 import math
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from scene_parts import add_plane, add_sphere, principled
+from bake_scenes import SIZE, baked, save, start, textured_scene
+from scene_parts import add_plane, principled
 
 from ltsh_addon import bake_object, imaging
-from ltsh_addon.bake import BakeOptions, bake_scene
-from ltsh_addon.blender import child, gbuffer, render_settings
+from ltsh_addon.blender import gbuffer, render_settings
 from ltsh_addon.imaging.exr import read_metadata
-from ltsh_addon.scene import AreaLight, Cancelled, SurfaceSamples
-
-ROOT = Path(__file__).resolve().parents[2]
-SIZE = 64
-
-
-def start(light=True, camera=(0.0, -3.0, 2.0)):
-    scene_parts.empty_scene()
-    if light:
-        scene_parts.add_area_light("Key")
-    if camera:
-        scene_parts.add_camera(camera)
-
-
-def save(folder):
-    path = folder / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    return path
-
-
-def baked(path, output, **options):
-    """Report and layers by file name, row 0 on top."""
-    values = {"width": SIZE, "height": SIZE, "margin": 0, **options}
-    report = bake_scene(BakeOptions(scene=path, output=output, **values))
-    return report, {file.name: imaging.read_layers(file) for file in sorted(output.glob("*.exr"))}
+from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
 def plane_positions(size=SIZE, side=6.0):
@@ -114,35 +84,6 @@ def test_diffuse_light_is_the_irradiance_over_pi_and_leaves_colors_out(tmp_path)
     assert np.abs(layers["ltsh4.diffuse"] - layers["ltsh4.diffuse_light"] * color).max() < 1e-5 * light.max()
     assert np.array_equal(layers["ltsh4.combined"], layers["ltsh4.diffuse"] + layers["ltsh4.specular"])
     assert layers["coverage.hit"].min() == 1.0
-
-
-def textured_scene():
-    """A sphere of metal and a plane whose colors, roughness and normals come from textures, one in a node group."""
-    start(camera=(0.0, -3.0, 3.0))
-    scene_parts.add_area_light("Fill", (-1.5, 0.5, 1.2), (0.2, -0.8, 0.3), shape="DISK", energy=40.0)
-    add_sphere(principled("Metal", Metallic=1.0, Roughness=0.7)[0], radius=0.5, location=(0.0, 0.0, 0.6), segments=48)
-    material, node = principled("Rough", Roughness=0.5)
-    tree = material.node_tree
-    noise = tree.nodes.new("ShaderNodeTexNoise")
-    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 0.7, 0.0
-    group = bpy.data.node_groups.new("Group", "ShaderNodeTree")
-    group.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
-    inner = group.nodes.new("ShaderNodeBsdfPrincipled")
-    texture = group.nodes.new("ShaderNodeTexWave")
-    texture.inputs["Scale"].default_value, texture.inputs["Detail"].default_value = 0.2, 0.0
-    group.links.new(texture.outputs["Color"], inner.inputs["Base Color"])
-    group.links.new(inner.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
-    outer, mix = tree.nodes.new("ShaderNodeGroup"), tree.nodes.new("ShaderNodeMixShader")
-    outer.node_tree = group
-    tree.links.new(noise.outputs[0], node.inputs["Roughness"])
-    tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
-    tree.links.new(node.outputs[0], mix.inputs[1])
-    tree.links.new(outer.outputs[0], mix.inputs[2])
-    tree.links.new(mix.outputs[0], tree.nodes["Material Output"].inputs["Surface"])
-    scene_parts.add_bump(tree, node, strength=0.2, scale=0.7).inputs["Height"].links[0].from_node.inputs[
-        "Detail"
-    ].default_value = 0.0
-    add_plane(material, size=3.0)
 
 
 def test_textures_groups_and_mixes_agree_with_the_bake_of_cycles(tmp_path):
@@ -284,130 +225,3 @@ def test_apply_saves_a_file_whose_object_shows_the_texture(tmp_path):
     rendered = gbuffer.read_layer(channels, "Combined", "RGB")
     # Cycles keeps the texture in half precision and blends neighbors by a thousandth of a texel.
     assert np.abs(rendered - combined).max() <= 5e-3 * combined.max()
-
-
-def broken_scene():
-    start()
-    add_plane(name="Good")
-    bare = add_plane(name="No map", location=(0, 0, 0.1))
-    bare.data.uv_layers.remove(bare.data.uv_layers[0])
-    add_plane(name="Point map").data.uv_layers.active.data.foreach_set("uv", np.full(8, 0.5, np.float32))
-    add_plane(name="Far map").data.uv_layers.active.data.foreach_set(
-        "uv", np.float32([-5, -5, -4.1, -5, -4.1, -4.1, -5, -4.1])
-    )
-    square = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
-    double = scene_parts.add_mesh("Double", 2 * square, [(0, 1, 2, 3), (4, 5, 6, 7)])
-    double.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 1, 0, 1, 1, 0, 1] * 2))
-    add_plane(name="Hidden").hide_render = True
-    scene_parts.add_mesh("No faces", [(0, 0, 0)], []).data.uv_layers.new(name="UVMap")
-    flat = add_plane(name="Flat")
-    flat.scale = (1.0, 0.0, 0.0)
-
-
-def test_broken_objects_are_named_and_the_rest_is_baked(tmp_path, capsys):
-    from ltsh_addon import cli
-
-    broken_scene()
-    path = save(tmp_path)
-    names = [ob.name for ob in bpy.data.objects if ob.type == "MESH"]
-    arguments = [value for name in names for value in ("--object", name)]
-    capsys.readouterr()
-    code = cli.main(["bake", str(path), "-o", str(tmp_path / "out"), "--size", "64", "--quiet", *arguments])
-    said = capsys.readouterr().err
-    assert code == 1
-    assert {file.name for file in (tmp_path / "out").glob("*.exr")} == {"Good.exr", "Double.exr"}
-    for text in (
-        "not baked: object 'No map' has no UV map, found none",
-        "not baked: object 'Point map': all faces of UV map 'UVMap' have no area",
-        "not baked: object 'Far map': all of UV map 'UVMap' lies outside of the texture",
-        "not baked: object 'Hidden' is hidden in renders",
-        "not baked: object 'No faces' has no faces",
-        "not baked: object 'Flat': its transform has no inverse",
-        "warning: object 'Double': 100 % of its texels are covered twice",
-    ):
-        assert text in said, text
-    report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert len(report["problems"]) == 6 and len(report["objects"]) == 2
-
-
-def test_scenes_that_cannot_be_baked_say_why(tmp_path):
-    start(light=False)
-    add_plane()
-    with pytest.raises(child.SceneError, match="no area light that renders, found no lights at all; add an area light"):
-        baked(save(tmp_path), tmp_path / "out")
-    scene_parts.add_area_light()
-    path = save(tmp_path)
-    with pytest.raises(child.SceneError, match="object 'Wall' is not in scene 'Scene'; meshes there: 'Plane'"):
-        baked(path, tmp_path / "out", objects=("Wall",))
-    report, _ = baked(path, tmp_path / "out", uv="Lightmap")
-    assert report["problems"] == [
-        "object 'Plane' has no UV map 'Lightmap', found 'UVMap': unwrap it, or name another with --uv"
-    ]
-    with pytest.raises(ValueError, match="size is 32x8192, expected 64 to 8192 each"):
-        baked(path, tmp_path / "out", width=32, height=8192)
-    bpy.data.objects.remove(bpy.data.objects["Plane"])
-    with pytest.raises(child.SceneError, match="no mesh that renders, nothing to bake"):
-        baked(save(tmp_path), tmp_path / "out")
-
-
-def test_above_needs_no_camera_and_camera_does(tmp_path):
-    start(camera=None)
-    add_plane()
-    path = save(tmp_path)
-    _, files = baked(path, tmp_path / "out", view="above")
-    assert files["Plane.exr"]["ltsh4.specular"].max() > 0.0
-    with pytest.raises(child.SceneError, match="no active camera"):
-        baked(path, tmp_path / "out")
-
-
-def test_stopping_leaves_no_file(tmp_path):
-    start()
-    add_plane()
-
-    def stop(stage, fraction):
-        return not stage.startswith("shade")
-
-    with pytest.raises(Cancelled):
-        bake_scene(BakeOptions(scene=save(tmp_path), output=tmp_path / "out", width=64, height=64), stop)
-    assert list((tmp_path / "out").iterdir()) == []
-
-
-def test_after_a_kill_resume_gives_the_same_bytes(tmp_path):
-    textured_scene()
-    path = save(tmp_path)
-    arguments = ["bake", str(path), "--size", "64", "--error", "--cycles-samples", "4", "--quiet", "--margin", "3"]
-
-    def start_bake(output, *more):
-        command = [sys.executable, "-m", "ltsh_addon", *arguments, "-o", str(output), *more]
-        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-    began = time.monotonic()
-    assert start_bake(tmp_path / "whole").wait() == 0
-    seconds = time.monotonic() - began
-    moments = np.random.default_rng(7).uniform(0.2, 1.0, 2) * seconds
-    for moment in (*moments, seconds):
-        process = start_bake(tmp_path / "killed", "--resume")
-        try:
-            process.wait(moment)
-        except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGKILL)
-            process.wait()
-    assert start_bake(tmp_path / "killed", "--resume").wait() == 0
-    names = {file.name for file in (tmp_path / "whole").iterdir()}
-    # A killed process cannot take its hidden temporary file away; nothing else may be left.
-    visible = {file.name for file in (tmp_path / "killed").iterdir() if not file.name.startswith(".")}
-    assert visible == names
-    for name in names - {"timing.json"}:
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
-
-
-def test_resume_bakes_again_what_belongs_to_another_job(tmp_path):
-    start()
-    add_plane()
-    path = save(tmp_path)
-    _, first = baked(path, tmp_path / "out", view="above", resume=True)
-    _, second = baked(path, tmp_path / "out", view="camera", resume=True)
-    assert np.abs(first["Plane.exr"]["ltsh4.specular"] - second["Plane.exr"]["ltsh4.specular"]).max() > 0.0
-    (tmp_path / "out" / "Plane.exr").write_bytes(b"no EXR")
-    _, third = baked(path, tmp_path / "out", view="camera", resume=True)
-    assert np.array_equal(second["Plane.exr"]["ltsh4.specular"], third["Plane.exr"]["ltsh4.specular"])

@@ -40,7 +40,7 @@ def add_lights():
         textured.use_nodes = True
     tree = textured.node_tree
     emission = next(node for node in tree.nodes if node.type == "EMISSION")
-    tree.links.new(tree.nodes.new("ShaderNodeTexChecker").outputs["Color"], emission.inputs["Color"])
+    tree.links.new(tree.nodes.new("ShaderNodeLayerWeight").outputs["Facing"], emission.inputs["Strength"])
 
 
 def add_surfaces(folder):

@@ -1,0 +1,56 @@
+"""A bake's part in Blender through a child process, as `child` does it. Imports no bpy."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from . import child
+
+
+@dataclass(frozen=True)
+class BakeJob:
+    """What to take from which file for a bake; None means as in the file."""
+
+    scene: Path
+    objects: tuple[str, ...] | str  # names, "selected" or "all"
+    uv: str | None
+    width: int
+    height: int
+    block_rows: int
+    view: tuple[float, float, float] | str  # a position, "camera" or "above"
+    camera: str | None
+    frame: int | None
+    cycles_samples: int
+    passes: tuple[str, ...]  # of Cycles
+    finished: tuple[tuple[str, int], ...] = ()  # (object, tile): of these no maps are needed
+
+
+def extract_bake(job: BakeJob, folder: Path, *, progress: child.Progress | None = None) -> dict:
+    """Meshes, materials, maps and Cycles' bake of a .blend as files in `folder`; the manifest.
+
+    Raises as `extract` does.
+    """
+    scene = Path(job.scene).absolute()
+    child.check_readable(scene)
+    with child.termination_as_exception():
+        return child.run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
+
+
+def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: child.Progress | None = None) -> list[str]:
+    """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
+
+    Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
+    not at all. Raises as `extract` does.
+    """
+    path = Path(path).absolute()
+    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
+    job = {"task": "apply", "scene": str(Path(scene).absolute()), "path": str(unfinished), "textures": textures}
+    try:
+        with child.temporary_folder() as folder:
+            manifest = child.run_child(job, folder, progress)
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    return manifest["warnings"]

@@ -62,6 +62,7 @@ NOT_SHADED = {
         "Anisotropic": (0.0, "is shaded as 0"),
         "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
         "Sheen Weight": (0.0, "adds diffuse reflection of the same albedo"),
+        "Thin Wall": (0.0, "is shaded as off"),
         "Thin Film Thickness": (0.0, "is shaded as 0"),
     },
     "ShaderNodeBsdfAnisotropic": {"Anisotropy": (0.0, "is shaded as 0")},

@@ -38,6 +38,8 @@ def _perform(job: dict, folder: Path) -> dict:
         return {}
     if job["task"] == "bake":
         return _module("bake_extraction").extract_bake(job, folder, _progress)
+    if job["task"] == "facts":
+        return _module("scene_facts").answer(job, _progress)
     if job["task"] == "apply":
         return _module("bake_apply").apply_bake(job, folder, _progress)
     return _module("extraction").extract(job, folder, _progress)

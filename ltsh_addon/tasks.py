@@ -78,12 +78,18 @@ def tasks_of(job: Job, progress=None) -> list[Task]:
     for scene in job.scenes:
         check_readable(Path(scene))
     tasks = []
+    camera_stems = output_names.file_stems(job.cameras) or [None]
     for scene, stem in zip(job.scenes, output_names.file_stems(Path(scene).stem for scene in job.scenes), strict=True):
         facts = _facts(job, scene, progress)
         contents = contents_digest(replace(job.options, scene=Path(scene)))
-        for camera in job.cameras or (None,):
+        for camera, camera_stem in zip(job.cameras or (None,), camera_stems, strict=True):
             for frame, found in zip(job.frames or (None,), facts, strict=True):
-                tasks += _tasks(job, (scene, camera, frame), stem, found, contents)
+                fields = {
+                    "scene": stem,
+                    "camera": camera_stem or output_names.file_stems([found.get("camera") or "camera"])[0],
+                    "frame": found.get("frame", 0) if frame is None else frame,
+                }
+                tasks += _tasks(job, (scene, camera, frame), fields, found.get("objects"), contents)
     _check_names(job, tasks)
     return tasks
 
@@ -106,20 +112,16 @@ def _facts(job, scene, progress) -> list[dict]:
     return scene_facts.ask(Path(scene), job.frames or (None,), objects, progress=progress)
 
 
-def _tasks(job, unit, stem, found, contents) -> list[Task]:
-    """The tasks of one scene, camera and frame."""
+def _tasks(job, unit, fields, objects, contents) -> list[Task]:
+    """The tasks of one scene, camera and frame: one for each of the objects of a bake."""
     scene, camera, frame = unit
-    objects = [None]
-    if job.command == "bake":
-        objects = list(dict.fromkeys(found["objects"]))
-    camera_stem = output_names.file_stems([camera or found.get("camera") or "camera"])[0]
-    fields = {"scene": stem, "camera": camera_stem, "frame": frame if frame is not None else found.get("frame", 0)}
-    options = replace(job.options, scene=Path(scene), camera=camera, frame=frame)
-    key = options_digest(job.command, options, contents)
-    names = output_names.file_stems(name or "" for name in objects)
+    key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
+    if job.command != "bake":
+        return [Task(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
+    objects = list(dict.fromkeys(objects))
     return [
-        Task(str(scene), camera, frame, name, job.pattern.format(**fields, object=object_stem), key)
-        for name, object_stem in zip(objects, names, strict=True)
+        Task(str(scene), camera, frame, name, job.pattern.format(**fields, object=stem), key)
+        for name, stem in zip(objects, output_names.file_stems(objects), strict=True)
     ]
 
 

@@ -39,12 +39,20 @@ def run_tasks(
     the others are done all the same, unless it is the only task: then SceneError is raised. Raises TableError,
     OSError, ValueError, Cancelled at once.
     """
+    from .blender.blender_process import kept_blender
+    from .blender.child import temporary_folder
+
+    compare.prepare(job.options)
+    with temporary_folder() as folder, kept_blender(folder):
+        tasks = tasks_of(job, progress)
+        return _run(job, tasks, shard_of(tasks, shard), existing, progress)
+
+
+def _run(job, tasks, mine, existing, progress) -> Done:
     from .blender.child import SceneError
 
     output = Path(job.options.output)
-    compare.prepare(job.options)
-    tasks = tasks_of(job, progress)
-    records, mine, kept, problems = Records(output, "tasks"), shard_of(tasks, shard), 0, []
+    records, kept, problems = Records(output, "tasks"), 0, []
     for number, task in enumerate(mine):
         if existing != OVERWRITE and _is_done(records, task, existing):
             kept += 1

@@ -42,7 +42,7 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
     except Exception as error:
         from .blender import child
 
-        if isinstance(error, child.SceneError | child.Cancelled):
+        if isinstance(error, child.SceneError):
             return _fail(program, bar, error, 1)
         bar.finish()
         logging.getLogger(__name__).exception("unexpected error")

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from ltsh_addon import __version__, argument_values, cli, cli_tables, shading
-from ltsh_addon.blender.child import Cancelled, SceneError
+from ltsh_addon.blender.child import SceneError
+from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from pathlib import Path
 
 from . import output_names
+from .baseline import Tolerance
 from .compare import DEFAULT_TECHNIQUES, known_technique
 from .shading import PASSES, SHIPPED_TABLES
 
@@ -84,6 +86,18 @@ def shard(text: str) -> tuple[int, int]:
     if separator and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)
     raise argparse.ArgumentTypeError(f"shard is {text!r}, expected I/N with I from 1 to N, such as 1/4 to 4/4")
+
+
+def tolerance(text: str) -> Tolerance:
+    """A number, or a percentage of what it is compared with."""
+    number, relative = text.removesuffix("%"), text.endswith("%")
+    try:
+        value = float(number) / (100.0 if relative else 1.0)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"tolerance is {text!r}, expected a number such as 0.002, or 10%")
+    return Tolerance(value, relative)
 
 
 def name_of_picture(text: str) -> str:

@@ -4,13 +4,13 @@ of the others.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from . import bake, compare
 from .imaging import write_json
-from .scene import Cancelled
 from .task_records import FOLDER, FORMAT, Records
 from .tasks import Job, Task, shard_of, tasks_of
 
@@ -29,8 +29,24 @@ class Done:
     problems: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class TaskState:
+    """Task `number` of `tasks`, from 1, begins, or, where there are `seconds`, has ended."""
+
+    number: int
+    tasks: int
+    name: str
+    seconds: float | None = None
+    problem: str | None = None
+
+
 def run_tasks(
-    job: Job, *, shard: tuple[int, int] = (1, 1), existing: str = OVERWRITE, progress: Progress | None = None
+    job: Job,
+    *,
+    shard: tuple[int, int] = (1, 1),
+    existing: str = OVERWRITE,
+    progress: Progress | None = None,
+    tell: Callable[[TaskState], None] | None = None,
 ) -> Done:
     """Do the tasks of shard (I, N) of `job`, I from 1 to N.
 
@@ -45,32 +61,39 @@ def run_tasks(
     compare.prepare(job.options)
     with temporary_folder() as folder, kept_blender(folder):
         tasks = tasks_of(job, progress)
-        return _run(job, tasks, shard_of(tasks, shard), existing, progress)
+        mine = shard_of(tasks, shard)
+        records = Records(job.options.output, "tasks")
+        wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
+        problems = []
+        if len(wanted) < len(mine):
+            _write_job(job, tasks, existing)
+        for number, task in enumerate(wanted, 1):
+            if tell is not None:
+                tell(TaskState(number, len(wanted), task.name))
+            found, seconds, files = _attempt(job, task, existing, progress, alone=len(tasks) == 1)
+            _write_job(job, tasks, existing)
+            _write_timing(job.options.output, task, seconds)
+            records.write(task.name, task.key, task.to_dict(), files, **found)
+            wrong = [found["problem"]] if "problem" in found else found["report"].get("problems", [])
+            problems += wrong
+            if tell is not None:
+                tell(TaskState(number, len(wanted), task.name, seconds["total"], "; ".join(wrong) or None))
+    return Done(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
 
 
-def _run(job, tasks, mine, existing, progress) -> Done:
+def _attempt(job, task, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
+    """What is to be recorded of a task, its seconds and files; a scene that fails is a "problem", unless `alone`."""
     from .blender.child import SceneError
 
-    output = Path(job.options.output)
-    records, kept, problems = Records(output, "tasks"), 0, []
-    for number, task in enumerate(mine):
-        if existing != OVERWRITE and _is_done(records, task, existing):
-            kept += 1
-            continue
-        found, seconds, files = {}, {}, ()
-        try:
-            made = _perform(job, task, existing, _of_task(progress, task, number, mine))
-            found, seconds, files = {"report": made.report}, made.seconds, made.files
-            problems += made.report.get("problems", ())
-        except SceneError as error:
-            if len(tasks) == 1:
-                raise
-            found = {"problem": f"{task.name}: {' '.join(str(error).split())}"}
-            problems.append(found["problem"])
-        _write_job(output, job, tasks, existing)
-        _write_timing(output, task, seconds)
-        records.write(task.name, task.key, task.to_dict(), files, **found)
-    return Done(len(mine), len(mine) - kept, kept, tuple(problems))
+    start = time.perf_counter()
+    try:
+        made = _perform(job, task, existing, progress)
+        return {"report": made.report}, made.seconds, made.files
+    except SceneError as error:
+        if alone:
+            raise
+        problem = f"{task.name}: {' '.join(str(error).split())}"
+        return {"problem": problem}, {"total": time.perf_counter() - start}, ()
 
 
 def _is_done(records, task, existing) -> bool:
@@ -87,16 +110,7 @@ def _perform(job: Job, task: Task, existing: str, progress) -> compare.Made:
     return compare.make_picture(options, job.command == "compare", progress)
 
 
-def _of_task(progress, task, number, tasks):
-    """`progress` that says which of several tasks it is about."""
-    if progress is None or len(tasks) == 1:
-        return progress
-    if progress(f"{number + 1} of {len(tasks)} {task.name}", 0.0) is False:
-        raise Cancelled(f"stopped before {task.name}")
-    return lambda stage, fraction: progress(f"{number + 1} of {len(tasks)} {stage}", fraction)
-
-
-def _write_job(output, job, tasks, existing) -> None:
+def _write_job(job, tasks, existing) -> None:
     """Say what the whole job is: the same from every shard, so that `merge` knows what to wait for."""
     applied = job.command == "bake" and job.options.apply
     document = {
@@ -107,12 +121,12 @@ def _write_job(output, job, tasks, existing) -> None:
         "applied_layer": bake.applied_layer(job.options) if applied else None,
         "tasks": [task.to_dict() for task in tasks],
     }
-    path = output / FOLDER / "job.json"
+    path = Path(job.options.output) / FOLDER / "job.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, document)
 
 
 def _write_timing(output, task, seconds) -> None:
-    path = output / FOLDER / "timing" / f"{task.name}.json"
+    path = Path(output) / FOLDER / "timing" / f"{task.name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, seconds)

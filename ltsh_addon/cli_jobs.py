@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 
+from .baseline import Baseline
 from .batch import run_tasks
 from .imaging.report import json_text
 from .merge import Merged, merge
@@ -14,32 +15,48 @@ from .tasks import Job
 
 def run_job(job: Job, arguments, bar) -> int:
     """Do the job, or its shard; 0, or 1 where something of it is wrong."""
+    document, code = do_job(job, arguments, bar, _baseline(arguments))
+    if arguments.json:
+        print_json(document)
+    return code
+
+
+def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
+    """As `run_job`; the document for --json, which is not printed, and the exit code."""
     shard = arguments.shard or (1, 1)
-    done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar)
+
+    def tell(state):
+        if state.seconds is None:
+            bar.begin_task(state.number, state.tasks)
+        else:
+            bar.end_task(state.name, state.seconds)
+
+    done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar, tell=tell)
     if shard[1] == 1:
-        return finish(merge(job.options.output, bar), arguments, bar)
+        return finish(merge(job.options.output, bar), job.options.output, arguments, bar, baseline)
     bar.finish()
     text = f"{shard[0]}/{shard[1]}"
-    if arguments.json:
-        print_json({"shard": text, **vars(done)})
-    else:
-        kept = f" ({done.kept} were there already)" if done.kept else ""
-        say(f"shard {text}: {done.tasks} tasks done{kept}; when all are: merge {job.options.output}", sys.stdout)
-    _complain("problem", done.problems)
-    return 1 if done.problems else 0
+    kept = f" ({done.kept} were there already)" if done.kept else ""
+    tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
+    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
+    _complain(bar, "problem", done.problems)
+    return {"shard": text, **vars(done)}, 1 if done.problems else 0
 
 
-def finish(merged: Merged, arguments, bar) -> int:
-    """Print what a whole job has made; 0, or 1 where something of it is missing or wrong."""
+def finish(merged: Merged, output, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
+    """Print what a whole job has made; the document for --json and the exit code, 1 where something is wrong."""
     bar.finish()
-    if arguments.json:
-        print_json(merged.report)
-    else:
-        _complain("warning", _warnings(merged))
-        say(_summary(merged, arguments.output), sys.stdout)
-    _complain("not baked" if merged.command == "bake" else "failed", merged.problems)
-    _complain("missing", merged.missing)
-    return 1 if merged.missing or merged.problems else 0
+    if not arguments.json:
+        _complain(bar, "warning", _warnings(merged))
+    _print(_summary(merged, output), arguments, bar)
+    _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
+    _complain(bar, "missing", merged.missing)
+    worse = []
+    if baseline is not None:
+        worse = baseline.worse(merged.report, arguments.tolerance)
+        _complain(bar, "worse", worse)
+    document = merged.report if baseline is None else {**merged.report, "worse": worse}
+    return document, 1 if merged.missing or merged.problems or worse else 0
 
 
 def print_json(document) -> None:
@@ -47,9 +64,30 @@ def print_json(document) -> None:
     say(json.dumps(json.loads(json_text(document)), indent=2), sys.stdout)
 
 
-def _complain(what: str, lines) -> None:
+def merge_folder(arguments, bar) -> int:
+    """`ltsh merge OUT`; 0, or 1 where something is missing or wrong."""
+    baseline = _baseline(arguments)
+    document, code = finish(merge(arguments.output, bar), arguments.output, arguments, bar, baseline)
+    if arguments.json:
+        print_json(document)
+    return code
+
+
+def _baseline(arguments) -> Baseline | None:
+    """What --baseline names, read before anything is done."""
+    path = getattr(arguments, "baseline", None)
+    return None if path is None else Baseline.read(path)
+
+
+def _print(text, arguments, bar) -> None:
+    bar.log.line(text.splitlines()[-1])
+    if not arguments.json:
+        say(text, sys.stdout)
+
+
+def _complain(bar, what: str, lines) -> None:
     for line in dict.fromkeys(lines):
-        say(f"{what}: {line}", sys.stderr)
+        bar.note(f"{what}: {line}")
 
 
 def _warnings(merged) -> list[str]:

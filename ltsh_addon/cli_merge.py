@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from . import cli_options as options
-from .cli_jobs import finish
-from .merge import merge
+from .argument_values import Misuse
+from .cli_jobs import merge_folder
+from .cli_run import merge_jobs
 
 EXAMPLES = """examples:
   %(prog)s out/room
   %(prog)s out/room --json > room.json
+  %(prog)s night.toml
 
 Writes report.json and timing.json. What is missing is named, and the exit code is 1; the same command with --resume
 and the same --shard does what is missing.
@@ -20,10 +22,15 @@ and the same --shard does what is missing.
 def add(parser) -> None:
     """Add the arguments and the function that runs."""
     options.with_examples(parser, EXAMPLES)
-    parser.add_argument("output", type=Path, metavar="OUT", help="the folder that -o named")
+    parser.add_argument("output", type=Path, metavar="OUT", help="the folder that -o named, or JOB.toml of `run`")
+    options.add_baseline(parser)
     options.add_talk(parser)
     parser.set_defaults(run=_run)
 
 
 def _run(arguments, bar, open_file) -> int:
-    return finish(merge(arguments.output, bar), arguments, bar)
+    if arguments.output.suffix == ".toml" and not arguments.output.is_dir():
+        if arguments.baseline is not None:
+            raise Misuse("--baseline belongs into the job file, to the job that it is for")
+        return merge_jobs(arguments.output, arguments, bar)
+    return merge_folder(arguments, bar)

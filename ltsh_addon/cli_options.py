@@ -7,6 +7,7 @@ from pathlib import Path
 
 from . import argument_values as values
 from . import batch
+from .baseline import Tolerance
 
 SCENES = "SCENE.blend"
 
@@ -51,10 +52,22 @@ def add_batch(parser) -> None:
     parser.set_defaults(existing=batch.OVERWRITE)
 
 
-def add_talk(parser) -> None:
+def add_baseline(parser) -> None:
+    """Regression of a comparison."""
+    parser.add_argument("--baseline", type=Path, metavar="REPORT",
+                        help="report.json of an earlier comparison: exit code 1 where an error got worse")  # fmt: skip
+    parser.add_argument(
+        "--tolerance", type=values.tolerance, default=Tolerance(), metavar="X",
+        help="how much worse is let pass: 0.002 (a fifth of a percent) or 10%% of the baseline's error "
+        "(default: 0.001)",
+    )  # fmt: skip
+
+
+def add_talk(parser, json_meaning: str = "print the report on stdout as one JSON document") -> None:
     """What is printed."""
-    parser.add_argument("--json", action="store_true", help="print the report on stdout as one JSON document")
+    parser.add_argument("--json", action="store_true", help=json_meaning)
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    parser.add_argument("--log", type=Path, metavar="FILE", help="append to FILE what was done when")
 
 
 def with_examples(parser, examples: str) -> None:

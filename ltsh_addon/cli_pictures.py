@@ -21,6 +21,7 @@ COMPARE_EXAMPLES = """examples:
   %(prog)s room.blend -o out/room --frames 1-240:2 --camera Left --camera Right
   %(prog)s room.blend hall.blend -o out/both --name "{scene}/{scene}_{frame:04d}"
   %(prog)s room.blend -o out/room --frames 1-240 --shard 1/4 --resume
+  %(prog)s room.blend -o out/today --baseline out/yesterday/report.json --tolerance 0.002
 """
 SHADE_EXAMPLES = """examples:
   %(prog)s room.blend -o out/room --techniques ltsh4 --aa 16
@@ -41,6 +42,7 @@ def add_compare(parser) -> None:
     options.with_examples(parser, COMPARE_EXAMPLES)
     options.add_scenes(parser)
     _add_picture(parser, cycles=True)
+    options.add_baseline(parser)
     parser.set_defaults(run=_run)
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from . import argument_values as values
 from .cli_jobs import print_json
+from .cli_options import add_talk
 from .progress_bar import say
 from .shading import SHIPPED_TABLES
 
@@ -21,13 +22,12 @@ def add(parser) -> None:
         # The script parses its own options: nothing starts with this prefix, so that all of them are taken as they are.
         script = actions.add_parser(action, help="in the source checkout", add_help=False, prefix_chars="\0")
         script.add_argument("arguments", nargs="*")
-        script.set_defaults(run=_run_table_script, quiet=False)
+        script.set_defaults(run=_run_table_script, quiet=False, log=None)
     export = actions.add_parser("export", help="an EXR and a C, C++ and GLSL header of each, for other engines")
     export.add_argument("names", nargs="*", type=values.table, metavar="TABLE",
                         help="or a path (.npz); default: all shipped")  # fmt: skip
     export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
-    export.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
-    export.add_argument("--quiet", action="store_true", help="no progress on stderr")
+    add_talk(export, "name the files on stdout in one JSON document")
     export.set_defaults(run=_export_tables)
 
 

@@ -12,6 +12,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -90,12 +91,25 @@ def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
 
     Done before anything takes long. Raises TableError, OSError.
     """
-    tables = {
-        name: given if given == shading.REFERENCE else shading.load_table(given)
-        for name, given in technique_names(options.techniques).items()
-    }
+    tables = load_tables(options.techniques)
     _make_writable(Path(options.output))
     return tables
+
+
+def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
+    """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
+    names = technique_names(techniques)
+    return {name: given if given == shading.REFERENCE else _table(given) for name, given in names.items()}
+
+
+def _table(given: str) -> shading.LookupTable:
+    return _shipped_table(given) if given in shading.SHIPPED_TABLES else shading.load_table(given)
+
+
+@cache
+def _shipped_table(name: str) -> shading.LookupTable:
+    """Read once: a job of many frames needs it for each."""
+    return shading.load_table(name)
 
 
 def technique_names(techniques: Sequence[str]) -> dict[str, str]:

@@ -5,7 +5,7 @@ import io
 import pytest
 
 from ltsh_addon import progress_bar
-from ltsh_addon.progress_bar import ProgressBar
+from ltsh_addon.progress_bar import ProgressBar, duration
 
 
 class Stream(io.StringIO):
@@ -140,3 +140,37 @@ def test_a_closed_stream_is_quiet(capsys):
 def test_the_bar_never_stops_the_work(clock, terminal):
     bar = ProgressBar(Stream(terminal))
     assert all(bar("samples", fraction) is True for fraction in (-1.0, 0.0, 1.0, 2.0))
+
+
+def test_a_job_shows_where_it_stands_as_a_whole(clock):
+    stream = Stream(terminal=True)
+    bar = ProgressBar(stream)
+    for number in range(1, 5):
+        bar.begin_task(number, 4)
+        for stage in ("samples", "LTC"):
+            clock.now += 10.0
+            bar(stage, 0.5)
+        bar.end_task(f"shade_{number}", 20.0)
+    bar("afterwards", 1.0)
+    bar.finish()
+    drawn = [text.rstrip() for text in stream.getvalue().replace("\n", "\r").split("\r") if text]
+    assert drawn[4].startswith("2 of 4 LTC") and "25 %" in drawn[4] and "(120 s" not in drawn[4]
+    assert "(2 min left)" in drawn[4]  # a quarter in 40 s
+    assert drawn[-2].startswith("4 of 4 shade_4") and "100 % (80.0 s)" in drawn[-2]
+    assert len(shown_lines(stream)) == 3 and drawn[-1].startswith("afterwards")
+
+
+def test_a_job_in_a_file_is_a_line_per_task(clock):
+    stream = Stream(terminal=False)
+    bar = ProgressBar(stream)
+    for number in (1, 2):
+        bar.begin_task(number, 2)
+        clock.now += 30.0
+        bar("samples", 1.0)
+        bar.end_task(f"shade_{number}", 30.0)
+    assert stream.getvalue().splitlines() == ["1 of 2: shade_1 in 30.0 s (30 s left)", "2 of 2: shade_2 in 30.0 s"]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (99.4, "99 s"), (100.0, "2 min"), (12000.0, "3.3 h")])
+def test_durations_are_short(seconds, text):
+    assert duration(seconds) == text

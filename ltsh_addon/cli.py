@@ -53,7 +53,7 @@ def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
     except Mistakes as error:
         for line in error.lines:
             _fail(program, bar, line, 2)
-        return 2
+        return 1 if error.of_the_world else 2
     except (values.Misuse, NameClash) as error:
         return _fail(program, bar, error, 2)
     except (TableError, OSError, ValueError, ImportError, Cancelled, MemoryError) as error:

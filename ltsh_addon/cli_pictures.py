@@ -94,6 +94,8 @@ def job_of(arguments, scenes: tuple[Path, ...], resolution=None) -> Job:
 
 
 def _run(arguments, bar, open_file) -> int:
+    if getattr(arguments, "baseline", None) and arguments.shard and arguments.shard[1] > 1:
+        raise values.Misuse("--baseline is for the whole job, not for a shard of it: give it to `merge`")
     return run_job(job_of(arguments, values.scenes(arguments, open_file)), arguments, bar)
 
 

@@ -53,11 +53,14 @@ class Wanted:
 
 
 class Mistakes(Misuse):
-    """What is wrong in a job file; `lines` holds a line for each mistake."""
+    """What is wrong in a job file; `lines` holds a line for each mistake.
 
-    def __init__(self, lines: list[str]):
+    `of_the_world` is True where the file is right and only what it names is missing or damaged.
+    """
+
+    def __init__(self, lines: list[str], of_the_world: bool = False):
         super().__init__("\n".join(lines))
-        self.lines = lines
+        self.lines, self.of_the_world = lines, of_the_world
 
 
 def read_jobs(path: Path, commands: dict[str, Command]) -> list[Wanted]:
@@ -72,7 +75,7 @@ def read_jobs(path: Path, commands: dict[str, Command]) -> list[Wanted]:
     reader = _Reader(path, commands, key_lines(text))
     wanted = reader.read(document)
     if reader.mistakes:
-        raise Mistakes([line for _, line in sorted(reader.mistakes)])
+        raise Mistakes([line for _, line in sorted(reader.mistakes)], reader.of_the_world)
     return wanted
 
 
@@ -82,6 +85,7 @@ class _Reader:
     def __init__(self, path, commands, lines):
         self.path, self.commands, self.lines = path, commands, lines
         self.mistakes: list[tuple[int, str]] = []
+        self.of_the_world = True
 
     def read(self, document) -> list[Wanted]:
         """The jobs that are right."""
@@ -138,9 +142,11 @@ class _Reader:
                 check_readable(scene)
             compare.load_tables(arguments.techniques)
             return Wanted(job, arguments)
-        except (argparse.ArgumentError, Misuse, SceneError, TableError) as error:
+        except Misuse as error:
             self._complain(where, str(error))
-            return None
+        except (SceneError, TableError) as error:
+            self._complain(where, str(error), of_the_world=True)
+        return None
 
     def _scenes(self, number, job) -> tuple[Path, ...]:
         where = ("job", number, "scenes" if "scenes" in job else "scene")
@@ -206,8 +212,9 @@ class _Reader:
             hint = "give it to `ltsh run` on the command line"
         self._complain(where, f"{what} {key!r} is unknown here; {hint}")
 
-    def _complain(self, where, text) -> None:
+    def _complain(self, where, text, of_the_world=False) -> None:
         line = self._line(where)
+        self.of_the_world &= of_the_world
         self.mistakes.append((line, f"{self.path}, line {line}: {' '.join(text.split())}"))
 
     def _line(self, where) -> int:

@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 
 from . import bake
-from .imaging import write_json
+from .imaging import write_json, write_overview
 from .task_records import FOLDER, FORMAT, Records
 from .tasks import Task
 
@@ -26,7 +26,8 @@ class Merged:
 
 
 def merge(output: Path, progress=None) -> Merged:
-    """Assemble report.json and timing.json of the job in the folder `output`, and the .blend of a bake with `apply`.
+    """Assemble report.json and timing.json of the job in the folder `output`; of comparisons of several pictures also
+    report.html, and of a bake with `apply` the .blend.
 
     A report from which something is missing says so under "missing". Raises OSError, and ValueError where there is
     no job in the folder or nothing of it is done.
@@ -56,6 +57,8 @@ def merge(output: Path, progress=None) -> Merged:
         report = {**report, "missing": list(missing)}
     write_json(output / "report.json", report)
     write_json(output / "timing.json", {"seconds": seconds})
+    if job["command"] == "compare" and "reports" in report:
+        write_overview(output, "report.html", report)
     return Merged(report, seconds, missing, tuple(problems), job["command"], job["single"])
 
 

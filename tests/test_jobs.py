@@ -154,6 +154,16 @@ def test_shards_merged_are_the_single_run_byte_for_byte(capsys, child, room, tmp
     assert len(timing) == 8 and all(seconds["total"] > 0.0 for seconds in timing.values())
 
 
+def test_the_page_of_many_comparisons_links_those_of_each(capsys, child, room, tmp_path):
+    out = tmp_path / "out"
+    name = "{camera}/p {frame:03d}"
+    assert run(capsys, "compare", room, "-o", out, "--frames", "1-2", "--camera", "<A>", "--name", name, *SMALL)[0] == 0
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert 'href="_A_/p%20001.html"' in page and "&lt;A&gt;" in page and "2 comparisons" in page
+    picture = (out / "_A_" / "p 001.html").read_text(encoding="utf-8")
+    assert 'src="p%20001.png"' in picture and 'href="../report.json"' in picture
+
+
 def test_merging_names_what_is_missing(capsys, child, room, tmp_path):
     out = tmp_path / "out"
     code, _, stderr = run(capsys, "merge", tmp_path)

@@ -29,8 +29,9 @@ def answer(job: dict, progress) -> dict:
     extraction.open_scene(Path(job["scene"]), [])
     scene, facts = bpy.context.scene, []
     view_layer = render_settings.choose_view_layer(scene, [])
+    own = scene.frame_current
     for frame in job["frames"]:
-        cameras.go_to_frame(scene, frame)
+        cameras.go_to_frame(scene, own if frame is None else frame)
         chosen = [] if job["objects"] is None else texel_bake.chosen_objects(scene, view_layer, job["objects"])
         name = scene.camera.name if scene.camera is not None else None
         facts.append({"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]})

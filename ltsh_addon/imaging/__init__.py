@@ -16,7 +16,7 @@ from .metrics import (
     unbiased_relative_error,
 )
 from .png import write_png
-from .report import write_html, write_json
+from .report import write_html, write_json, write_overview
 from .sheet import Tile, comparison_sheet
 from .tone import exposure_factor, to_srgb8
 
@@ -38,5 +38,6 @@ __all__ = [
     "write_html",
     "write_json",
     "write_layers",
+    "write_overview",
     "write_png",
 ]

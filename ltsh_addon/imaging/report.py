@@ -77,12 +77,47 @@ def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, re
         _warnings(report["warnings"]),
         f'<p>All layers: <a href="{layers}">{layers}</a>. All figures: <a href="{figures}">report.json</a>.</p>',
     ]
+    write_bytes(os.path.join(folder, page), _page(f"{report['scene']}: comparison", body))
+
+
+def write_overview(folder: str | os.PathLike, page: str, report: Mapping) -> None:
+    """Write the page of many comparisons: a line for each, with the errors of one pass and a link to its own page."""
+    pictures, rows = report["reports"], []
+    techniques = list(dict.fromkeys(name for picture in pictures for name in _shown(picture)[1]["techniques"]))
+    for picture in pictures:
+        link = next((file for file in picture["files"] if file.endswith(".html")), "")
+        figures = _shown(picture)[1]
+        cells = [figures.get("noise")] + [
+            figures["techniques"].get(name, {}).get("against_cycles", {}).get("unbiased_relative_error")
+            for name in techniques
+        ]
+        name = f'<a href="{_link(page, link)}">{_text(picture["name"])}</a>'
+        texts = [name, _text(picture["camera"]), str(picture["frame"]), *map(_percent, cells)]
+        rows.append(f"<tr>{''.join(f'<td>{text}</td>' for text in texts)}</tr>")
+    heads = ["picture", "camera", "frame", "noise of Cycles", *techniques]
+    problems = [*report["problems"], *(f"{name} is missing" for name in report.get("missing", ()))]
+    body = [
+        f"<h1>{len(pictures)} comparisons</h1>",
+        f'<p class="facts">{_text(_shown(pictures[0])[0]) if pictures else "no"} radiance, error against Cycles</p>',
+        *([f"<ul>{''.join(f'<li>{_text(problem)}</li>' for problem in problems)}</ul>"] if problems else []),
+        f"<table><tr>{''.join(f'<th>{_text(head)}</th>' for head in heads)}</tr>{''.join(rows)}</table>",
+        '<p>All figures: <a href="report.json">report.json</a>.</p>',
+    ]
+    write_bytes(os.path.join(folder, page), _page(f"{len(pictures)} comparisons", body))
+
+
+def _shown(picture: Mapping) -> tuple[str, Mapping]:
+    """Name and figures of the pass that is shown of a picture: specular where there is one."""
+    name = "specular" if "specular" in picture["passes"] else next(iter(picture["passes"]))
+    return name, picture["passes"][name]
+
+
+def _page(title: str, body: list[str]) -> bytes:
     text = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>{_text(report['scene'])}: comparison</title><style>{_STYLE}</style></head>"
-        f"<body>{''.join(body)}</body></html>\n"
+        f"<title>{_text(title)}</title><style>{_STYLE}</style></head><body>{''.join(body)}</body></html>\n"
     )
-    write_bytes(os.path.join(folder, page), text.encode())
+    return text.encode()
 
 
 def _link(page: str, name: str) -> str:

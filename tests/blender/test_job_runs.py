@@ -1,0 +1,195 @@
+"""Jobs with real children: one Blender for many frames, shards, several cameras, bakes; bytes are what is compared."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import pytest
+import scene_parts
+
+from ltsh_addon import batch
+from ltsh_addon.bake import BakeOptions
+from ltsh_addon.blender import blender_process, child, scene_facts
+from ltsh_addon.compare import Options, make_picture
+from ltsh_addon.merge import merge
+from ltsh_addon.tasks import Job, tasks_of
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A light that moves from frame 1 to 5, a plane with a texture, one that cannot be baked, two cameras."""
+    scene = scene_parts.empty_scene(16, 12)
+    material, node = scene_parts.principled("Wave", Roughness=0.4)
+    texture = material.node_tree.nodes.new("ShaderNodeTexWave")
+    material.node_tree.links.new(texture.outputs["Color"], node.inputs["Base Color"])
+    scene_parts.add_plane(material, name="Floor")
+    scene_parts.add_plane(scene_parts.principled("Metal", Metallic=1.0)[0], size=1.0, location=(0, 0, 0.3), name="Slab")
+    scene_parts.add_mesh("Bare", [(0, 0, 1), (0.2, 0, 1), (0, 0.2, 1)], [(0, 1, 2)])
+    scene_parts.add_area_light("Key")
+    light = bpy.data.objects["Key"]
+    light.keyframe_insert("location", frame=1)
+    light.location.x += 1.0
+    light.keyframe_insert("location", frame=5)
+    scene_parts.add_camera(name="Side")
+    scene_parts.add_top_camera()
+    scene.frame_current = 3
+    path = tmp_path / "room.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+def contents(folder):
+    """Bytes by name of all files below `folder` but for times."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def run_python(*arguments):
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+
+
+def job(room, output, **changes):
+    options = Options(room, output, techniques=("ltsh4",), cycles_samples=4)
+    return Job("compare", options, **{"scenes": (room,), **changes})
+
+
+def test_one_blender_for_all_frames_gives_the_bytes_of_one_for_each(room, tmp_path, monkeypatch):
+    starts = []
+    command = blender_process.child_command
+    monkeypatch.setattr(blender_process, "child_command", lambda path: starts.append(path) or command(path))
+    wanted = job(room, tmp_path / "kept", frames=(1, 3, 5), cameras=("Side", "Camera"))
+    assert batch.run_tasks(wanted).problems == () and len(starts) == 1
+    for task in tasks_of(wanted)[1::3]:
+        made = make_picture(task.options(job(room, tmp_path / "fresh", frames=(1, 3))), True)
+        for name in made.files:
+            assert (tmp_path / "fresh" / name).read_bytes() == (tmp_path / "kept" / name).read_bytes(), name
+    assert len(starts) == 3
+    frames = [(tmp_path / "kept" / f"compare_Side_000{frame}.exr").read_bytes() for frame in (1, 3, 5)]
+    assert len(set(frames)) == 3
+
+
+def test_after_an_error_the_next_task_gets_a_new_blender(room, tmp_path):
+    bad = tmp_path / "bad.blend"
+    bad.write_bytes(b"BLENDER no more\n" * 9)
+    wanted = job(room, tmp_path / "out", scenes=(bad, room))
+    (problem,) = batch.run_tasks(wanted).problems
+    assert "bad.blend" in problem and "cannot open it" in problem
+    merged = merge(tmp_path / "out")
+    assert merged.problems == (problem,) and [report["name"] for report in merged.report["reports"]] == ["compare_room"]
+
+
+def test_a_killed_blender_is_one_failed_task(room, tmp_path):
+    """As when the system is out of memory."""
+    done, killed = [], []
+
+    def progress(stage, fraction):
+        if stage == "samples" and len(done) == 1 and not killed:
+            (process,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+            killed.append(int(process))
+            os.kill(int(process), 9)
+
+    def tell(state):
+        if state.seconds is not None:
+            done.append(state.problem)
+
+    wanted = job(room, tmp_path / "out", frames=(1, 2, 3))
+    (problem,) = batch.run_tasks(wanted, progress=progress, tell=tell).problems
+    assert "compare_0002: Blender ended with code -9" in problem and done == [None, problem, None]
+    assert batch.run_tasks(wanted, existing=batch.RESUME).kept == 2 and merge(tmp_path / "out").problems == ()
+
+
+def test_facts_are_those_of_the_frame_and_of_the_file(room):
+    facts = scene_facts.ask(room, (1, None), "all")
+    assert [(fact["frame"], fact["camera"]) for fact in facts] == [(1, "Camera"), (3, "Camera")]
+    assert all(sorted(fact["objects"]) == ["Bare", "Floor", "Slab"] for fact in facts)
+    assert scene_facts.ask(room, (None,), None)[0]["objects"] == []
+    with pytest.raises(child.SceneError, match="object 'Roof' is not in scene"):
+        scene_facts.ask(room, (None,), ("Roof",))
+
+
+def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
+    """Two frames of three objects, of which one cannot be baked."""
+
+    def bake(output, **shard):
+        options = BakeOptions(room, output, width=64, height=64, margin=2, techniques=("ltsh4",), cycles_samples=2)
+        return batch.run_tasks(Job("bake", options, (room,), frames=(1, 5)), **shard)
+
+    assert len(bake(tmp_path / "one").problems) == 2
+    merge(tmp_path / "one")
+    problems = [bake(tmp_path / "four", shard=(number, 4)).problems for number in (4, 2, 3, 1)]
+    assert len(sum(problems, ())) == 2
+    merged = merge(tmp_path / "four")
+    assert contents(tmp_path / "four") == contents(tmp_path / "one")
+    assert merged.missing == () and "'Bare' has no UV map" in merged.problems[0]
+    names = {path.name for path in (tmp_path / "one").glob("*.exr")}
+    assert names == {f"{name}_000{frame}.exr" for name in ("Floor", "Slab") for frame in (1, 5)}
+
+
+def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
+    def bake(output, **shard):
+        options = BakeOptions(room, output, objects=("Slab", "Floor"), width=64, height=64, margin=2, apply=True)
+        return batch.run_tasks(Job("bake", options, (room,)), **shard)
+
+    for number in (1, 2):
+        assert bake(tmp_path / "out", shard=(number, 2)).problems == ()
+    report = merge(tmp_path / "out").report
+    assert report["applied"] == "room_baked.blend" and [item["name"] for item in report["objects"]] == ["Slab", "Floor"]
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "room_baked.blend"))
+    for name in ("Floor", "Slab"):
+        assert bpy.data.objects[name].material_slots[0].material.name.endswith(f"(baked {name})")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory of processes as Linux tells it")
+def test_memory_does_not_grow_with_the_frames(room, tmp_path):
+    """Of both processes, from the sixth frame on; a leak of a picture per frame would be 1 MiB each."""
+    sizes = []
+
+    def tell(state):
+        if state.seconds is not None:
+            (process,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+            pages = [int(Path(f"/proc/{name}/statm").read_text().split()[1]) for name in (process, "self")]
+            sizes.append([count * os.sysconf("SC_PAGE_SIZE") / 2**20 for count in pages])
+
+    options = Options(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), width=128, height=96)
+    batch.run_tasks(Job("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
+    for column in zip(*sizes, strict=True):
+        assert max(column[15:]) - max(column[5:15]) < 5.0, column
+
+
+def test_json_is_alone_on_stdout_whatever_blender_prints():
+    code = (
+        "import os, sys\nfrom ltsh_addon.blender import standard_output\n"
+        "print('before', flush=True)\nstandard_output.reserve()\n"
+        "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
+    )
+    done = run_python("-c", code)
+    assert done.stdout == "before\n{}\n" and done.stderr == "from C\nat the end\n"
+
+
+def test_the_command_in_blender_answers_with_one_document(room, tmp_path):
+    """As Blender calls it, with the file open: the same document as with pip's bpy."""
+    code = f"""
+import sys, bpy
+bpy.ops.wm.open_mainfile(filepath={str(room)!r})
+handlers = []
+bpy.utils.register_cli_command = lambda name, run: handlers.append(run) or run
+bpy.utils.unregister_cli_command = lambda handle: None
+import ltsh_addon, os
+ltsh_addon.register()
+code = handlers[0](["shade", "-o", {str(tmp_path / "a")!r}, "--techniques", "ltc", "--json", "--quiet"])
+os.write(1, b"Blender quit\\n")
+sys.stdout.flush()
+os._exit(code)
+"""
+    done = run_python("-c", code)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout[done.stdout.index("{\n") :])
+    other = run_python("-m", "ltsh_addon", "shade", room, "-o", tmp_path / "b", "--techniques", "ltc", "--json", "--quiet")
+    assert found == json.loads(other.stdout) and "Blender quit" in done.stderr
+    assert (tmp_path / "a" / "shade.exr").read_bytes() == (tmp_path / "b" / "shade.exr").read_bytes()

@@ -190,6 +190,7 @@ os._exit(code)
     done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout[done.stdout.index("{\n") :])
-    other = run_python("-m", "ltsh_addon", "shade", room, "-o", tmp_path / "b", "--techniques", "ltc", "--json", "--quiet")
+    arguments = ("shade", room, "-o", tmp_path / "b", "--techniques", "ltc", "--json", "--quiet")
+    other = run_python("-m", "ltsh_addon", *arguments)
     assert found == json.loads(other.stdout) and "Blender quit" in done.stderr
     assert (tmp_path / "a" / "shade.exr").read_bytes() == (tmp_path / "b" / "shade.exr").read_bytes()

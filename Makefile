@@ -28,7 +28,17 @@ help:
 demo:
 	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon demo -o out/demo $(DEMO_OPTIONS)
 
-test: lint test-3.13 test-3.11
+# The tests of one version leave half of two cores idle, so both versions run at once. The output of the second is kept
+# and shown when the first has ended.
+test: lint
+	@mkdir -p build; \
+	$(MAKE) --no-print-directory test-3.11 >build/test-3.11.log 2>&1 & second=$$!; \
+	trap 'kill $$second 2>/dev/null' EXIT; \
+	status=0; $(MAKE) --no-print-directory test-3.13 || status=$$?; \
+	echo 'make: waiting for Python 3.11' >&2; \
+	wait $$second || status=$$?; \
+	cat build/test-3.11.log; \
+	exit $$status
 
 lint:
 	@python=$$($(SETUP) python newest) && "$$python" -m ruff check .

@@ -114,6 +114,7 @@ def _read(ob, mesh, matrix, uv_name):
         normals=world_normals.reshape(count, 3, 3),
         uv=uv,
         material=np.minimum(_get(mesh.loop_triangles, "material_index", count), slots - 1),
+        vertices=vertices.reshape(count, 3),
     )
     a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
     if not np.any((b - a)[:, 0] * (c - a)[:, 1] != (b - a)[:, 1] * (c - a)[:, 0]):

@@ -28,6 +28,7 @@ class TexelMesh:
     normals: np.ndarray  # (T, 3, 3) unit, as shaded, custom normals included
     uv: np.ndarray  # (T, 3, 2)
     material: np.ndarray  # (T,) number of the material
+    vertices: np.ndarray  # (T, 3) numbers in the mesh
 
     def save(self, path) -> None:
         """Write an .npz."""

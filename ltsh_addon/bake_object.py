@@ -42,7 +42,10 @@ class ObjectBaker:
 
         self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
         self.mesh = texel_samples.TexelMesh.load(folder / "mesh.npz")
-        self.materials = [texel_samples.BakeMaterial.of(material) for material in record["materials"]]
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [
+            texel_samples.BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]
+        ]
         self.view = texel_samples.BakeView(**manifest["view"])
         self.manifest = manifest
         self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)

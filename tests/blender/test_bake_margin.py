@@ -105,7 +105,7 @@ def test_margins_agree_with_blenders_own(tmp_path, kind, share):
     ob.data.materials.clear()
     ob.data.materials.append(position_material())
     plain, wide = blender_bake(ob, 0), blender_bake(ob, MARGIN)
-    mesh, _ = texel_bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+    mesh, _, _ = texel_bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
 
     def colors(texels):
         return plain.reshape(-1, 3)[texels.index]

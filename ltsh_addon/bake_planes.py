@@ -13,7 +13,7 @@ from .imaging.margin import nearest_covered
 # Texels that are in memory while the file is written.
 WRITTEN_TEXELS = 1 << 18
 COVERAGE = "coverage.hit.V"
-_OWNER = "owner"
+_OWNER = "owner"  # 1 + the number of the island, 0 where nothing is covered
 
 
 class Planes:
@@ -23,7 +23,8 @@ class Planes:
         """`seams` (UvSeams): margins show the adjacent faces; None: the nearest texel."""
         folder.mkdir()
         self.names, self.shape, self._seams = names, (height, width), seams
-        self.coverage = np.zeros((height, width), dtype=bool)
+        # A bit per texel, for all that is in memory of the whole image.
+        self._covered = np.zeros((height, -(-width // 8)), dtype=np.uint8)
         files = [*names, _OWNER] if seams is not None else names
         self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(files)}
         self._files = {name: path.open("w+b") for name, path in self._paths.items()}
@@ -39,12 +40,18 @@ class Planes:
     def put(self, first: int, count: int, texels, values) -> None:
         """Rows from `first`: `values` by channel at the `texels` (Texels)."""
         width = self.shape[1]
-        self.coverage[first : first + count].reshape(-1)[texels.index] = True
+        covered = np.zeros((count, width), dtype=bool)
+        covered.reshape(-1)[texels.index] = True
+        self._covered[first : first + count] = np.packbits(covered, axis=1)
         for name, file in self._files.items():
             rows = np.zeros(count * width, np.int32 if name == _OWNER else np.float32)
-            rows[texels.index] = self._seams.islands[texels.triangle] if name == _OWNER else values[name]
+            rows[texels.index] = 1 + self._seams.islands[texels.triangle] if name == _OWNER else values[name]
             file.seek(4 * first * width)
             file.write(rows)
+
+    def coverage(self, first: int, last: int) -> np.ndarray:
+        """Mask (last - first, W) of the texels that were put."""
+        return np.unpackbits(self._covered[first:last], axis=1, count=self.shape[1]).view(bool)
 
     def _rows(self, name, first, last):
         file, width = self._files[name], self.shape[1]
@@ -83,13 +90,13 @@ class Planes:
         """Rows from `bottom` to `top` of all channels with the margin, row 0 on top."""
         height, width = self.shape
         low, high = max(bottom - margin, 0), min(top + margin, height)
-        target, source = nearest_covered(self.coverage[low:high], margin)
+        target, source = nearest_covered(self.coverage(low, high), margin)
         inside = (target >= (bottom - low) * width) & (target < (top - low) * width)
         target, source = target[inside] - (bottom - low) * width, source[inside]
         beyond = None
         if self._seams is not None and len(target):
             beyond = self._beyond(target + bottom * width, source + low * width)
-        block = {COVERAGE: self.coverage[bottom:top][::-1].astype(np.float32)}
+        block = {COVERAGE: self.coverage(bottom, top)[::-1].astype(np.float32)}
         for name in self.names:
             around = self._rows(name, low, high)
             plane = around[bottom - low : top - low].copy()
@@ -116,7 +123,7 @@ class Planes:
             weight = np.abs(1 - x - share[:, 0]) * np.abs(1 - y - share[:, 1])
             weights[:, number] = np.where(within, weight, 0.0)
         # Texels that no face covers, or one beyond another cut, show something else.
-        weights[~self.coverage.reshape(-1)[index] | (self._at(_OWNER, index, np.int32) != island[:, None])] = 0.0
+        weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
         total = weights.sum(axis=1)
         found = np.flatnonzero(total > 1e-3)
         return which[found], index[found], weights[found] / total[found, None]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from .shader_graph import live_link
+from .shader_graph import live_link, origin
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
 CONSTANT_NODES = frozenset(
@@ -96,30 +95,8 @@ def _note_values(tree, socket, groups, found: Emission, seen: set) -> None:
             _note_values(owner, entry, path, found, seen)
 
 
-def _sources(tree, socket, groups) -> Iterator[tuple]:
-    """(tree, node, output, groups) of what feeds the input `socket`, past reroutes, muted nodes and groups."""
+def _sources(tree, socket, groups) -> list[tuple]:
+    """(tree, node, output, groups) of what feeds the input `socket`, as `origin` finds it; nothing, or one."""
     link = live_link(socket)
-    if link is None:
-        return
-    node, output = link.from_node, link.from_socket
-    if node.mute:
-        for passed in node.internal_links:
-            if passed.to_socket == output:
-                yield from _sources(tree, passed.from_socket, groups)
-    elif node.bl_idname == "NodeReroute":
-        yield from _sources(tree, node.inputs[0], groups)
-    elif node.bl_idname == "ShaderNodeGroup":
-        if node.node_tree is not None:
-            for inner in node.node_tree.nodes:
-                if inner.bl_idname == "NodeGroupOutput" and inner.is_active_output:
-                    for entry in inner.inputs:
-                        if entry.identifier == output.identifier:
-                            yield from _sources(node.node_tree, entry, (*groups, (tree, node)))
-    elif node.bl_idname == "NodeGroupInput":
-        if groups:
-            outer, group = groups[-1]
-            for entry in group.inputs:
-                if entry.identifier == output.identifier:
-                    yield from _sources(outer, entry, groups[:-1])
-    else:
-        yield tree, node, output, groups
+    found = origin(tree, link.from_socket, groups) if link is not None else None
+    return [] if found is None else [found]

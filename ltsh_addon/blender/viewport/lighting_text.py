@@ -74,7 +74,7 @@ diffuse_sum diffuse_empty()
 
 diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 {
-    ltsh_edge edge = ltsh_edge_from(start, start + end);
+    ltsh_edge edge = ltsh_edge_between(start, end);
     sum.total += edge.phi * edge.normal;
     return sum;
 }

@@ -13,7 +13,7 @@ specular_sum specular_empty()
 
 specular_sum specular_with_edge(specular_sum sum, vec3 start, vec3 end)
 {
-    ltsh_edge edge = ltsh_edge_from(start, start + end);
+    ltsh_edge edge = ltsh_edge_between(start, end);
     sum.values[0] += edge.normal.z * edge.phi;
     return sum;
 }
@@ -41,7 +41,7 @@ specular_sum specular_empty()
 
 specular_sum specular_with_edge(specular_sum moments, vec3 start, vec3 end)
 {
-    ltsh_edge edge = ltsh_edge_from(start, start + end);
+    ltsh_edge edge = ltsh_edge_between(start, end);
     vec2 turn = vec2(edge.total.z + ltsh_one_plus_cosine(edge.total), edge.normal.z);
     turn = vec2(moments.turn.x * turn.x - moments.turn.y * turn.y, moments.turn.x * turn.y + moments.turn.y * turn.x);
     /* Only the argument matters: keep the magnitude near one. */

@@ -51,13 +51,15 @@ def _arc_node_lines():
 
 
 _EDGES = """\
-/* The edge from a unit vector to the one that gives `total` together with it. */
-LTSH_FUNCTION ltsh_edge ltsh_edge_from(ltsh_vec3 start, ltsh_vec3 total)
+/* The edge between two unit vectors. */
+LTSH_FUNCTION ltsh_edge ltsh_edge_between(ltsh_vec3 start, ltsh_vec3 end)
 {
     ltsh_edge edge;
     edge.start = start;
-    edge.total = total;
-    edge.normal = ltsh_cross(edge.start, edge.total);
+    edge.total = ltsh_add_scaled(start, 1.0f, end);
+    /* start x end from the difference of ends that are close, which is exact, or the sum of ends nearly opposite. */
+    float sign = ltsh_dot(edge.total, edge.total) > 2.0f ? -1.0f : 1.0f;
+    edge.normal = ltsh_cross(start, ltsh_add_scaled(end, sign, start));
     float shifted = ltsh_larger(ltsh_one_plus_cosine(edge.total), @TINY_SHIFT@);
     float kappa = LTSH_SQRT(ltsh_clamped(0.5f * shifted, 1.0f));
     float psi = @PSI_HIGHEST@;
@@ -70,7 +72,7 @@ LTSH_FUNCTION ltsh_edge ltsh_edge_from(ltsh_vec3 start, ltsh_vec3 total)
 
 LTSH_FUNCTION ltsh_edge ltsh_make_edge(ltsh_polygon unit, int i)
 {
-    return ltsh_edge_from(unit.corners[i], ltsh_edge_sum(unit, i));
+    return ltsh_edge_between(unit.corners[i], unit.corners[i + 1 < unit.count ? i + 1 : 0]);
 }
 
 /* Signed integral of max(0, z) over a spherical polygon in z >= 0 (Lambert 1760). */

@@ -12,10 +12,11 @@ from ..shading import TableError
 from . import engine_snapshot
 from .child import SceneError
 from .engine_final import FinalJob, blender_pixels, final_picture, pass_names
+from .engine_view import EngineView
 from .view_properties import ENGINE, TECHNIQUE_LABELS
+from .viewport import view_text
 from .world_look import world_radiance
 
-CHANNELS = {"Combined": ("RGBA", "COLOR")}
 # Blender redraws its status bar as often as it is told something.
 REPORT_SECONDS = 0.1
 _logger = logging.getLogger(__name__)
@@ -32,7 +33,26 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     # With the GPU's context Blender's window would stand still during a final render.
     bl_use_gpu_context = False
 
+    # -- viewport -----------------------------------------------------------------------------------------------------
+
+    def view_update(self, context, depsgraph):
+        """Take over what has changed in the scene."""
+        self._engine_view().update(context, depsgraph)
+
+    def view_draw(self, context, depsgraph):
+        """Draw the view."""
+        self._engine_view().draw(context, depsgraph)
+
+    def _engine_view(self) -> EngineView:
+        if self._view is None:
+            self._view = EngineView()
+        return self._view
+
     # -- final render -------------------------------------------------------------------------------------------------
+
+    def __init__(self, *arguments, **keywords):
+        super().__init__(*arguments, **keywords)
+        self._view = None
 
     def update_render_passes(self, scene=None, renderlayer=None):
         """Tell Blender the passes, which the compositor then has as sockets."""
@@ -113,9 +133,11 @@ def register() -> None:
     """Add the engine and what its final renders need."""
     bpy.utils.register_class(LTSH_RenderEngine)
     engine_snapshot.register()
+    view_text.register()
 
 
 def unregister() -> None:
     """Remove what `register` added."""
+    view_text.unregister()
     engine_snapshot.unregister()
     bpy.utils.unregister_class(LTSH_RenderEngine)

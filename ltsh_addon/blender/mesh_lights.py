@@ -68,7 +68,8 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
                 warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
                 found[key] = None
         if found[key] is not None:
-            placement = _placement(ob, np.array(instance.matrix_world, dtype=np.float64), found[key], depsgraph if copies else None)
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            placement = _placement(ob, matrix, found[key], depsgraph if copies else None)
             if placement is not None:
                 found[key].placements.append(placement)
                 instancer = surface_instancer(instance)

@@ -44,6 +44,7 @@ class Look:
     normal: Value | None = None  # of a tangent space normal map
     normal_strength: float = 1.0
     scattered: bool = False  # Multiscatter GGX
+    corrected: bool = True  # Cycles bends specular normals toward the eye
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
 
@@ -169,7 +170,8 @@ class _Reader:
                 self.note(f"{layer} is not shown")
         normal, strength = self._normal(source, values)
         scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
-        return Look(kind, values, normal, strength, scattered, emission, tuple(self.notes))
+        corrected = self.material.cycles.use_bump_map_correction
+        return Look(kind, values, normal, strength, scattered, corrected, emission, tuple(self.notes))
 
     def _value(self, source: Source, name: str, socket_name: str) -> Value:
         value = value_at(source.tree, source.node.inputs[socket_name], source.groups)

@@ -16,7 +16,9 @@ class MeshBatches:
     triangles: int
     indices: dict[int, gpu.types.GPUIndexBuf]
     corners: gpu.types.GPUVertBuf | None
+    corner_count: int
     uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
+    middle: np.ndarray  # (3,) of the bounding box
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
 
@@ -36,8 +38,6 @@ class MeshBatches:
                 values = np.zeros((self.corner_count, 2), np.float32)
             self._uv_buffers[uv_map] = _vertex_buffer({"uv": values})
         return self._uv_buffers[uv_map]
-
-    corner_count: int = 0
 
 
 def _vertex_buffer(attributes: dict[str, np.ndarray]) -> gpu.types.GPUVertBuf:
@@ -78,7 +78,8 @@ def mesh_batches(ob) -> MeshBatches | None:
         for slot in used
     }
     buffer = _vertex_buffer({"position": place, "normal": normal})
-    return MeshBatches(used, count, indices, buffer, uv, corner_count=corners)
+    middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
+    return MeshBatches(used, count, indices, buffer, corners, uv, middle)
 
 
 def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:

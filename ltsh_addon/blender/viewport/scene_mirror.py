@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...scene import AreaLight
 from ..inventory import SURFACE_TYPES
@@ -31,14 +32,11 @@ class ShownInstance:
     """One placement of a mesh."""
 
     mesh: MeshBatches
-    matrix: np.ndarray  # (4, 4)
+    model: Matrix
     looks: tuple[ShownLook, ...]  # one for each slot of the mesh
     receiver: int
-
-    @property
-    def side(self) -> float:
-        """-1 where the transform mirrors."""
-        return -1.0 if np.linalg.det(self.matrix[:3, :3]) < 0.0 else 1.0
+    side: float  # -1 where the transform mirrors
+    center: np.ndarray  # (4,) of the bounding box in the world
 
 
 @dataclass
@@ -46,15 +44,17 @@ class Changes:
     """What an update of the depsgraph touches."""
 
     everything: bool = False
-    geometry: set[int] = None  # session uids of original objects and their data
-    materials: set[str] = None  # full names
+    geometry: set[int] = field(default_factory=set)  # session uids of original objects and their data
+    materials: set[str] = field(default_factory=set)  # full names
     images: bool = False
+    instances: bool = False
     lights: bool = False
     world: bool = False
 
-    def __post_init__(self):
-        self.geometry = set() if self.geometry is None else self.geometry
-        self.materials = set() if self.materials is None else self.materials
+    @property
+    def surfaces(self) -> bool:
+        """Is anything of the G-buffer different?"""
+        return self.everything or self.instances or self.images or bool(self.geometry or self.materials)
 
 
 def changes_of(depsgraph, first: bool) -> Changes:
@@ -63,13 +63,9 @@ def changes_of(depsgraph, first: bool) -> Changes:
     for update in depsgraph.updates:
         block = update.id.original
         if isinstance(block, bpy.types.Object):
-            if block.type == "LIGHT":
-                changes.lights = True
-            elif update.is_updated_geometry:
-                changes.geometry.add(block.session_uid)
-            # Mesh lights move with their objects.
-            changes.lights |= update.is_updated_transform
-        elif isinstance(block, bpy.types.Light):
+            _note_object(changes, block, update)
+        elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
+            # Materials and worlds are named beside their node trees.
             changes.lights = True
         elif isinstance(block, bpy.types.Material):
             changes.materials.add(block.name_full)
@@ -77,13 +73,22 @@ def changes_of(depsgraph, first: bool) -> Changes:
             changes.images = True
         elif isinstance(block, bpy.types.World):
             changes.world = True
-        elif isinstance(block, bpy.types.Collection):
-            changes.lights = True
-        elif isinstance(block, bpy.types.Scene):
-            changes.world = changes.lights = True
+        elif isinstance(block, bpy.types.Collection | bpy.types.Scene):
+            changes.instances = changes.lights = changes.world = True
         elif update.is_updated_geometry:
             changes.geometry.add(block.session_uid)
     return changes
+
+
+def _note_object(changes: Changes, block, update) -> None:
+    if block.type == "LIGHT":
+        changes.lights = True
+        return
+    # Objects may be mesh lights, or instance lights.
+    changes.lights |= update.is_updated_transform or update.is_updated_geometry
+    changes.instances = True
+    if update.is_updated_geometry:
+        changes.geometry.add(block.session_uid)
 
 
 class SceneMirror:
@@ -93,7 +98,7 @@ class SceneMirror:
         self.instances: list[ShownInstance] = []
         self.lights: tuple[AreaLight, ...] = ()
         self.background = np.zeros(3)
-        self.lights_version = 0
+        self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
         self._looks: dict[str, ShownLook] = {}
         self._light_notes: tuple[str, ...] = ()
@@ -115,10 +120,11 @@ class SceneMirror:
         changes = changes_of(depsgraph, not self._synced)
         self._drop_changed(changes)
         in_view = _visibility(depsgraph, space)
-        self._read_instances(depsgraph, changes, in_view)
+        if changes.surfaces:
+            self._read_instances(depsgraph, changes, in_view)
+            self.surfaces_version += 1
         if changes.lights or changes.everything or changes.materials:
             self.lights, self._light_notes = view_lights(depsgraph, in_view)
-            self.lights_version += 1
         if changes.world or changes.everything:
             self._read_world(depsgraph.scene)
         self._synced = True
@@ -157,7 +163,10 @@ class SceneMirror:
             parent = instance.parent.original.name_full if instance.is_instance and instance.parent else ""
             receiver = receivers.numbers.get(parent, receivers.numbers.get(ob.original.name_full, 0))
             shown = tuple(looks[material.name_full if material else ""] for material in materials)
-            instances.append(ShownInstance(mesh, np.array(instance.matrix_world, np.float64), shown, receiver))
+            model = instance.matrix_world.copy()
+            side = -1.0 if model.determinant() < 0.0 else 1.0
+            center = np.array(model) @ [*mesh.middle, 1.0]
+            instances.append(ShownInstance(mesh, model, shown, receiver, side, center))
         self.instances, self._meshes, self._looks = instances, meshes, looks
 
     def _read_world(self, scene) -> None:

@@ -16,7 +16,7 @@ from .surface_uniforms import DEFINES, LOOK_SIZE, albedo_table, blend_table, flo
 
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
-NORMALS = ("geometric_normal", "diffuse_normal", "smooth_normal")
+NORMALS = ("diffuse_normal", "smooth_normal")
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class SurfacePass:
         if any(_bends(look) for instance in instances for look in instance.looks):
             self._draw_into(NORMALS, instances, view, size)
             textures.update({name: self._textures[name] for name in NORMALS})
+            textures["geometric_normal"] = textures["smooth_normal"]
         return GBufferTextures(**textures)
 
     @property
@@ -101,19 +102,13 @@ class SurfacePass:
         shader.uniform_block("view", self._view_values)
         for name, table in self._tables.items():
             shader.uniform_sampler(name, table)
-        order = sorted(
-            ((look, instance, slot) for instance in instances
-             for slot, look in zip(instance.mesh.slots, instance.looks, strict=True)),
-            key=lambda item: id(item[0]),
-        )  # fmt: skip
-        bound = None
-        for look, instance, slot in order:
-            if look is not bound:
-                self._bind_look(shader, look)
-                bound = look
-            shader.uniform_float("model", Matrix(instance.matrix.tolist()))
+        # From near to far: what is hidden need not be computed.
+        for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
+            shader.uniform_float("model", instance.model)
             shader.uniform_float("receiver_and_side", (instance.receiver, instance.side))
-            instance.mesh.batch(slot, look.look.uv_map).draw(shader)
+            for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
+                self._bind_look(shader, look)
+                instance.mesh.batch(slot, look.look.uv_map).draw(shader)
 
     def _bind_look(self, shader, shown: ShownLook) -> None:
         if shown.textures is None:

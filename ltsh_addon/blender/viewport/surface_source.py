@@ -1,5 +1,7 @@
 """GLSL of the passes that draw surfaces into the G-buffer: what `lobe_samples` does for pixels, for one lobe.
 
+The smooth normal stands in for the geometric one: of both horizons Cycles mostly keeps to its own (`specular_horizon`).
+
 The uniform buffer `Look` is an array of vec4 (see `surface_uniforms`). Images are read by texelFetch, since Blender 4.5
 has no say in a texture's filter and extension.
 """
@@ -290,10 +292,14 @@ void main()
   vec3 diffuse_normal = smooth_normal;
   vec3 specular_normal = smooth_normal;
   float alpha2 = 0.0;
-  if (look.data[0].z > 0.5) {
+  int flags = int(look.data[0].z + 0.5);
+  if (flags % 2 == 1) {
     diffuse_normal = mapped_normal(smooth_normal, backfacing);
+    specular_normal = diffuse_normal;
+    alpha2 = flags >= 2 ? bump_alpha2(diffuse_normal, smooth_normal) : 0.0;
+  }
+  if (flags >= 2) {
     specular_normal = valid_specular_normal(diffuse_normal, true_normal, towards_eye);
-    alpha2 = bump_alpha2(diffuse_normal, smooth_normal);
   }
 """
 
@@ -318,7 +324,6 @@ FRAGMENT_OF_NORMALS = """
     diffuse_normal = -specular_normal;
     smooth_normal = -smooth_normal;
   }
-  out_geometric_normal = vec4(true_normal, 0.0);
   out_diffuse_normal = vec4(diffuse_normal, alpha2);
   out_smooth_normal = vec4(smooth_normal, 0.0);
 }

@@ -29,7 +29,8 @@ def uniform_buffer(values: np.ndarray) -> gpu.types.GPUUniformBuf:
 def look_values(look: Look) -> np.ndarray:
     """The uniform buffer (LOOK_SIZE, 4) of a look."""
     data = np.zeros((LOOK_SIZE, 4))
-    data[0] = LOBE_KINDS[look.kind], look.scattered, look.normal is not None, look.normal_strength
+    flags = (look.normal is not None) + 2 * look.corrected
+    data[0] = LOBE_KINDS[look.kind], look.scattered, flags, look.normal_strength
     data[1] = *look.emission, look.value("transmission").offset[0]
     data[2] = *look.value("tint").offset, look.value("specular_level").offset[0]
     for position, name in enumerate(IMAGE_SLOTS):

@@ -18,6 +18,8 @@ from .task_records import Records, contents_digest, options_digest
 
 BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
 SIZES = (64, 8192)
+# Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
+MARGIN_TYPES = ("extend", "adjacent")
 # Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
 NOTED_SHARE_OUTSIDE = 0.01
 
@@ -35,6 +37,7 @@ class BakeOptions:
     width: int = 1024
     height: int = 1024
     margin: int = 16  # texels
+    margin_type: str = "extend"  # one of MARGIN_TYPES
     conservative: bool = False  # also texels that a triangle touches without covering their center
     view: tuple[float, float, float] | str = "camera"  # a position in m, "camera" or "above"
     techniques: tuple[str, ...] = ("ltsh4",)
@@ -119,6 +122,8 @@ def _check(options: BakeOptions) -> None:
     for side in (options.width, options.height):
         if not SIZES[0] <= side <= SIZES[1]:
             raise ValueError(f"size is {options.width}x{options.height}, expected {SIZES[0]} to {SIZES[1]} each")
+    if options.margin_type not in MARGIN_TYPES:
+        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")

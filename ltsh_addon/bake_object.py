@@ -15,6 +15,7 @@ from . import compare, shading
 from .bake_errors import ErrorPictures, ErrorSums
 from .bake_planes import Planes
 from .scene import Cancelled, SurfaceSamples
+from .shading.workers import cores
 
 # Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
 BLOCK_TEXELS = 1 << 18
@@ -36,11 +37,14 @@ class ObjectBaker:
     """Bakes all tiles of one object, block of rows by block of rows from the top."""
 
     def __init__(self, options, tables, lights, manifest, record, folder):
-        from .blender import texel_samples, uv_raster
+        from .blender import texel_samples, uv_raster, uv_seams
 
         self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
         self.mesh = texel_samples.TexelMesh.load(folder / "mesh.npz")
-        self.materials = [texel_samples.BakeMaterial.of(material) for material in record["materials"]]
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [
+            texel_samples.BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]
+        ]
         self.view = texel_samples.BakeView(**manifest["view"])
         self.manifest = manifest
         self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
@@ -49,6 +53,7 @@ class ObjectBaker:
         if not options.cycles_samples:
             self.compared = ()
         self._sample, self._raster = texel_samples.texel_samples, uv_raster.UvTriangles
+        self._seams = uv_seams.UvSeams.of
 
     def bake(self, stem: str, records, files: list[str], seconds: dict, progress) -> dict:
         """Write the files of the object that are not finished according to `records` (bake.TileRecords), add all to
@@ -79,7 +84,7 @@ class ObjectBaker:
         options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
         path = options.output / file
         errors, written = ErrorSums(), [file]
-        with Planes(self.folder / f"planes_{tile}", self.channels(), options.width, options.height) as planes:
+        with self._planes(tile) as planes:
             record = self._shade(tile, planes, errors, progress)
             pictures = None
             if self.compared:
@@ -97,11 +102,18 @@ class ObjectBaker:
             planes.write(path, options.margin, self._metadata(tile), pictures, texture)
         return record, written
 
+    def _planes(self, tile) -> Planes:
+        options, seams = self.options, None
+        size = options.width, options.height
+        if options.margin_type == "adjacent" and options.margin > 0:
+            seams = self._seams(self.mesh.uv, self.mesh.vertices, *size, _place(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *size, seams)
+
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; how many texels there were."""
         options, covered, overlaps = self.options, 0, 0
-        rows, place = block_rows(options), ((tile - 1001) % 10, (tile - 1001) // 10)
-        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, place)
+        rows = block_rows(options)
+        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, _place(tile))
 
         def shaded(first):
             texels = triangles.texels(first, min(rows, options.height - first), options.conservative)
@@ -111,7 +123,7 @@ class ObjectBaker:
         for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
             covered += len(texels.index)
             overlaps += texels.overlaps
-            planes.put(first, min(rows, options.height - first), texels.index, values)
+            planes.put(first, min(rows, options.height - first), texels, values)
             self._sum_up(errors, values, halves)
             share = (number + 1) / len(firsts)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
@@ -120,7 +132,7 @@ class ObjectBaker:
 
     def _threads(self) -> int:
         """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
-        return 1 if shading.REFERENCE in self.tables.values() else compare.cores()
+        return 1 if shading.REFERENCE in self.tables.values() else cores()
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR but for the coverage."""
@@ -215,6 +227,11 @@ class ObjectBaker:
             "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
             "ltsh:version": compare.versions(self.manifest["blender_version"])["ltsh"],
         }
+
+
+def _place(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
 
 
 def _in_order(function, items, threads: int):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from . import argument_values as values
 from . import cli_options as options
-from .bake import BAKE_PASSES, SIZES, BakeOptions
+from .bake import BAKE_PASSES, MARGIN_TYPES, SIZES, BakeOptions
 from .cli_jobs import run_job
 from .tasks import Job
 
@@ -37,6 +37,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--size", type=_size, default=(1024, 1024), metavar="N", help="N or WxH in texels (default: 1024)"
     )
     parser.add_argument("--margin", type=_margin, default=16, metavar="PX", help="in texels (default: 16)")
+    parser.add_argument(
+        "--margin-type", choices=MARGIN_TYPES, default=BakeOptions.margin_type,
+        help="the margin repeats the nearest texel, or shows the adjacent face (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--conservative", action="store_true", help="bake every texel that a face touches")
     parser.add_argument(
         "--view", type=_view, default="camera", metavar="V",
@@ -81,6 +85,7 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
         width=width,
         height=height,
         margin=arguments.margin,
+        margin_type=arguments.margin_type,
         conservative=arguments.conservative,
         view=arguments.view,
         techniques=arguments.techniques,

@@ -173,6 +173,9 @@ class _Reader:
         if not isinstance(action, argparse._AppendAction):
             items = [",".join(str(self._path(key, item)) for item in items)]
         for item in map(str, items):
+            if action.choices is not None and item not in action.choices:
+                self._complain(where, f"{key} is {item!r}, expected {' or '.join(action.choices)}")
+                return []
             try:
                 if action.type is not None:
                     action.type(item)

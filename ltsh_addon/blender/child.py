@@ -33,6 +33,8 @@ class ExtractOptions:
     cycles_samples: int = 0
     frame: int | None = None
     camera: str | None = None
+    scene_name: str | None = None
+    view_layer: str | None = None
 
 
 @dataclass(frozen=True)

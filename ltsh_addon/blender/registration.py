@@ -1,14 +1,21 @@
-"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...`."""
+"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
 from __future__ import annotations
 
+import atexit
+import importlib
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import bpy
 
 from . import standard_output
 
-_handles = []
+# Modules of this package with register() and unregister(), in the order in which they need each other.
+PARTS = ("preferences", "view_properties", "engine")
+
+# Takes back what is registered, last first; one that fails does not keep the others from it.
+_registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
@@ -19,10 +26,21 @@ def register(command_line: Callable[..., int]) -> None:
             standard_output.reserve()
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
-    _handles.append(bpy.utils.register_cli_command("ltsh", run))
+    with ExitStack() as added:
+        added.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("ltsh", run))
+        for name in PARTS:
+            part = importlib.import_module(f".{name}", __package__)
+            part.register()
+            added.callback(part.unregister)
+        _registered.push(added.pop_all())
+    # Blender 4.5 hangs at exit when an engine is still registered.
+    atexit.register(unregister)
 
 
 def unregister() -> None:
     """Remove what `register` added."""
-    while _handles:
-        bpy.utils.unregister_cli_command(_handles.pop())
+    from . import availability
+
+    atexit.unregister(unregister)
+    availability.missing_libraries.cache_clear()
+    _registered.close()

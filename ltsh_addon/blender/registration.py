@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -9,14 +10,14 @@ from contextlib import ExitStack
 import bpy
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
-PARTS = ("preferences",)
+PARTS = ("preferences", "view_properties", "engine")
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
 _registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything or, where a part fails, nothing; `command_line` is `cli.main`. `unregister` removes it."""
+    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
 
     def run(arguments: list[str]) -> int:
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
@@ -28,11 +29,14 @@ def register(command_line: Callable[..., int]) -> None:
             part.register()
             added.callback(part.unregister)
         _registered.push(added.pop_all())
+    # Blender 4.5 hangs at exit when an engine is still registered.
+    atexit.register(unregister)
 
 
 def unregister() -> None:
     """Remove what `register` added."""
     from . import availability
 
+    atexit.unregister(unregister)
     availability.missing_libraries.cache_clear()
     _registered.close()

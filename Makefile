@@ -58,11 +58,13 @@ test-3.13 test-3.11: test-%:
 BLENDER ?= blender
 
 test-blender:
-	@packages=$$($(SETUP) blender "$(BLENDER)") && LTSH_TEST_PACKAGES=$$packages $(LIMIT) "$(BLENDER)" --background \
-		--factory-startup --disable-autoexec --python tests/run_in_blender.py -- $(or $(PYTEST_OPTIONS),tests/blender)
+	@python=$$($(SETUP) python newest) && packages=$$($(SETUP) blender "$(BLENDER)") && \
+	LTSH_TEST_PACKAGES=$$packages $(LIMIT) "$(BLENDER)" --background --factory-startup --disable-autoexec \
+		--python tests/run_in_blender.py -- $(or $(PYTEST_OPTIONS),tests/blender) && \
+	$(if $(PYTEST_OPTIONS),true,LTSH_BLENDER="$(BLENDER)" $(LIMIT) "$$python" -m pytest tests/installed)
 
 extension:
-	@python=$$($(SETUP) python newest) && "$$python" requirements/build_extension.py $(EXTENSION_OPTIONS)
+	@python=$$($(SETUP) python newest) && "$$python" -m requirements.build_extension $(EXTENSION_OPTIONS)
 
 bench:
 	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)

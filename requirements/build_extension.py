@@ -1,11 +1,12 @@
 """`make extension`: the extension's zips, one per platform, each with the wheels of OpenEXR that it needs.
 
-    python requirements/build_extension.py [--output build]
+    python -m requirements.build_extension [--output build]
 
 Runs in an environment of requirements/setup.sh, whose bpy brings Blender's own extension tool. That tool builds the
 plain zip from the tree as blender_manifest.toml says; its content is unpacked, wheels and platforms are added to the
-manifest, and the tool builds and validates the zips. Wheels are those of wheels.txt, by hash; they stay in
-OUTPUT/wheels, so that only the first run needs a network. The same tree and wheels give the same bytes.
+manifest, and the tool builds and validates the zips. Wheels are those of wheels.txt, by hash, with one flag set in
+those for Linux (symbolic_wheel.py); they stay in OUTPUT/wheels, so that only the first run needs a network. The same
+tree and wheels give the same bytes.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ import tempfile
 import tomllib
 import zipfile
 from pathlib import Path
+
+from .symbolic_wheel import write_symbolic_wheel
 
 ROOT = Path(__file__).resolve().parent.parent
 MANIFEST = "blender_manifest.toml"
@@ -104,9 +107,12 @@ def _stage(folder: Path, wheels: list[Path]) -> None:
         archive.extractall(folder)
     (folder / "wheels").mkdir()
     for wheel in wheels:
-        shutil.copy(wheel, folder / "wheels")
+        if "manylinux" in wheel.name:
+            write_symbolic_wheel(wheel, folder / "wheels")
+        else:
+            shutil.copy(wheel, folder / "wheels")
     manifest = folder / MANIFEST
-    names = [f"./wheels/{wheel.name}" for wheel in wheels]
+    names = [f"./wheels/{path.name}" for path in (folder / "wheels").iterdir()]
     manifest.write_text(with_wheels(manifest.read_text(encoding="utf-8"), names), encoding="utf-8")
 
 
@@ -188,7 +194,7 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     try:
         paths = build(options.output.resolve())
-    except (BuildError, OSError) as error:
+    except (BuildError, OSError, ValueError) as error:
         print(f"make extension: {error}", file=sys.stderr)
         return 1
     for path in paths:

@@ -203,6 +203,7 @@ make_blender_packages() {
             --implementation cp --python-version "$version" --target "$directory" --require-hashes \
             -r "$here/blender.txt" >&2 </dev/null ||
             fail "pip could not install requirements/blender.txt for Python $version; see its messages above"
+        "$python" "$here/symbolic_wheel.py" "$directory" || fail "$directory: OpenEXR could not be made fit for Blender"
         cp "$here/blender.txt" "$directory/ltsh-stamp"
     fi
     printf '%s\n' "$directory"

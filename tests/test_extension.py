@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from test_symbolic_wheel import fake_library, fake_wheel
 
 from requirements import build_extension
 from requirements.build_extension import PLATFORMS, PYTHONS, BuildError, run_tool, with_wheels
@@ -81,8 +82,7 @@ def stand_ins(tmp_path_factory):
     folder.mkdir()
     for python in PYTHONS:
         for tag in WHEEL_TAGS.values():
-            path = folder / f"openexr-1.0-cp{python}-cp{python}-{tag}.whl"
-            path.write_bytes(path.name.encode())
+            fake_wheel(folder / f"openexr-1.0-cp{python}-cp{python}-{tag}.whl", fake_library(29, int(python)))
     hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.iterdir()]
     pins.write_text("openexr==1.0 \\\n" + " \\\n".join(f"    --hash=sha256:{item}" for item in hashes) + "\n")
     with pytest.MonkeyPatch.context() as patch:
@@ -106,7 +106,8 @@ def test_each_platform_gets_a_zip_with_its_own_wheels(stand_ins, zips):
     names = [f"ltsh-{version}-{name.replace('-', '_')}.zip" for name in sorted(PLATFORMS)]
     assert [path.name for path in zips] == names
     for path, platform in zip(zips, sorted(PLATFORMS), strict=True):
-        own = [f"wheels/openexr-1.0-cp{python}-cp{python}-{WHEEL_TAGS[platform]}.whl" for python in PYTHONS]
+        build = "-1" if platform.startswith("linux") else ""
+        own = [f"wheels/openexr-1.0{build}-cp{python}-cp{python}-{WHEEL_TAGS[platform]}.whl" for python in PYTHONS]
         assert set(content(path)) == common | set(own) and len(content(path)) == len(common) + len(own)
         with zipfile.ZipFile(path) as archive:
             manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())

@@ -73,7 +73,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     output_folder: bpy.props.StringProperty(
         name="Output Folder",
         description="Where pictures, reports and baked textures are written; // is the folder of the .blend. "
-        "Empty takes a folder of the extension's own",
+        "Empty takes a folder of the extension's own, which goes when the extension is uninstalled",
         subtype="DIR_PATH", default="",
     )  # fmt: skip
     log_level: bpy.props.EnumProperty(

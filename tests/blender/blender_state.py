@@ -41,7 +41,7 @@ def state() -> dict[str, list[str]]:
         if getattr(kind, "is_registered", False) and kind.__module__ != "bpy.types"
     ]
     owners = [*_types_of_blender(bpy.types.ID), bpy.types.WindowManager, bpy.types.Bone, bpy.types.PoseBone]
-    drawn = [kind for base in _DRAWN for kind in _subclasses(base)]
+    drawn = [kind for kind in registered if issubclass(kind, _DRAWN)]
     return {
         "classes": sorted(f"{kind.__module__}.{kind.__qualname__}" for kind in registered),
         "types": sorted(dir(bpy.types)),

@@ -3,12 +3,12 @@
 import json
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import pytest
 import scene_parts
 from bake_scenes import baked, save, start, textured_scene
@@ -113,7 +113,7 @@ def test_after_a_kill_resume_gives_the_same_bytes(tmp_path):
     arguments = ["bake", str(path), "--size", "64", "--error", "--cycles-samples", "4", "--quiet", "--margin", "3"]
 
     def start_bake(output, *more):
-        command = [sys.executable, "-m", "ltsh_addon", *arguments, "-o", str(output), *more]
+        command = programs.command_line(*arguments, "-o", output, *more)
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     began = time.monotonic()

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import pytest
 import scene_parts
 
@@ -178,7 +179,7 @@ def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen(programs.python(code), cwd=ROOT, stdout=subprocess.PIPE, text=True)
     watchdog = threading.Timer(60.0, parent.kill)
     watchdog.start()
     try:
@@ -205,7 +206,7 @@ def test_a_killed_parent_takes_its_child_along(tmp_path):
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )
     parent = subprocess.Popen(
-        [sys.executable, "-c", code],
+        programs.python(code),
         cwd=ROOT,
         stdout=subprocess.PIPE,
         text=True,
@@ -224,9 +225,10 @@ def test_a_killed_parent_takes_its_child_along(tmp_path):
     assert len(children) == 1 and not _is_alive(children[0])
 
 
-def test_the_command_is_this_python_with_pips_bpy(tmp_path):
+def test_the_command_is_this_python_with_pips_bpy_or_this_blender(tmp_path):
     command = child_command(tmp_path / "job.json")
-    assert command[0] == sys.executable and command[1].endswith("worker.py") and command[-1].endswith("job.json")
+    assert command[0] == (bpy.app.binary_path or sys.executable)
+    assert any(word.endswith("worker.py") for word in command) and command[-1].endswith("job.json")
 
 
 def test_without_bpy_the_remedy_is_named(tmp_path, monkeypatch):

@@ -4,13 +4,13 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import pytest
 import scene_parts
 
@@ -67,7 +67,7 @@ def left_over(folder):
 
 def test_compare_as_a_program(room, out, temporary_root):
     before = room.read_bytes()
-    command = [sys.executable, "-m", "ltsh_addon", "compare", room, "-o", out, *SMALL, "--json", "--quiet"]
+    command = programs.command_line("compare", room, "-o", out, *SMALL, "--json", "--quiet")
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=120, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     report = json.loads(done.stdout)
@@ -156,8 +156,7 @@ def test_objects_without_material_or_faces_do_no_harm(capsys, tmp_path, out):
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGINT to one process as in POSIX")
 def test_ctrl_c_is_130_and_leaves_nothing(room, out, temporary_root):
-    command = [sys.executable, "-m", "ltsh_addon", "compare", room, "-o", out, "--resolution", "640x360",
-               "--cycles-samples", "100000"]  # fmt: skip
+    command = programs.command_line("compare", room, "-o", out, "--resolution", "640x360", "--cycles-samples", "100000")
     program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     watchdog = threading.Timer(90.0, program.kill)
     watchdog.start()

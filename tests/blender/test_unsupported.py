@@ -2,11 +2,11 @@
 
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import scene_parts
 
 from ltsh_addon import imaging
@@ -138,7 +138,7 @@ def test_a_file_full_of_unsupported_things_is_shaded_and_each_is_named(tmp_path)
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     library.unlink()
     before = path.read_bytes()
-    command = [sys.executable, "-m", "ltsh_addon", "compare", path, "-o", tmp_path / "out", "--cycles-samples", "8"]
+    command = programs.command_line("compare", path, "-o", tmp_path / "out", "--cycles-samples", "8")
     command += ["--aa", "2", "--techniques", "ltc,ltsh4", "--json", "--quiet"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=200, check=False)
     assert (done.returncode, done.stderr) == (0, "")
@@ -160,7 +160,7 @@ def test_the_panoramic_camera_of_such_a_file_is_refused(tmp_path):
     change_the_scene(scene)
     path = tmp_path / "everything.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    command = [sys.executable, "-m", "ltsh_addon", "shade", path, "-o", tmp_path / "out", "--camera", "Panorama"]
+    command = programs.command_line("shade", path, "-o", tmp_path / "out", "--camera", "Panorama")
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=200, check=False)
     assert done.returncode == 1 and done.stdout == ""
     assert "camera 'Panorama' is panoramic" in done.stderr.splitlines()[-1]

@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 import bpy
 
-from . import engine, view_properties
+from . import engine, engine_panels, engine_preview, split_gizmo, view_properties
 
 # Each has register() and unregister(); removed in reverse order.
-MODULES = (view_properties, engine)
+MODULES = (view_properties, engine, engine_panels, engine_preview, split_gizmo)
 _handles = []
 _registered = []
 

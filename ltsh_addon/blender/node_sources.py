@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from .shader_graph import group_output, live_link, passed_through, socket_named
+from .shader_graph import live_link, traced
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,8 @@ def source_of(tree, socket, groups: tuple = ()) -> Source | None:
     link = live_link(socket)
     if link is None:
         return Source(tree, socket, None, groups)
-    node, output = link.from_node, link.from_socket
-    if node.mute:
-        inner = passed_through(node, output)
-        return None if inner is None else source_of(tree, inner, groups)
-    if node.bl_idname == "NodeReroute":
-        return source_of(tree, node.inputs[0], groups)
-    if node.bl_idname == "ShaderNodeGroup":
-        end = group_output(node.node_tree) if node.node_tree is not None else None
-        inner = socket_named(end.inputs, output.identifier) if end is not None else None
-        return None if inner is None else source_of(node.node_tree, inner, (*groups, (tree, node)))
-    if node.bl_idname == "NodeGroupInput":
-        if not groups:
-            return None
-        outer, group = groups[-1]
-        entry = socket_named(group.inputs, output.identifier)
-        return None if entry is None else source_of(outer, entry, groups[:-1])
-    return Source(tree, output, node, groups)
+    found = traced(tree, link.from_socket, groups)
+    if found is None:
+        return None
+    tree, node, socket, groups = found
+    return Source(tree, socket, node, groups)

@@ -1,38 +1,42 @@
-"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and the render engine."""
+"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
 from __future__ import annotations
 
 import atexit
+import importlib
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import bpy
 
-from . import engine, engine_panels, engine_preview, split_gizmo, view_properties
+# Modules of this package with register() and unregister(), in the order in which they need each other.
+PARTS = ("preferences", "view_properties", "engine", "engine_panels", "engine_preview", "split_gizmo")
 
-# Each has register() and unregister(); removed in reverse order.
-MODULES = (view_properties, engine, engine_panels, engine_preview, split_gizmo)
-_handles = []
-_registered = []
+# Takes back what is registered, last first; one that fails does not keep the others from it.
+_registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
+    """Add everything or, where a part fails, nothing; `command_line` is `cli.main`. `unregister` removes it."""
 
     def run(arguments: list[str]) -> int:
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
-    _handles.append(bpy.utils.register_cli_command("ltsh", run))
-    for module in MODULES:
-        module.register()
-        _registered.append(module)
-    # Blender 4.5 hangs at exit when an engine is still registered.
-    atexit.register(unregister)
+    with ExitStack() as added:
+        added.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("ltsh", run))
+        for name in PARTS:
+            part = importlib.import_module(f".{name}", __package__)
+            part.register()
+            added.callback(part.unregister)
+        # Blender 4.5 hangs at exit when an engine is still registered.
+        atexit.register(unregister)
+        added.callback(atexit.unregister, unregister)
+        _registered.push(added.pop_all())
 
 
 def unregister() -> None:
     """Remove what `register` added."""
-    atexit.unregister(unregister)
-    while _registered:
-        _registered.pop().unregister()
-    while _handles:
-        bpy.utils.unregister_cli_command(_handles.pop())
+    from . import availability
+
+    availability.missing_libraries.cache_clear()
+    _registered.close()

@@ -25,6 +25,7 @@ class Source:
 def source_of(tree, socket, groups: tuple = ()) -> Source | None:
     """What feeds the input `socket` of `tree`; None where a group has no inside or no outside."""
     link = live_link(socket)
+<<<<<<< HEAD
     if link is None:
         return Source(tree, socket, None, groups)
     found = traced(tree, link.from_socket, groups)
@@ -32,3 +33,27 @@ def source_of(tree, socket, groups: tuple = ()) -> Source | None:
         return None
     tree, node, socket, groups = found
     return Source(tree, socket, node, groups)
+=======
+    return Source(tree, socket, None, groups) if link is None else source_behind(tree, link.from_socket, groups)
+
+
+def source_behind(tree, output, groups: tuple = ()) -> Source | None:
+    """What the `output` of a node in `tree` really comes from; None as in `source_of`."""
+    node, entry = output.node, None
+    if node.mute:
+        entry = passed_through(node, output)
+    elif node.bl_idname == "NodeReroute":
+        entry = node.inputs[0]
+    elif node.bl_idname == "ShaderNodeGroup":
+        end = group_output(node.node_tree) if node.node_tree is not None else None
+        if end is not None:
+            entry = socket_named(end.inputs, output.identifier)
+            tree, groups = node.node_tree, (*groups, (tree, node))
+    elif node.bl_idname == "NodeGroupInput":
+        if groups:
+            (tree, group), groups = groups[-1], groups[:-1]
+            entry = socket_named(group.inputs, output.identifier)
+    else:
+        return Source(tree, output, node, groups)
+    return None if entry is None else source_of(tree, entry, groups)
+>>>>>>> main

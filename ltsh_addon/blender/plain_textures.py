@@ -10,7 +10,7 @@ import numpy as np
 
 from .color_management import working_space
 from .image_textures import EXTENSIONS, INTERPOLATIONS
-from .shader_graph import live_link, origin
+from .node_sources import source_behind
 
 # Color space of the image -> whether values are sRGB. Of others, and of floats in sRGB, Cycles knows more than we do.
 BYTE_SPACES = {"sRGB": True, "Non-Color": False, "Linear Rec.709": False}
@@ -36,40 +36,36 @@ class PlainTexture:
 def plain_texture(tree, socket, groups) -> PlainTexture | None:
     """What feeds an input from the output `socket` of `tree`, where that is an image texture; `groups` leads to `tree`
     from the material, as (tree, group node) pairs."""
-    found = origin(tree, socket, groups)
-    if found is None:
+    found, part = source_behind(tree, socket, groups), "color"
+    if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
+        part = str(list(found.node.outputs).index(found.socket))
+        found = found.input(0)
+    if not _is_node(found, "ShaderNodeTexImage") or found.socket.name != "Color" or found.node.image is None:
         return None
-    tree, node, output, groups = found
-    part = "color"
-    if node.bl_idname == "ShaderNodeSeparateColor" and node.mode == "RGB":
-        part = str(list(node.outputs).index(output))
-        link = live_link(node.inputs[0])
-        found = None if link is None else origin(tree, link.from_socket, groups)
-        if found is None:
-            return None
-        tree, node, output, groups = found
-    if node.bl_idname != "ShaderNodeTexImage" or output.name != "Color" or node.image is None:
-        return None
-    uv, srgb = _uv_map(tree, node.inputs["Vector"], groups), _is_srgb(node.image)
+    node = found.node
+    uv, srgb = _uv_map(found), _is_srgb(node.image)
     if uv is None or srgb is None or not _is_plain(node):
         return None
     return PlainTexture(node.image.name_full, uv, node.extension, node.interpolation, srgb, part)
 
 
-def _uv_map(tree, socket, groups) -> str | None:
-    """Name of the UV map that feeds an input for vectors, "" for the default, None where something else does."""
-    link = live_link(socket)
-    if link is None:
-        return ""
-    found = origin(tree, link.from_socket, groups)
+def _is_node(source, kind: str) -> bool:
+    return source is not None and source.node is not None and source.node.bl_idname == kind
+
+
+def _uv_map(texture) -> str | None:
+    """Name of the UV map that an image texture is looked up at, "" for the default, None for anything else."""
+    found = texture.input("Vector")
     if found is None:
         return None
-    _, node, output, _ = found
-    if getattr(node, "from_instancer", False):
+    if found.node is None:
+        # Only the texture's own open input means a UV map; that of a group is a constant.
+        return "" if found.socket == texture.node.inputs["Vector"] else None
+    if getattr(found.node, "from_instancer", False):
         return None
-    if node.bl_idname == "ShaderNodeUVMap":
-        return node.uv_map
-    return "" if node.bl_idname == "ShaderNodeTexCoord" and output.name == "UV" else None
+    if _is_node(found, "ShaderNodeUVMap"):
+        return found.node.uv_map
+    return "" if _is_node(found, "ShaderNodeTexCoord") and found.socket.name == "UV" else None
 
 
 def _is_plain(node) -> bool:

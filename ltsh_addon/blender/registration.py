@@ -10,14 +10,18 @@ from contextlib import ExitStack
 import bpy
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
+<<<<<<< HEAD
 PARTS = ("preferences", "view_properties", "engine", "engine_panels", "engine_preview", "split_gizmo")
+=======
+PARTS = ("preferences", "view_properties", "engine")
+>>>>>>> main
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
 _registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything or, where a part fails, nothing; `command_line` is `cli.main`. `unregister` removes it."""
+    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
 
     def run(arguments: list[str]) -> int:
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
@@ -32,11 +36,17 @@ def register(command_line: Callable[..., int]) -> None:
         atexit.register(unregister)
         added.callback(atexit.unregister, unregister)
         _registered.push(added.pop_all())
+<<<<<<< HEAD
+=======
+    # Blender 4.5 hangs at exit when an engine is still registered.
+    atexit.register(unregister)
+>>>>>>> main
 
 
 def unregister() -> None:
     """Remove what `register` added."""
     from . import availability
 
+    atexit.unregister(unregister)
     availability.missing_libraries.cache_clear()
     _registered.close()

@@ -65,40 +65,6 @@ def passed_through(node, output):
     return next((link.from_socket for link in node.internal_links if link.to_socket == output), None)
 
 
-def origin(tree, output, groups: tuple = ()):
-    """(tree, node, output, groups) of what the `output` of a node in `tree` really comes from, past reroutes, muted
-    nodes and groups; None where that is nothing. `groups` leads to `tree`, as (tree, group node) pairs from outside."""
-    found = traced(tree, output, groups)
-    return None if found is None or found[1] is None else found
-
-
-def traced(tree, output, groups: tuple = ()):
-    """As `origin`; where the way ends at an input without a link (tree, None, input, groups)."""
-    while True:
-        node, entry = output.node, None
-        if node.mute:
-            entry = passed_through(node, output)
-        elif node.bl_idname == "NodeReroute":
-            entry = node.inputs[0]
-        elif node.bl_idname == "ShaderNodeGroup":
-            end = group_output(node.node_tree) if node.node_tree is not None else None
-            if end is not None:
-                entry = socket_named(end.inputs, output.identifier)
-                tree, groups = node.node_tree, (*groups, (tree, node))
-        elif node.bl_idname == "NodeGroupInput":
-            if groups:
-                (tree, group), groups = groups[-1], groups[:-1]
-                entry = socket_named(group.inputs, output.identifier)
-        else:
-            return tree, node, output, groups
-        if entry is None:
-            return None
-        link = live_link(entry)
-        if link is None:
-            return tree, None, entry, groups
-        output = link.from_socket
-
-
 def bypass(tree, node, source) -> None:
     """Feed everything that `node` feeds from the socket `source` instead."""
     for target in [link.to_socket for link in node.outputs[0].links]:

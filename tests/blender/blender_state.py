@@ -63,7 +63,13 @@ def state() -> dict[str, list[str]]:
             for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ())
             if function.__qualname__ != f"{kind.__name__}.draw"
         ),
-        "engines": sorted(f"{kind.__name__}: {engine}" for kind in drawn for engine in _engines(kind)),
+        "engines": sorted(
+            # A class that is no longer registered may keep its own list: nobody sees it.
+            f"{kind.__name__}: {engine}"
+            for kind in drawn
+            if getattr(kind, "is_registered", False)
+            for engine in _engines(kind)
+        ),
         "shortcuts": sorted(
             f"{keymap.name}: {item.idname}"
             for configuration in [bpy.context.window_manager.keyconfigs.addon]

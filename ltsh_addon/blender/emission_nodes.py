@@ -5,12 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-<<<<<<< HEAD
-from .shader_graph import live_link, origin
-=======
 from .node_sources import source_of
 from .shader_graph import live_link
->>>>>>> main
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
 CONSTANT_NODES = frozenset(
@@ -101,16 +97,8 @@ def _note_values(tree, socket, groups, found: Emission, seen: set) -> None:
             _note_values(owner, entry, path, found, seen)
 
 
-<<<<<<< HEAD
-def _sources(tree, socket, groups) -> list[tuple]:
-    """(tree, node, output, groups) of what feeds the input `socket`, as `origin` finds it; nothing, or one."""
-    link = live_link(socket)
-    found = origin(tree, link.from_socket, groups) if link is not None else None
-    return [] if found is None else [found]
-=======
 def _sources(tree, socket, groups) -> Iterator[tuple]:
     """(tree, node, output, groups) of what feeds the input `socket`, past reroutes, muted nodes and groups."""
     source = source_of(tree, socket, groups)
     if source is not None and source.node is not None:
         yield source.tree, source.node, source.socket, source.groups
->>>>>>> main

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from .shader_graph import live_link, traced
+from .shader_graph import group_output, live_link, passed_through, socket_named
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,6 @@ class Source:
 def source_of(tree, socket, groups: tuple = ()) -> Source | None:
     """What feeds the input `socket` of `tree`; None where a group has no inside or no outside."""
     link = live_link(socket)
-<<<<<<< HEAD
-    if link is None:
-        return Source(tree, socket, None, groups)
-    found = traced(tree, link.from_socket, groups)
-    if found is None:
-        return None
-    tree, node, socket, groups = found
-    return Source(tree, socket, node, groups)
-=======
     return Source(tree, socket, None, groups) if link is None else source_behind(tree, link.from_socket, groups)
 
 
@@ -56,4 +47,3 @@ def source_behind(tree, output, groups: tuple = ()) -> Source | None:
     else:
         return Source(tree, output, node, groups)
     return None if entry is None else source_of(tree, entry, groups)
->>>>>>> main

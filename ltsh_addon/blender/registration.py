@@ -10,11 +10,7 @@ from contextlib import ExitStack
 import bpy
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
-<<<<<<< HEAD
 PARTS = ("preferences", "view_properties", "engine", "engine_panels", "engine_preview", "split_gizmo")
-=======
-PARTS = ("preferences", "view_properties", "engine")
->>>>>>> main
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
 _registered = ExitStack()
@@ -32,15 +28,9 @@ def register(command_line: Callable[..., int]) -> None:
             part = importlib.import_module(f".{name}", __package__)
             part.register()
             added.callback(part.unregister)
-        # Blender 4.5 hangs at exit when an engine is still registered.
-        atexit.register(unregister)
-        added.callback(atexit.unregister, unregister)
         _registered.push(added.pop_all())
-<<<<<<< HEAD
-=======
     # Blender 4.5 hangs at exit when an engine is still registered.
     atexit.register(unregister)
->>>>>>> main
 
 
 def unregister() -> None:

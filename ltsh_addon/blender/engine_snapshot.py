@@ -41,10 +41,13 @@ def _take(*_) -> None:
     _current["folder"] = folder
     path = Path(folder.name) / "scene.blend"
     try:
+        _current["saving"] = True
         with _without_previews():
             bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, check_existing=False, relative_remap=True)
     except RuntimeError as error:
         _current["error"] = " ".join(str(error).split()).removeprefix("Error: ")
+    finally:
+        _current.pop("saving")
 
 
 @persistent
@@ -54,6 +57,11 @@ def _drop(*_) -> None:
     _current.clear()
     if folder is not None:
         folder.cleanup()
+
+
+def is_saving() -> bool:
+    """True while the copy is written."""
+    return "saving" in _current
 
 
 def saved_copy() -> Path:

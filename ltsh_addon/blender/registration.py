@@ -12,7 +12,7 @@ import bpy
 from . import standard_output
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
-PARTS = ("preferences", "view_properties", "engine")
+PARTS = ("preferences", "view_properties", "engine", "engine_panels", "engine_preview", "split_gizmo")
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
 _registered = ExitStack()

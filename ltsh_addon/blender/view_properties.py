@@ -81,11 +81,19 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         description="Final renders also have a specular and a diffuse pass of every technique",
         default=False,
     )
+    artist_engine: bpy.props.StringProperty(
+        name="Former Engine", description="The render engine to give back after the preview", options={"HIDDEN"}
+    )
+    artist_shading: bpy.props.StringProperty(
+        name="Former Shading", description="The viewport shading to give back after the preview", options={"HIDDEN"}
+    )
 
 
 def draw_view_settings(layout, scene) -> None:
     """The controls of what is seen; the same in every panel that shows them."""
     settings = scene.ltsh_view
+    if settings.artist_engine:
+        layout.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK")
     layout.prop(settings, "technique")
     layout.prop(settings, "shown")
     layout.prop(settings, "mode")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...shading import edge_loop
-from ...shading.light_polygons import ROUND_CORNERS, ROUND_LIMITS
+from ...shading.light_polygons import ROUND_CORNERS
 from ...shading.lookup_table import LookupTable
 from ...shading.table_header import moment_lines, shared_text
 from ...shading.table_header.literals import float_literal
@@ -114,11 +114,17 @@ def _lookup(table) -> str:
 def _round_levels() -> str:
     """The list of corners that a round light takes, from how far it reaches in units of the lobe's width."""
     lines = []
-    levels = zip(light_texture.CIRCLE_FIRST, ROUND_CORNERS, (*ROUND_LIMITS, np.inf), strict=True)
-    for first, count, limit in reversed(list(levels)):
-        condition = "true" if np.isinf(limit) else f"wide <= {float_literal(limit)}"
-        lines.append(f"    first = {condition} ? {first} : first;")
-        lines.append(f"    count = {condition} ? {count} : count;")
+    for first, count, limit in reversed(light_texture.ROUND_LEVELS):
+        condition = "round" if np.isinf(limit) else f"round && wide <= {float_literal(limit)}"
+        whole = [f"    light.whole_first = {condition} ? {first} : light.whole_first;"]
+        whole.append(f"    light.whole_count = {condition} ? {count} : light.whole_count;")
+        if count < ROUND_CORNERS[0]:
+            lines += whole
+            continue
+        lines.append(f"    light.first = {condition} ? {first} : light.first;")
+        lines.append(f"    light.count = {condition} ? {count} : light.count;")
+        if count == ROUND_CORNERS[0]:
+            lines += ["    light.whole_first = light.first;", "    light.whole_count = light.count;"]
     return "\n".join(lines)
 
 

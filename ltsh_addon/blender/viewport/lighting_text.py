@@ -4,8 +4,12 @@ Names between @ are filled in there.
 """
 
 LIGHTS = """\
-/* A light as seen from a point: vectors in the world, the first corner's texel, how many corners. */
-struct ltsh_light { vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float bound; };
+/* A light as seen from a point: vectors in the world, the first corner's texel and how many there are, the same for
+   where no horizon cuts it. */
+struct ltsh_light {
+    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; int whole_first; int whole_count;
+    float bound;
+};
 /* What is read of the surface point of a pixel. */
 struct ltsh_point {
     vec3 position; vec3 view; vec3 normal; vec3 geometric; float roughness; float ior; float receiver;
@@ -17,7 +21,7 @@ vec4 ltsh_light_texel(int index)
     return texelFetch(lights, ivec2(index % LTSH_LIGHT_WIDTH, index / LTSH_LIGHT_WIDTH), 0);
 }
 
-vec2 ltsh_corner(ltsh_light light, int number) { return ltsh_light_texel(light.first + number).xy; }
+vec2 ltsh_corner(int texel) { return ltsh_light_texel(texel).xy; }
 
 /* The light as lobes `width` radians wide need it: of round ones the number of corners depends on that. */
 ltsh_light ltsh_seen_light(int header, vec3 position, float width)
@@ -36,11 +40,10 @@ ltsh_light ltsh_seen_light(int header, vec3 position, float width)
     float reach = more.z;
     float beyond = sqrt(dot(light.offset, light.offset)) - reach;
     float wide = reach / (max(max(abs(dot(light.offset, light.direction)), beyond), 1e-12 * reach) * width);
-    int first = 0;
-    int count = 0;
+    light.first = int(center.w);
+    light.count = int(half_u.w);
+    bool round = light.count == 0;
 @ROUND_LEVELS@
-    light.first = half_u.w > 0.0 ? int(center.w) : first;
-    light.count = half_u.w > 0.0 ? int(half_u.w) : count;
     return light;
 }
 
@@ -164,12 +167,15 @@ ADD_SPECULAR = """\
         ltsh_light shining = ltsh_seen_light(header, point.position, weights.width);
         bool shines = received && glossy && (flags & LTSH_SPECULAR_FLAG) != 0;
         shining.count = shines ? shining.count : 0;
+        shining.whole_count = shines ? shining.whole_count : 0;
         reflected += ltsh_reflected(point, weights, specular_integral(shine, shining));
 """
 
 ADD_DIFFUSE = """\
         ltsh_light lighting = ltsh_seen_light(header, point.position, 1.0);
-        lighting.count = received && (flags & LTSH_DIFFUSE_FLAG) != 0 ? lighting.count : 0;
+        bool lights_up = received && (flags & LTSH_DIFFUSE_FLAG) != 0;
+        lighting.count = lights_up ? lighting.count : 0;
+        lighting.whole_count = lights_up ? lighting.whole_count : 0;
         reflected += base.xyz * diffuse_form_factor(matte, diffuse_integral(matte, lighting));
 """
 

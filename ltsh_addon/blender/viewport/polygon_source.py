@@ -26,7 +26,7 @@ def integral_function(name: str, planes: int) -> str:
     """
     values = {
         "name": name,
-        "LAST_SLOT": str(planes),
+        "SLOTS": str(planes + 1),
         "APICES": "\n".join(_apex_lines(name, planes)),
         "INTERVAL": "\n".join(_interval_lines(planes)),
         "CLOSING": "\n".join(_closing_lines(planes)),
@@ -43,12 +43,12 @@ def _pairs(planes):
 
 
 def _apex_lines(name, planes):
-    """Directions in which two horizons meet: warped, with their heights; w is 0 where the horizons are the same."""
+    """Directions in which two horizons meet: warped, with their heights. Horizons closer than 3e-4 rad count as one."""
     for k, j in _pairs(planes):
         yield f"    vec3 apex = cross(lobe.plane_{k}, lobe.plane_{j});" if (k, j) == (0, 1) else (
             f"    apex = cross(lobe.plane_{k}, lobe.plane_{j});"
         )
-        yield f"    float meets_{k}{j} = dot(apex, apex) > 1e-12 ? 1.0 : 0.0;"
+        yield f"    bool same_{k}{j} = dot(apex, apex) < 1e-7;"
         yield "    apex = dot(apex, light.direction) < 0.0 ? apex : -apex;"
         yield f"    vec3 apex_{k}{j} = {name}_warped(lobe, apex);"
         yield f"    vec3 apex_height_{k}{j} = {name}_heights(lobe, apex, apex_{k}{j}, 1.0);"
@@ -77,11 +77,12 @@ def _closing_lines(planes):
             yield f"                vec3 height = start_height + share.{a} * (end_height - start_height);"
         for j in others:
             pair = f"{min(k, j)}{max(k, j)}"
-            yield f"                if (height.{_AXES[j]} < 0.0 && meets_{pair} > 0.0) {{"
+            yield f"                if (height.{_AXES[j]} < 0.0 && !same_{pair}) {{"
             yield f"                    crossing.xyz = apex_{pair};"
             yield f"                    height = apex_height_{pair};"
             yield "                }"
-        yield f"                bool crosses = (start_height.{a} > 0.0) != rises;"
+        first = "".join(f" && !same_{j}{k}" for j in range(k))
+        yield f"                bool crosses = (start_height.{a} > 0.0) != rises{first};"
         yield f"                used = crosses && pin_{k}.w > 0.0;"
         yield f"                from = rises ? pin_{k}.xyz : crossing.xyz;"
         yield f"                to = rises ? crossing.xyz : pin_{k}.xyz;"
@@ -103,24 +104,24 @@ _INTEGRAL = """\
     bool dark = any(lessThanEqual(height + reach, vec3(0.0)));
 
     @name@_sum sum = @name@_empty();
-    int first_count = whole ? light.count : 0;
-    vec2 place = ltsh_corner(light, light.count - 1);
+    int first_count = whole ? light.whole_count : 0;
+    vec2 place = ltsh_corner(light.whole_first + light.whole_count - 1);
     vec3 start = ltsh_unit(center + place.x * along_u + place.y * along_v);
     for (int i = 0; i < first_count; ++i) {
-        place = ltsh_corner(light, i);
+        place = ltsh_corner(light.whole_first + i);
         vec3 end = ltsh_unit(center + place.x * along_u + place.y * along_v);
         sum = @name@_with_edge(sum, start, end);
         start = end;
     }
 
     int second_count = whole || dark ? 0 : light.count;
-    place = ltsh_corner(light, light.count - 1);
+    place = ltsh_corner(light.first + light.count - 1);
     start = center + place.x * along_u + place.y * along_v;
     vec3 start_height = height + place.x * height_u + place.y * height_v;
 @APICES@
 @PINS@
     for (int i = 0; i < second_count; ++i) {
-        place = ltsh_corner(light, i);
+        place = ltsh_corner(light.first + i);
         vec3 end = center + place.x * along_u + place.y * along_v;
         vec3 end_height = height + place.x * height_u + place.y * height_v;
         vec3 drop = start_height - end_height;
@@ -128,7 +129,9 @@ _INTEGRAL = """\
         float enter = 0.0;
         float leave = 1.0;
 @INTERVAL@
-        for (int slot = 0; slot <= @LAST_SLOT@; ++slot) {
+        bool crosses_any = any(notEqual(greaterThan(start_height, vec3(0.0)), greaterThan(end_height, vec3(0.0))));
+        int slots = crosses_any ? @SLOTS@ : 1;
+        for (int slot = 0; slot < slots; ++slot) {
             bool used = enter < leave;
             vec3 from = start + enter * (end - start);
             vec3 to = start + leave * (end - start);

@@ -17,6 +17,7 @@ from .surface_uniforms import DEFINES, LOOK_SIZE, albedo_table, blend_table, flo
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal")
+EMISSION = ("emission",)
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class SurfacePass:
     """Shaders and textures of one view's G-buffer; needs an active GPU context."""
 
     def __init__(self):
-        self._shaders = {outputs: _shader(outputs) for outputs in (SURFACES, NORMALS)}
+        self._shaders = {outputs: _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._size, self._textures, self._buffers = None, {}, {}
@@ -59,6 +60,23 @@ class SurfacePass:
     def depth(self) -> gpu.types.GPUTexture:
         """The depth of what was drawn last."""
         return self._depth
+
+    def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
+        """Add what the surfaces drawn last emit to `frame_buffer`."""
+        shining = [instance for instance in instances if any(np.any(look.look.emission) for look in instance.looks)]
+        if not shining:
+            return
+        with frame_buffer.bind():
+            gpu.state.viewport_set(0, 0, *size)
+            gpu.state.depth_test_set("NONE")
+            gpu.state.blend_set("ADDITIVE")
+            shader = self._shaders[EMISSION]
+            shader.bind()
+            shader.uniform_sampler("positions", self._textures["position"])
+            try:
+                self._draw_instances(shader, shining, view, with_images=False)
+            finally:
+                gpu.state.blend_set("NONE")
 
     def free(self) -> None:
         """Let go of everything."""
@@ -94,26 +112,28 @@ class SurfacePass:
                 gpu.state.depth_test_set("NONE")
                 gpu.state.depth_mask_set(False)
 
-    def _draw_instances(self, shader, instances, view: View) -> None:
+    def _draw_instances(self, shader, instances, view: View, with_images: bool = True) -> None:
         shader.bind()
         values = np.vstack([view.projection.T, [*view.eye, 0.0 if view.is_parallel else 1.0]])
         # Kept until all is drawn: the card reads it then.
         self._view_values = uniform_buffer(values)
         shader.uniform_block("view", self._view_values)
-        for name, table in self._tables.items():
+        for name, table in self._tables.items() if with_images else ():
             shader.uniform_sampler(name, table)
         # From near to far: what is hidden need not be computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             shader.uniform_float("model", instance.model)
-            shader.uniform_float("receiver_and_side", (instance.receiver, instance.side))
+            if with_images:
+                shader.uniform_float("receiver_and_side", (instance.receiver, instance.side))
             for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
-                self._bind_look(shader, look)
+                shader.uniform_block("look", look.uniforms)
+                if with_images:
+                    self._bind_images(shader, look)
                 instance.mesh.batch(slot, look.look.uv_map).draw(shader)
 
-    def _bind_look(self, shader, shown: ShownLook) -> None:
+    def _bind_images(self, shader, shown: ShownLook) -> None:
         if shown.textures is None:
             shown.textures = {name: gpu.texture.from_image(use.image) for name, use in shown.look.images.items()}
-        shader.uniform_block("look", shown.uniforms)
         for name in IMAGE_SLOTS:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
 
@@ -133,13 +153,16 @@ def _shader(outputs):
     info.uniform_buf(0, "SurfaceView", "view")
     info.uniform_buf(1, "SurfaceLook", "look")
     info.push_constant("MAT4", "model")
-    info.push_constant("VEC2", "receiver_and_side")
-    for slot, name in enumerate((*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")):
+    # What a shader does not use is not there for whom sets it.
+    if outputs != EMISSION:
+        info.push_constant("VEC2", "receiver_and_side")
+    images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
+    for slot, name in enumerate(("positions",) if outputs == EMISSION else images):
         info.sampler(slot, "FLOAT_2D", name)
     info.vertex_in(0, "VEC3", "position")
     info.vertex_in(1, "VEC3", "normal")
     info.vertex_in(2, "VEC2", "uv")
-    passed = gpu.types.GPUStageInterfaceInfo("ltsh_surface")
+    passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}")
     passed.smooth("VEC3", "v_position")
     passed.smooth("VEC3", "v_normal")
     passed.smooth("VEC2", "v_uv")
@@ -147,6 +170,12 @@ def _shader(outputs):
     for slot, name in enumerate(outputs):
         info.fragment_out(slot, "VEC4", f"out_{name}")
     info.vertex_source(source.VERTEX)
-    end = source.FRAGMENT_OF_SURFACES if outputs == SURFACES else source.FRAGMENT_OF_NORMALS
-    info.fragment_source(source.IMAGES + source.REFLECTANCE + source.NORMALS + source.FRAGMENT + end)
+    info.fragment_source(_fragment_source(outputs))
     return gpu.shader.create_from_info(info)
+
+
+def _fragment_source(outputs) -> str:
+    if outputs == EMISSION:
+        return source.EMISSION_FRAGMENT
+    end = source.FRAGMENT_OF_SURFACES if outputs == SURFACES else source.FRAGMENT_OF_NORMALS
+    return source.IMAGES + source.REFLECTANCE + source.NORMALS + source.FRAGMENT + end

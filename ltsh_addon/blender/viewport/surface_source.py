@@ -328,3 +328,17 @@ FRAGMENT_OF_NORMALS = """
   out_smooth_normal = vec4(smooth_normal, 0.0);
 }
 """
+
+# Adds what surfaces emit to a picture, where they are those of the G-buffer.
+EMISSION_FRAGMENT = """
+void main()
+{
+  vec4 seen = texelFetch(positions, ivec2(gl_FragCoord.xy), 0);
+  vec3 between = seen.xyz - v_position;
+  float distance2 = view.eye.w < 0.5 ? 1.0 : dot(view.eye.xyz - v_position, view.eye.xyz - v_position);
+  if (seen.w == 0.0 || dot(between, between) > 1e-7 * distance2) {
+    discard;
+  }
+  out_emission = vec4(look.data[1].xyz, 0.0);
+}
+"""

@@ -82,6 +82,8 @@ class ViewRenderer:
         texture, buffer = self._target(number, size)
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
         lighting.draw(self._gbuffer, buffer, passes, **place)
+        if passes == "combined":
+            self._surfaces.add_emission(mirror.instances, view, size, buffer)
         return texture
 
     def _target(self, number: int, size):

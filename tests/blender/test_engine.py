@@ -1,0 +1,181 @@
+"""The render engine LTSH in background: what it registers, its final renders, the preview button."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+
+import ltsh_addon
+from ltsh_addon import shading
+from ltsh_addon.blender import child, engine_final, engine_panels, engine_snapshot
+from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.scene import Border
+
+SIZE = (32, 20)
+
+
+@pytest.fixture
+def addon():
+    """The add-on in a factory-empty Blender."""
+    scene = parts.empty_scene(*SIZE)
+    ltsh_addon.register()
+    yield scene
+    ltsh_addon.unregister()
+
+
+def add_content(scene):
+    """A glossy plane and a matte sphere under an area light, and the engine."""
+    shiny, _ = parts.principled("Shiny", Base_Color=(0.6, 0.3, 0.1, 1.0), Roughness=0.3)
+    matte, _ = parts.bsdf_material("ShaderNodeBsdfDiffuse", "Matte", Color=(0.2, 0.5, 0.8, 1.0))
+    plane, sphere = parts.add_plane(shiny, size=2.0), parts.add_sphere(matte, location=(0.4, 0.5, 0.6))
+    parts.add_area_light()
+    parts.add_camera()
+    scene.render.engine = "LTSH"
+    scene.ltsh_view.render_samples = 1
+    return plane, sphere
+
+
+def render(scene, path):
+    """Channels of the picture that rendering `scene` writes."""
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth, settings.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    return read_channels(path)
+
+
+def picture(channels, layer, name, letters="RGB"):
+    """Pass `name` of a view layer, (H, W, C)."""
+    return np.stack([channels[f"{layer}.{name}.{letter}"] for letter in letters], axis=-1)
+
+
+def handlers_of_package():
+    """Names of Blender's handler lists with functions of ours."""
+    lists = {name: getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers)}
+    ours = ltsh_addon.__name__
+    return [
+        name
+        for name, functions in lists.items()
+        if isinstance(functions, list) and any(function.__module__.startswith(ours) for function in functions)
+    ]
+
+
+def test_unregister_leaves_nothing_behind():
+    parts.empty_scene()
+    before = set(dir(bpy.types)), {panel: set(panel.COMPAT_ENGINES) for panel in engine_panels.shared_panels()}
+    bpy.context.scene.render.engine = "CYCLES"
+    ltsh_addon.register()
+    assert hasattr(bpy.types, "LTSH_PT_view") and handlers_of_package()
+    assert "LTSH" in bpy.types.DATA_PT_lens.COMPAT_ENGINES
+    assert bpy.ops.ltsh.preview() == {"FINISHED"} and bpy.context.scene.render.engine == "LTSH"
+    ltsh_addon.unregister()
+    assert set(dir(bpy.types)) == before[0]
+    assert {panel: set(panel.COMPAT_ENGINES) for panel in engine_panels.shared_panels()} == before[1]
+    assert not handlers_of_package() and not hasattr(bpy.types.Scene, "ltsh_view")
+    assert bpy.context.scene.render.engine == "CYCLES"
+
+
+def test_settings_of_cycles_own_renders_stay_hidden(addon):
+    for name in ("CYCLES_MATERIAL_PT_surface", "CYCLES_LIGHT_PT_light", "DATA_PT_lens", "OBJECT_PT_transform"):
+        panel = getattr(bpy.types, name)
+        assert "LTSH" in getattr(panel, "COMPAT_ENGINES", {"LTSH"}), name
+    for name in ("CYCLES_RENDER_PT_sampling", "CYCLES_RENDER_PT_light_paths", "CYCLES_RENDER_PT_performance"):
+        assert "LTSH" not in getattr(bpy.types, name).COMPAT_ENGINES, name
+
+
+def test_final_render_is_the_picture_that_shade_makes(addon, tmp_path):
+    add_content(addon)
+    addon.ltsh_view.technique, addon.ltsh_view.technique_passes = "ltsh2", True
+    channels = render(addon, tmp_path / "final.exr")
+    copy = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
+    extraction = child.extract(child.ExtractOptions(scene=copy))
+    for prefix, technique in (("LTSH", "ltsh2"), ("LTC", "ltc"), ("LTSH 4", "ltsh4")):
+        for name in shading.PASSES:
+            shaded = shading.shade(extraction.samples, extraction.lights, technique, passes=(name,))
+            expected = extraction.film.image(shaded.combined)
+            found = picture(channels, "ViewLayer", f"{prefix} {name.capitalize()}")
+            # Both take the same samples; the pictures are float32.
+            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+            assert expected.max() > 0.01
+    both = picture(channels, "ViewLayer", "LTSH Specular") + picture(channels, "ViewLayer", "LTSH Diffuse")
+    np.testing.assert_allclose(picture(channels, "ViewLayer", "Combined"), both, rtol=1e-6, atol=1e-7)
+
+
+def test_every_view_layer_has_its_own_picture(addon, tmp_path):
+    plane, sphere = add_content(addon)
+    other = bpy.data.collections.new("Other")
+    addon.collection.children.link(other)
+    addon.collection.objects.unlink(sphere)
+    other.objects.link(sphere)
+    layer = addon.view_layers.new("Without sphere")
+    layer.layer_collection.children["Other"].exclude = True
+    addon.render.film_transparent = True
+    channels = render(addon, tmp_path / "layers.exr")
+    alpha = {name: channels[f"{name}.Combined.A"] for name in ("ViewLayer", "Without sphere")}
+    assert set(np.unique(alpha["Without sphere"])) == {0.0, 1.0}
+    # The sphere stands in part before the background.
+    assert alpha["ViewLayer"].sum() > 1.1 * alpha["Without sphere"].sum()
+    for name, hit in alpha.items():
+        light = picture(channels, name, "LTSH Specular").sum(axis=-1)
+        assert light[hit == 0.0].max() == 0.0 < light.max(), name
+
+
+def test_the_world_is_seen_behind_surfaces_alone(addon, tmp_path):
+    add_content(addon)
+    world = addon.world = bpy.data.worlds.new("World")
+    if bpy.app.version < (5, 0, 0):
+        world.use_nodes = True
+    background = next(node for node in world.node_tree.nodes if node.bl_idname == "ShaderNodeBackground")
+    background.inputs["Color"].default_value = (0.1, 0.2, 0.4, 1.0)
+    background.inputs["Strength"].default_value = 2.0
+    channels = render(addon, tmp_path / "world.exr")
+    combined = picture(channels, "ViewLayer", "Combined")
+    np.testing.assert_allclose(combined[0, 0], (0.2, 0.4, 0.8), rtol=1e-6)
+    assert (channels["ViewLayer.Combined.A"] == 1.0).all()
+    seen = picture(channels, "ViewLayer", "LTSH Specular").sum(axis=-1) > 0.0
+    assert seen.any() and not np.isclose(combined[seen][:, 2], 0.8, rtol=1e-3).any()
+
+
+def test_a_scene_without_lights_fails_with_its_reason(addon, tmp_path):
+    parts.add_plane()
+    parts.add_camera()
+    addon.render.engine = "LTSH"
+    with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
+        render(addon, tmp_path / "dark.exr")
+    assert not engine_snapshot._current
+
+
+def test_only_the_render_region_is_handed_to_blender():
+    image = np.arange(60.0).reshape(6, 10, 1)
+    border = Border(left=2, top=1, width=5, height=3, full_width=10, full_height=6)
+    np.testing.assert_array_equal(engine_final.inside_border(image, border), image[1:4, 2:7])
+    flat = engine_final.blender_pixels(image)
+    # Blender's rows start at the bottom.
+    np.testing.assert_array_equal(flat.reshape(6, 10)[0], image[5, :, 0])
+
+
+def test_files_saved_during_a_preview_keep_the_artists_engine(addon, tmp_path):
+    addon.render.engine = "BLENDER_WORKBENCH"
+    bpy.ops.ltsh.preview()
+    path = tmp_path / "previewed.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    assert addon.render.engine == "LTSH" and addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    scene = bpy.context.scene
+    assert scene.render.engine == "BLENDER_WORKBENCH" and not scene.ltsh_view.artist_engine
+    bpy.ops.ltsh.preview()
+    bpy.ops.ltsh.preview()
+    assert scene.render.engine == "BLENDER_WORKBENCH"
+
+
+def test_an_engine_chosen_by_hand_is_not_taken_for_a_preview(addon, tmp_path):
+    addon.render.engine = "LTSH"
+    bpy.ops.ltsh.preview()
+    assert addon.render.engine == "LTSH" and not addon.ltsh_view.artist_engine
+    path = tmp_path / "own.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    assert bpy.context.scene.render.engine == "LTSH"

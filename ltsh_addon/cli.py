@@ -30,13 +30,16 @@ EXAMPLES = """examples:
 DEMO_RESOLUTION = (480, 270)
 
 
-def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None) -> int:
-    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code."""
+def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None, bar=None) -> int:
+    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code.
+
+    `bar` shows progress in place of a ProgressBar on stderr.
+    """
     try:
         options = _parser(program).parse_args(arguments)
     except SystemExit as stop:  # argparse has printed help (0) or the mistake (2)
         return int(stop.code or 0)
-    bar = ProgressBar(sys.stderr, quiet=options.quiet)
+    bar = bar or ProgressBar(sys.stderr, quiet=options.quiet)
     try:
         return options.run(options, bar, open_file)
     except values.Misuse as error:

@@ -161,29 +161,27 @@ def termination_as_exception():
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
-def child_command(job: Path) -> list[str]:
-    """The command that runs worker.py on `job`: this Blender's own binary, or this Python with pip's bpy."""
+def child_command(job: Path, script: Path = WORKER) -> list[str]:
+    """The command that runs `script` on `job`: this Blender's own binary, or this Python with pip's bpy."""
     bpy = sys.modules.get("bpy")
     binary = bpy.app.binary_path if bpy is not None else ""
     if binary:
         return [
             *(binary, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1"),
-            *("--python", str(WORKER), "--", str(job)),
+            *("--python", str(script), "--", str(job)),
         ]
     if bpy is None and importlib.util.find_spec("bpy") is None:
         wanted = BPY_FOR_PYTHON.get(sys.version_info[:2])
         other = "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
         remedy = f"pip install bpy=={wanted}" if wanted else other
         raise SceneError(f"{sys.executable} has no module bpy, which opens .blend files: {remedy}")
-    return [sys.executable, str(WORKER), str(job)]
+    return [sys.executable, str(script), str(job)]
 
 
-def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
-    """Run worker.py on `job` in `folder`, report its progress; the manifest it wrote."""
-    job_path = folder / "job.json"
-    job_path.write_text(json.dumps({**job, "watch_parent": True}), encoding="utf-8")
-    child = subprocess.Popen(
-        child_command(job_path),
+def start(command: list[str], folder: Path) -> subprocess.Popen:
+    """`command` as a process that works in `folder`; it is told by the end of its stdin that we are gone."""
+    return subprocess.Popen(
+        command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -202,6 +200,13 @@ def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
         # Ctrl-C goes to the parent alone, which ends the child.
         start_new_session=True,
     )
+
+
+def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
+    """Run worker.py on `job` in `folder`, report its progress; the manifest it wrote."""
+    job_path = folder / "job.json"
+    job_path.write_text(json.dumps({**job, "watch_parent": True}), encoding="utf-8")
+    child = start(child_command(job_path), folder)
     last_lines: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
     try:
         for line in child.stdout:

@@ -70,15 +70,15 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         if ob.type != "LIGHT" or not instance.show_self:
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
-        problem = _reason_to_leave_out(ob, matrix)
+        problem = reason_to_leave_out(ob, matrix)
         if problem:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
             continue
         light = _area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
-            placed.append((ob.original.name_full, light, _unseen(ob, matrix, inventory)))
-            _note_unsupported(ob, matrix, inventory)
+            placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
+            note_unsupported(ob, matrix, inventory)
             _note_instancer(instance, inventory)
     # One unusable instance takes all instances of the object along: the reference can only drop the object.
     for name, light, unseen in placed:
@@ -116,7 +116,7 @@ def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
         return lights + mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
 
 
-def _reason_to_leave_out(ob, matrix: np.ndarray) -> str:
+def reason_to_leave_out(ob, matrix: np.ndarray) -> str:
     light = ob.data
     if light.type != "AREA":
         return f"{light.type} lights are not shaded, only area lights are"
@@ -170,7 +170,7 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     return value
 
 
-def _unseen(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
+def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
     """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
     light = ob.data
     tree = light.node_tree
@@ -188,7 +188,7 @@ def _unseen(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | 
     return UnseenLight(light.original, matrix, emission.varies)
 
 
-def _note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
+def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     """Warn of what Cycles renders for this light and the techniques do not."""
     light, name = ob.data, ob.original.name
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)

@@ -16,7 +16,7 @@ from pathlib import Path
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """End this process as soon as the parent, which holds the other end of stdin, is gone."""
 
     def watch():
@@ -53,7 +53,7 @@ def main() -> int:
     job_path = Path(sys.argv[-1])
     job = json.loads(job_path.read_text(encoding="utf-8"))
     if job.get("watch_parent"):
-        _end_with_parent()
+        end_with_parent()
     # Running a script puts its own folder first, where `lights` and others would be found as top-level modules.
     sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
     scene_error = _module("child").SceneError

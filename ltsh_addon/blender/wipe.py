@@ -1,0 +1,136 @@
+"""What is drawn over the image "LTSH Comparison", and the line in it that the mouse drags."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..imaging.false_color import color_bar
+from . import drawing, results, viewer
+from .probe import draw_probe
+
+GRIP_PIXELS = 12.0
+HANDLE_PIXELS = 9.0
+_state = {"handle": None, "keymaps": []}
+
+
+def _shown(context):
+    """Result and choice where the space of `context` shows the comparison of its scene, else None."""
+    space, scene = context.space_data, context.scene
+    if space is None or space.type != "IMAGE_EDITOR" or not viewer.is_viewer(space.image):
+        return None
+    if space.image[results.SCENE] != scene.name:
+        return None
+    result = results.result_of(scene)
+    return None if result is None else (result, results.choice_of(scene.ltsh, result))
+
+
+def line_position(context) -> float:
+    """Where the line is, in pixels from the left of the region."""
+    return context.region.view2d.view_to_region(context.scene.ltsh.split, 0.0, clip=False)[0]
+
+
+class LTSH_OT_drag_split(bpy.types.Operator):
+    """Drag the line between the two pictures"""
+
+    bl_idname = "ltsh.drag_split"
+    bl_label = "Drag Split"
+    bl_options = {"UNDO", "INTERNAL"}
+
+    def invoke(self, context, event):
+        if context.region is None or context.region.type != "WINDOW" or _shown(context) is None:
+            return {"PASS_THROUGH"}
+        grip = GRIP_PIXELS * context.preferences.system.ui_scale
+        distance = abs(event.mouse_region_x - line_position(context))
+        if context.scene.ltsh.mode != "WIPE" or distance > grip:
+            return {"PASS_THROUGH"}
+        self._before = context.scene.ltsh.split
+        context.window.cursor_modal_set("MOVE_X")
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        settings = context.scene.ltsh
+        if event.type == "MOUSEMOVE":
+            settings.split = context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0]
+        elif event.type in {"ESC", "RIGHTMOUSE"}:
+            settings.split = self._before
+            context.window.cursor_modal_restore()
+            return {"CANCELLED"}
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            context.window.cursor_modal_restore()
+            return {"FINISHED"}
+        return {"RUNNING_MODAL"}
+
+
+def _draw() -> None:
+    """Called by Blender for every Image Editor."""
+    context = bpy.context
+    shown = _shown(context)
+    if shown is None:
+        return
+    result, choice = shown
+    scale, region, settings = context.preferences.system.ui_scale, context.region, context.scene.ltsh
+    labels = result.groups[choice.group]["labels"]
+    first, second = labels[choice.first], labels[choice.second]
+    left, bottom = region.view2d.view_to_region(0.0, 0.0, clip=False)
+    right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
+    below, gap = bottom - 26.0 * scale, 6.0 * scale
+    if settings.mode == "WIPE":
+        _draw_line(line_position(context), bottom, top, scale)
+        drawing.draw_label(left, below, first, scale)
+        drawing.draw_label(right, below, second, scale, align=1.0)
+    elif settings.mode == "SIDE":
+        drawing.draw_label(left, below, first, scale)
+        drawing.draw_label((left + right) / 2.0, below, second, scale)
+    elif settings.mode == "A":
+        drawing.draw_label(left, below, first, scale)
+    else:
+        drawing.draw_label(left, below, f"{first} \u2212 {second}", scale)
+        limit = viewer.error_scale(settings, result.groups[choice.group], choice)
+        _draw_legend(right, below, limit, scale)
+    if result.partial:
+        drawing.draw_label(left, top + gap, result.partial, scale)
+    draw_probe(context, result, choice, (left, bottom, right, top))
+
+
+def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
+    half, handle = 0.75 * scale, HANDLE_PIXELS * scale
+    drawing.draw_rectangle(x - 2.0 * half, bottom, x + 2.0 * half, top, drawing.PAPER)
+    drawing.draw_rectangle(x - half, bottom, x + half, top, drawing.LINE)
+    middle = (bottom + top) / 2.0
+    drawing.draw_rectangle(x - handle, middle - handle, x + handle, middle + handle, drawing.PAPER)
+    for offset in (-3.0 * scale, 3.0 * scale):
+        drawing.draw_rectangle(
+            x + offset - half, middle - 0.6 * handle, x + offset + half, middle + 0.6 * handle, drawing.LINE
+        )
+
+
+def _draw_legend(right: float, below: float, limit: float, scale: float) -> None:
+    """The colors of the difference with their ends, its right end at `right`."""
+    width, height = 200.0 * scale, 20.0 * scale
+    start, end = f"\u2212{limit:g} too dark", f"too bright +{limit:g}"
+    drawing.draw_label(right, below, end, scale, align=1.0)
+    bar_right = right - drawing.text_width(end, scale) - 18.0 * scale
+    drawing.draw_gradient(bar_right - width, below, bar_right, below + height, color_bar(65, 1)[0])
+    drawing.draw_label(bar_right - width - 6.0 * scale, below, start, scale, align=1.0)
+
+
+CLASSES = (LTSH_OT_drag_split,)
+_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+
+
+def register():
+    _register()
+    _state["handle"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
+    configuration = bpy.context.window_manager.keyconfigs.addon
+    if configuration is not None:  # None without a window
+        keymap = configuration.keymaps.new(name="Image", space_type="IMAGE_EDITOR")
+        _state["keymaps"].append((keymap, keymap.keymap_items.new("ltsh.drag_split", "LEFTMOUSE", "PRESS")))
+
+
+def unregister():
+    for keymap, item in _state["keymaps"]:
+        keymap.keymap_items.remove(item)
+    _state["keymaps"].clear()
+    bpy.types.SpaceImageEditor.draw_handler_remove(_state["handle"], "WINDOW")
+    _unregister()

@@ -10,13 +10,15 @@ PYTEST_OPTIONS ?=
 # Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
 STRICT ?=
 
-.PHONY: help demo test lint tables lock clean bench soak test-3.13 test-3.11
+.PHONY: help demo test lint tables lock clean bench soak extension test-blender test-3.13 test-3.11
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    build the example scene, shade it, compare it with Cycles: out/demo/compare.png, report.json'
 	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
+	@echo 'make test-blender BLENDER=path  the tests of tests/blender inside that Blender'
 	@echo 'make lint    ruff only'
+	@echo 'make extension  the zips that Blender installs, one per platform: build/ltsh-*.zip'
 	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (5 minutes)'
 	@echo 'make soak    1e8 random integrals, 1e5 random polygons of each kind against quadrature (hours)'
 	@echo 'make tables  fit the lookup tables in tables/ again (long)'
@@ -26,7 +28,17 @@ help:
 demo:
 	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon demo -o out/demo $(DEMO_OPTIONS)
 
-test: lint test-3.13 test-3.11
+# The tests of one version leave half of two cores idle, so both versions run at once. The output of the second is kept
+# and shown when the first has ended.
+test: lint
+	@mkdir -p build; \
+	$(MAKE) --no-print-directory test-3.11 >build/test-3.11.log 2>&1 & second=$$!; \
+	trap 'kill $$second 2>/dev/null' EXIT; \
+	status=0; $(MAKE) --no-print-directory test-3.13 || status=$$?; \
+	echo 'make: waiting for Python 3.11' >&2; \
+	wait $$second || status=$$?; \
+	cat build/test-3.11.log; \
+	exit $$status
 
 lint:
 	@python=$$($(SETUP) python newest) && "$$python" -m ruff check .
@@ -42,6 +54,15 @@ test-3.13 test-3.11: test-%:
 		status=$(if $(STRICT),1,0); \
 	fi; \
 	exit $$status
+
+BLENDER ?= blender
+
+test-blender:
+	@packages=$$($(SETUP) blender "$(BLENDER)") && LTSH_TEST_PACKAGES=$$packages $(LIMIT) "$(BLENDER)" --background \
+		--factory-startup --disable-autoexec --python tests/run_in_blender.py -- $(or $(PYTEST_OPTIONS),tests/blender)
+
+extension:
+	@python=$$($(SETUP) python newest) && "$$python" requirements/build_extension.py $(EXTENSION_OPTIONS)
 
 bench:
 	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)

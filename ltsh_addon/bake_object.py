@@ -17,6 +17,7 @@ from .bake_errors import ErrorPictures, ErrorSums
 from .bake_planes import Planes
 from .bake_resume import job_metadata
 from .scene import Cancelled, SurfaceSamples
+from .shading.workers import cores
 
 # Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
 BLOCK_TEXELS = 1 << 18
@@ -113,7 +114,7 @@ class ObjectBaker:
 
     def _threads(self) -> int:
         """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
-        return 1 if shading.REFERENCE in self.tables.values() else compare.cores()
+        return 1 if shading.REFERENCE in self.tables.values() else cores()
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR but for the coverage."""

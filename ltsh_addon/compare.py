@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -186,11 +185,6 @@ def versions(blender_version: str) -> dict[str, str]:
         "numpy": np.__version__,
         "OpenEXR": getattr(OpenEXR, "__version__", "unknown"),
     }
-
-
-def cores() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def known_technique(name: str) -> bool:

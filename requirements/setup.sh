@@ -3,6 +3,7 @@
 #
 #   setup.sh find VERSION     print the interpreter of that version; exit code 3 when there is none
 #   setup.sh python VERSION   make the environment if it is missing or outdated, print its interpreter
+#   setup.sh blender PROGRAM  install what tests need in that Blender beside its own Python, print the folder
 #   setup.sh lock [OPTION..]  rewrite the lock files (options go to `uv pip compile`, for example --upgrade)
 #
 # VERSION is 3.13, 3.11 or newest. LTSH_PYTHON_313 and LTSH_PYTHON_311 name an interpreter, or say "none": that
@@ -183,6 +184,30 @@ make_environment() {
     printf '%s\n' "$directory/bin/python"
 }
 
+# ---- packages for the tests in a real Blender
+
+# The folder is named after the Python: pip fills it for that one, whatever Python runs pip.
+make_blender_packages() {
+    local blender=$1 version directory python
+    command -v "$blender" >/dev/null 2>&1 || fail "'$blender' is no program, expected the path of Blender: BLENDER=..."
+    version=$(limited 120 "$blender" --background --factory-startup --python-expr \
+        'import sys; print("ltsh-python %d.%d" % sys.version_info[:2])' 2>/dev/null </dev/null |
+        sed -n 's/^ltsh-python //p' || true)
+    [ -n "$version" ] || fail "$blender does not tell which Python it has, expected Blender 4.5 or newer"
+    directory=$environments/blender-py${version//./}
+    if ! cmp -s "$here/blender.txt" "$directory/ltsh-stamp"; then
+        python=$(make_environment "$(resolve newest)")
+        say "making $directory"
+        rm -rf "$directory"
+        "$python" -m pip install --quiet --disable-pip-version-check --no-input --no-deps --only-binary :all: \
+            --implementation cp --python-version "$version" --target "$directory" --require-hashes \
+            -r "$here/blender.txt" >&2 </dev/null ||
+            fail "pip could not install requirements/blender.txt for Python $version; see its messages above"
+        cp "$here/blender.txt" "$directory/ltsh-stamp"
+    fi
+    printf '%s\n' "$directory"
+}
+
 # ---- lock files
 
 # PIP_* settings of the machine do not reach uv; the --no-emit options keep addresses out of the files.
@@ -195,11 +220,21 @@ write_locks() {
     "$python" -m venv "$scratch/uv"
     "$scratch/uv/bin/python" -m pip install --quiet --disable-pip-version-check "$uv_requirement"
     for version in $versions; do
-        (cd "$here" && "$scratch/uv/bin/uv" pip compile --quiet --no-config --universal --no-python-downloads \
-            --python-version "$version" --generate-hashes --no-annotate --no-emit-index-url --no-emit-find-links \
-            --custom-compile-command "make lock" "$@" -o "py${version//./}.txt" "py${version//./}.in")
-        say "wrote requirements/py${version//./}.txt"
+        compile "$version" "py${version//./}" "py${version//./}" "$@"
     done
+    # The wheels that the extension's zips bring along, for every Python from the oldest one up.
+    compile "${versions##* }" runtime wheels --no-deps "$@"
+    compile "${versions##* }" blender blender --no-emit-package numpy "$@"
+}
+
+# compile PYTHON_VERSION INPUT OUTPUT [OPTION..]; uses `scratch` of the caller.
+compile() {
+    local version=$1 input=$2 output=$3
+    shift 3
+    (cd "$here" && "$scratch/uv/bin/uv" pip compile --quiet --no-config --universal --no-python-downloads \
+        --python-version "$version" --generate-hashes --no-annotate --no-emit-index-url --no-emit-find-links \
+        --custom-compile-command "make lock" "$@" -o "$output.txt" "$input.in")
+    say "wrote requirements/$output.txt"
 }
 
 main() {
@@ -209,8 +244,9 @@ main() {
         version=$(resolve "${2:-}") || return
         if [ "$1" = find ]; then find_python "$version"; else make_environment "$version"; fi
         ;;
+    blender) make_blender_packages "${2:-blender}" ;;
     lock) shift && write_locks "$@" ;;
-    *) fail "usage: setup.sh find VERSION | python VERSION | lock [OPTION..]" ;;
+    *) fail "usage: setup.sh find VERSION | python VERSION | blender PROGRAM | lock [OPTION..]" ;;
     esac
 }
 

@@ -1,12 +1,18 @@
 """Settings of the whole suite; nothing here imports bpy, so that tests of the core stay free of it."""
 
+import atexit
+import os
 import platform
+import sys
 from importlib.metadata import PackageNotFoundError, version
 
+import pytest
 from hypothesis import settings
 
 settings.register_profile("ltsh", derandomize=True, deadline=None, database=None)
 settings.load_profile("ltsh")
+
+EXIT_STATUS = pytest.StashKey[int]()
 
 
 def pytest_report_header():
@@ -18,3 +24,18 @@ def pytest_report_header():
         except PackageNotFoundError:
             names.append(f"no {name}")
     return f"LTSH: Python {platform.python_version()}, {', '.join(names)}"
+
+
+def pytest_sessionfinish(session, exitstatus):
+    """Keep the exit code for the end of the run."""
+    session.config.stash[EXIT_STATUS] = int(exitstatus)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_unconfigure(config):
+    """End without the C library's exit where bpy is loaded: bpy 4.5 now and then never comes back from it."""
+    if "bpy" in sys.modules and EXIT_STATUS in config.stash:
+        atexit._run_exitfuncs()  # pytest removes old temporary folders there
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(config.stash[EXIT_STATUS])

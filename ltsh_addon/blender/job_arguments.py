@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from . import preflight
+from .preferences import preferences
 
 NO_CYCLES = "Cycles was not rendered: the job was stopped before"
 REFERENCE = "reference"
@@ -66,10 +67,13 @@ def chosen(settings, key: str) -> list[str]:
 
 
 def output_folder(scene, command: str) -> Path:
-    """Where `command` writes: beside the .blend as the settings have it, or a temporary folder of this session."""
-    root = Path(bpy.app.tempdir) / "ltsh"
-    if bpy.data.filepath:
-        root = Path(bpy.path.abspath(scene.ltsh.output_folder or "//ltsh/"))
+    """Where `command` writes: the folder of the settings, or that of the preferences where it is empty or where the
+    .blend that it is relative to is not saved."""
+    folder = scene.ltsh.output_folder.strip()
+    if folder and (bpy.data.filepath or not folder.startswith("//")):
+        root = Path(bpy.path.abspath(folder))
+    else:
+        root = preferences(bpy.context).output_folder / (Path(bpy.data.filepath).stem or "untitled")
     if len(bpy.data.scenes) > 1:
         root /= bpy.path.clean_name(scene.name)
     return root / command

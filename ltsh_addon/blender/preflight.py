@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
 
+from .availability import missing_libraries
 from .cameras import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from .emission_nodes import emission_behind
 from .shader_graph import material_output
@@ -97,9 +97,8 @@ def _sentence(text: str) -> str:
 
 
 def _packages() -> list[Problem]:
-    if importlib.util.find_spec("OpenEXR") is None:
-        return [Problem("The package OpenEXR is missing: install the extension's zip for this system")]
-    return []
+    missing = missing_libraries()
+    return [Problem(missing)] if missing else []
 
 
 def _camera(scene) -> list[Problem]:
@@ -148,7 +147,7 @@ def glows(material) -> bool:
 def _files(settings) -> list[Problem]:
     found = []
     if not bpy.data.filepath:
-        text = "The file is not saved: results last until Blender quits"
+        text = "The file is not saved: results go to the output folder of the preferences"
         found.append(Problem(text, False, "wm.save_mainfile", "Save"))
     elif (reason := _not_writable(settings.output_folder)) != "":
         found.append(Problem(reason))

@@ -89,8 +89,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )
     output_folder: StringProperty(
         name="Output",
-        description="Folder for the results, in folders of their own for shading, comparing and baking. "
-        "In a file that is not saved yet a temporary folder takes its place",
+        description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
+        "folder of the .blend. Empty takes the one of the preferences, as does a file that is not saved yet",
         subtype="DIR_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
         default="//ltsh/",

@@ -1,45 +1,51 @@
-"""What LTSH adds to a running Blender: panels, operators, and the command `blender [FILE] --command ltsh ...`."""
+"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import bpy
 
-from . import (
-    image_panels,
-    operators,
-    operators_fix,
-    operators_view,
-    overview,
-    panels,
-    probe,
-    properties,
-    settings_presets,
-    viewer,
-    wipe,
+# Modules of this package with register() and unregister(), in the order in which they need each other.
+PARTS = (
+    "preferences",
+    "properties",
+    "operators",
+    "operators_fix",
+    "operators_view",
+    "overview",
+    "viewer",
+    "probe",
+    "wipe",
+    "settings_presets",
+    "panels",
+    "image_panels",
 )
 
-PARTS = (properties, operators, operators_fix, operators_view, overview, viewer, probe, wipe, settings_presets,
-         panels, image_panels)  # fmt: skip
-
-_handles = []
+# Takes back what is registered, last first; one that fails does not keep the others from it.
+_registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
+    """Add everything or, where a part fails, nothing; `command_line` is `cli.main`. `unregister` removes it."""
 
     def run(arguments: list[str]) -> int:
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
-    for part in PARTS:
-        part.register()
-    _handles.append(bpy.utils.register_cli_command("ltsh", run))
+    with ExitStack() as added:
+        added.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("ltsh", run))
+        for name in PARTS:
+            part = importlib.import_module(f".{name}", __package__)
+            part.register()
+            added.callback(part.unregister)
+        _registered.push(added.pop_all())
 
 
 def unregister() -> None:
     """Remove what `register` added."""
-    while _handles:
-        bpy.utils.unregister_cli_command(_handles.pop())
-    for part in reversed(PARTS):
-        part.unregister()
+    from . import availability
+
+    availability.missing_libraries.cache_clear()
+    _registered.close()

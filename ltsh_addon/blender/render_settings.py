@@ -6,6 +6,7 @@ from pathlib import Path
 
 import bpy
 
+from ..shading.workers import cores
 from .cameras import hold_still
 from .child import SceneError
 from .inventory import SURFACE_TYPES
@@ -49,7 +50,7 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     scene.camera = camera
     hold_still(scene, camera)
     render.engine = "CYCLES"
-    render.threads_mode = "AUTO"
+    render.threads_mode, render.threads = "FIXED", cores()
     render.use_compositing = render.use_sequencer = False
     # Alpha 0 then means a holdout and nothing else; the passes are the same.
     render.film_transparent = False

@@ -24,6 +24,7 @@ from .block_exchange import ParentSide
 SECONDS_WORTH_A_CHILD = 0.5
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
+CORES_VARIABLE = "LTSH_CORES"
 _PACKAGE = __package__.rpartition(".")[0]
 _logger = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ def run(
 ) -> None:
     """Call keep(block, radiance, error) with the result of every block, from this thread or another one.
 
-    `workers` processes in all (None: as many as there are cores). After every block `progress` is called from this
+    `workers` processes in all (None: as many as `cores` says). After every block `progress` is called from this
     thread; where it returns False Cancelled is raised. No child is left when this returns or raises.
     """
     queue = _Queue(blocks, keep)
@@ -55,10 +56,17 @@ def run(
 
 def _children_wanted(task, count, blocks, workers) -> int:
     if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        workers = cores()
     if workers < 2 or task.seconds(count) < SECONDS_WORTH_A_CHILD or interpreter() is None:
         return 0
     return min(workers, len(blocks)) - 1
+
+
+def cores() -> int:
+    """Cores that this process may use: those it may run on, at most as many as the environment's LTSH_CORES says."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get(CORES_VARIABLE, "").strip()
+    return min(there, int(limit)) if limit.isdecimal() and int(limit) > 0 else there
 
 
 def interpreter() -> str | None:

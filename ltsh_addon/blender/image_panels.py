@@ -18,25 +18,39 @@ def draw_figures(layout, context, result, choice) -> None:
     if not figures:
         return
     box = layout.box()
-    column = box.column(align=True)
-    head = column.row()
-    head.active = False
-    head.label(text="vs Cycles")
-    for _, title in FIGURES:
-        cell = head.row()
-        cell.alignment = "RIGHT"
-        cell.label(text=title)
-    for name, row in figures["techniques"].items():
-        line = column.row()
-        line.label(text=group["labels"][name], translate=False)
-        for key, _ in FIGURES:
-            cell = line.row()
+    split = box.split(factor=0.34)
+    column = split.column(align=True)
+    title = column.row()
+    title.active = False
+    title.label(text="vs Cycles")
+    for name in figures["techniques"]:
+        column.label(text=group["labels"][name], translate=False)
+    side = split.row()
+    for key, title in FIGURES:
+        column = side.column(align=True)
+        column.alignment = "RIGHT"
+        head = column.row()
+        head.alignment, head.active = "RIGHT", False
+        head.label(text=title)
+        for row in figures["techniques"].values():
+            cell = column.row()
             cell.alignment = "RIGHT"
             cell.label(text=_figure(key, row.get(key)), translate=False)
     if figures.get("noise") is not None:
-        row = box.row()
-        row.active = False
-        panel_parts.draw_text(row, context, f"Noise of Cycles {100.0 * figures['noise']:.2f} %, part of Rel. L2")
+        notes = box.column()
+        notes.active = False
+        panel_parts.draw_text(notes, context, _noise_text(group, figures))
+
+
+def _noise_text(group, figures) -> str:
+    """How much of the error is the noise of Cycles, and what is left without it."""
+    rest = []
+    for name, row in figures["techniques"].items():
+        squared = row.get("unbiased_squared_error")
+        if squared is not None:
+            value = "in noise" if squared < 0.0 else f"{100.0 * squared**0.5:.2f} %"
+            rest.append(f"{group['labels'][name]} {value}")
+    return f"Noise of Cycles {100.0 * figures['noise']:.2f} %. Error without it: {', '.join(rest)}"
 
 
 def _figure(key: str, value: float | None) -> str:

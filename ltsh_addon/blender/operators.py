@@ -6,12 +6,22 @@ import atexit
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_iface as translated
 
 from . import job_arguments, preflight, results, viewer
 from .child import SceneError
 from .job import Job, clock, new_folder
 
 TIMER_SECONDS = 0.1
+# What stages of the command line are called here; others keep their names.
+STAGES = {
+    "open scene": "Open Scene",
+    "samples": "Sample Surfaces",
+    "Cycles A": "Cycles, First Half",
+    "Cycles B": "Cycles, Second Half",
+    "write": "Write Files",
+    "images": "Make Pictures",
+}
 _running: dict = {"job": None}
 
 
@@ -183,9 +193,9 @@ class LTSH_OT_cancel(bpy.types.Operator):
 
 def progress_text(job: Job) -> str:
     """Stage, percent and time left in a few words."""
-    text = f"{job.stage}  {100.0 * job.fraction:.0f} %"
+    text = f"{translated(STAGES.get(job.stage, job.stage))}  {100.0 * job.fraction:.0f} %"
     left = job.seconds_left()
-    return text if left is None else f"{text},  {clock(left)} left"
+    return text if left is None else f"{text}, {clock(left)} {translated('left')}"
 
 
 def redraw_panels() -> None:

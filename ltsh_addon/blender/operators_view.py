@@ -54,7 +54,21 @@ class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
         area.type = "IMAGE_EDITOR"
         area.spaces.active.image = viewer.viewer_image(context.scene)
         area.spaces.active.show_region_ui = True
+        window = context.window
+        # Blender knows the size and the tabs of the new area after it has drawn it.
+        bpy.app.timers.register(lambda: _arrange(window, area), first_interval=0.2)
         return {"FINISHED"}
+
+
+def _arrange(window, area) -> None:
+    """Fit the picture into its new area and open our tab."""
+    try:
+        regions = {region.type: region for region in area.regions}
+        regions["UI"].active_panel_category = "LTSH"
+        with bpy.context.temp_override(window=window, area=area, region=regions["WINDOW"]):
+            bpy.ops.image.view_all(fit_view=True)
+    except (ReferenceError, TypeError, RuntimeError):
+        pass  # the area has been closed meanwhile
 
 
 class LTSH_OT_show_results(bpy.types.Operator):

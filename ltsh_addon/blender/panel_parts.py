@@ -12,12 +12,12 @@ from .job import clock
 
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
 MARGIN_PIXELS = 70.0  # icon, scroll bar and borders
+TOGGLE_PIXELS = 85.0
 
 
 def draw_text(layout, context, text: str, icon: str = "NONE", reserved: float = 0.0) -> None:
     """`text` in as many lines as the region needs; `reserved` pixels are taken by something beside it."""
-    scale = context.preferences.system.ui_scale
-    width = context.region.width / scale - MARGIN_PIXELS - reserved
+    width = region_width(context) - MARGIN_PIXELS - reserved
     column = layout.column(align=True)
     column.scale_y = 0.85
     lines = textwrap.wrap(text, max(16, int(width / LETTER_PIXELS))) or [""]
@@ -45,24 +45,40 @@ def draw_problems(layout, context, command: str) -> bool:
     return not any(problem.blocks for problem in found)
 
 
+def toggles(layout, context, count: int):
+    """A layout for `count` buttons of a set of choices: one row where they fit, else two columns."""
+    fits = region_width(context) >= TOGGLE_PIXELS * count
+    return layout.grid_flow(row_major=True, columns=count if fits else 2, even_columns=True, align=True)
+
+
+def region_width(context) -> float:
+    """Of the region that is drawn, in pixels at interface scale 1."""
+    return context.region.width / context.preferences.system.ui_scale
+
+
 def draw_job(layout) -> bool:
     """The job that runs, with its Cancel button; False where none does."""
     job = operators.running_job()
     if job is None:
         return False
-    box = layout.box()
-    row = box.row()
+    column = layout.box().column()
+    row = column.row()
     row.label(text=job.title, icon="RENDER_STILL")
+    _draw_right(row, clock(job.seconds()))
+    column.progress(factor=job.fraction, text=operators.progress_text(job))
+    row = column.row()
+    step = row.row()
+    step.active = False
+    of = f" / {job.steps}" if job.steps else ""
+    step.label(text=f"{translated('Step')} {min(job.step, job.steps or job.step)}{of}", translate=False)
     row.operator("ltsh.cancel", text="Cancel", icon="X")
-    box.progress(factor=job.fraction, text=operators.progress_text(job))
-    row = box.row()
-    row.active = False
-    step = f"Step {min(job.step, job.steps)} of {job.steps}" if job.steps else f"Step {job.step}"
-    row.label(text=step, translate=False)
-    side = row.row()
-    side.alignment = "RIGHT"
-    side.label(text=clock(job.seconds()), translate=False)
     return True
+
+
+def _draw_right(row, text: str) -> None:
+    side = row.row()
+    side.alignment, side.active = "RIGHT", False
+    side.label(text=text, translate=False)
 
 
 def draw_button(layout, context, operator: str, icon: str, ready: bool) -> None:

@@ -27,7 +27,7 @@ class _Main:
         running = panel_parts.draw_job(layout)
         column = layout.column()
         column.label(text="Techniques")
-        column.row(align=True).prop(settings, "techniques")
+        panel_parts.toggles(column, context, 4).prop(settings, "techniques")
         column.separator(factor=0.5)
         column.label(text="Passes")
         column.row(align=True).prop(settings, "passes")
@@ -55,8 +55,7 @@ class _Bake:
     def draw(self, context):
         layout, settings = self.layout, context.scene.ltsh
         column = layout.column()
-        grid = column.grid_flow(row_major=True, columns=2, even_columns=True, align=True)
-        grid.prop(settings, "bake_passes")
+        panel_parts.toggles(column, context, 4).prop(settings, "bake_passes")
         layout.use_property_split, layout.use_property_decorate = True, False
         column = layout.column()
         column.prop(settings, "bake_size")

@@ -87,7 +87,7 @@ def _draw() -> None:
     else:
         drawing.draw_label(left, below, f"{first} \u2212 {second}", scale)
         limit = viewer.error_scale(settings, result.groups[choice.group], choice)
-        _draw_legend(right, below, limit, scale)
+        _draw_legend(left, below - 26.0 * scale, limit, scale)
     if result.partial:
         drawing.draw_label(left, top + gap, result.partial, scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
@@ -105,14 +105,14 @@ def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
         )
 
 
-def _draw_legend(right: float, below: float, limit: float, scale: float) -> None:
-    """The colors of the difference with their ends, its right end at `right`."""
-    width, height = 200.0 * scale, 20.0 * scale
-    start, end = f"\u2212{limit:g} too dark", f"too bright +{limit:g}"
-    drawing.draw_label(right, below, end, scale, align=1.0)
-    bar_right = right - drawing.text_width(end, scale) - 18.0 * scale
-    drawing.draw_gradient(bar_right - width, below, bar_right, below + height, color_bar(65, 1)[0])
-    drawing.draw_label(bar_right - width - 6.0 * scale, below, start, scale, align=1.0)
+def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
+    """The colors of the difference between their ends, from `left` on."""
+    width, height, gap = 160.0 * scale, 20.0 * scale, 12.0 * scale
+    start, end = f"too dark \u2212{limit:g}", f"+{limit:g} too bright"
+    drawing.draw_label(left, below, start, scale)
+    bar = left + drawing.text_width(start, scale) + gap
+    drawing.draw_gradient(bar, below, bar + width, below + height, color_bar(65, 1)[0])
+    drawing.draw_label(bar + width, below, end, scale)
 
 
 CLASSES = (LTSH_OT_drag_split,)

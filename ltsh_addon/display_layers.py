@@ -56,7 +56,7 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     return {
         "size": [width, height],
         "names": names,
-        "labels": {CYCLES: "Cycles", **{name: compare.LABELS.get(name, name) for name in names if name != CYCLES}},
+        "labels": {name: "Cycles" if name == CYCLES else compare.LABELS.get(name, name) for name in names},
         "passes": passes,
         "files": written,
         "multilayer": path.name,

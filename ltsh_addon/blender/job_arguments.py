@@ -9,7 +9,7 @@ import bpy
 from . import preflight
 from .preferences import preferences
 
-NO_CYCLES = "Cycles was not rendered: the job was stopped before"
+NO_CYCLES = "Not complete: without Cycles"
 REFERENCE = "reference"
 
 

@@ -13,6 +13,7 @@ from .child import SceneError
 from .job import Job, clock, new_folder
 
 TIMER_SECONDS = 0.1
+PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 # What stages of the command line are called here; others keep their names.
 STAGES = {
     "open scene": "Open Scene",
@@ -97,14 +98,18 @@ class _JobOperator:
             job.remove_folder()
             self.report({"ERROR"}, " ".join(str(error).split()))
             return False
-        self._job, self._scene, self._shown = job, context.scene.name, 0
+        self._job, self._scene, self._shown, self._progress = job, context.scene.name, 0, None
         _running["job"] = job
         return True
 
     def _show_progress(self, context) -> None:
-        job = self._job
-        context.workspace.status_text_set(f"{job.title}: {progress_text(job)}    Esc: Cancel")
-        redraw_panels()
+        """Draw progress again where it has changed, at most a few times per second."""
+        text = f"{self._job.title}: {progress_text(self._job)}    {translated('Esc')}: {translated('Cancel')}"
+        shown = text, clock(self._job.seconds())
+        if shown != self._progress:
+            self._progress = shown
+            context.workspace.status_text_set(text)
+            redraw_panels()
 
     def _show_results(self, context) -> None:
         scene = bpy.data.scenes.get(self._scene)
@@ -199,11 +204,13 @@ def progress_text(job: Job) -> str:
 
 
 def redraw_panels() -> None:
-    """Draw everything again that shows progress."""
+    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in ("VIEW_3D", "PROPERTIES", "IMAGE_EDITOR"):
-                area.tag_redraw()
+            wanted = PANEL_REGIONS.get(area.type)
+            for region in area.regions:
+                if region.type == wanted:
+                    region.tag_redraw()
 
 
 @bpy.app.handlers.persistent

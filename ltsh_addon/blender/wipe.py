@@ -10,7 +10,7 @@ from .probe import draw_probe
 
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
-_state = {"handle": None, "keymaps": []}
+_state = {"handle": None}
 
 
 def _shown(context):
@@ -29,37 +29,50 @@ def line_position(context) -> float:
     return context.region.view2d.view_to_region(context.scene.ltsh.split, 0.0, clip=False)[0]
 
 
-class LTSH_OT_drag_split(bpy.types.Operator):
-    """Drag the line between the two pictures"""
+class LTSH_GT_split(bpy.types.Gizmo):
+    """The line itself; `_draw` shows it, so that it looks the same where gizmos are switched off."""
 
-    bl_idname = "ltsh.drag_split"
-    bl_label = "Drag Split"
-    bl_options = {"UNDO", "INTERNAL"}
+    bl_idname = "LTSH_GT_split"
+
+    def draw(self, context):
+        """Nothing beside what `_draw` shows."""
+
+    def test_select(self, context, location):
+        grip = GRIP_PIXELS * context.preferences.system.ui_scale
+        return 0 if abs(location[0] - line_position(context)) <= grip else -1
 
     def invoke(self, context, event):
-        if context.region is None or context.region.type != "WINDOW" or _shown(context) is None:
-            return {"PASS_THROUGH"}
-        grip = GRIP_PIXELS * context.preferences.system.ui_scale
-        distance = abs(event.mouse_region_x - line_position(context))
-        if context.scene.ltsh.mode != "WIPE" or distance > grip:
-            return {"PASS_THROUGH"}
         self._before = context.scene.ltsh.split
         context.window.cursor_modal_set("MOVE_X")
-        context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def modal(self, context, event):
-        settings = context.scene.ltsh
-        if event.type == "MOUSEMOVE":
-            settings.split = context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0]
-        elif event.type in {"ESC", "RIGHTMOUSE"}:
-            settings.split = self._before
-            context.window.cursor_modal_restore()
-            return {"CANCELLED"}
-        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
-            context.window.cursor_modal_restore()
-            return {"FINISHED"}
+    def modal(self, context, event, tweak):
+        context.scene.ltsh.split = context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0]
         return {"RUNNING_MODAL"}
+
+    def exit(self, context, cancel):
+        context.window.cursor_modal_restore()
+        if cancel:
+            context.scene.ltsh.split = self._before
+        elif context.scene.ltsh.split != self._before:
+            bpy.ops.ed.undo_push(message="Drag Split")
+
+
+class LTSH_GGT_split(bpy.types.GizmoGroup):
+    """Takes the mouse at the line before any tool of the Image Editor does"""
+
+    bl_idname = "LTSH_GGT_split"
+    bl_label = "Split of the Comparison"
+    bl_space_type = "IMAGE_EDITOR"
+    bl_region_type = "WINDOW"
+    bl_options = {"PERSISTENT", "SHOW_MODAL_ALL"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _shown(context) is not None
+
+    def setup(self, context):
+        self.gizmos.new(LTSH_GT_split.bl_idname)
 
 
 def _draw() -> None:
@@ -115,22 +128,15 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     drawing.draw_label(bar + width, below, end, scale)
 
 
-CLASSES = (LTSH_OT_drag_split,)
+CLASSES = (LTSH_GT_split, LTSH_GGT_split)
 _register, _unregister = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register():
     _register()
     _state["handle"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
-    configuration = bpy.context.window_manager.keyconfigs.addon
-    if configuration is not None:  # None without a window
-        keymap = configuration.keymaps.new(name="Image", space_type="IMAGE_EDITOR")
-        _state["keymaps"].append((keymap, keymap.keymap_items.new("ltsh.drag_split", "LEFTMOUSE", "PRESS")))
 
 
 def unregister():
-    for keymap, item in _state["keymaps"]:
-        keymap.keymap_items.remove(item)
-    _state["keymaps"].clear()
     bpy.types.SpaceImageEditor.draw_handler_remove(_state["handle"], "WINDOW")
     _unregister()

@@ -8,7 +8,7 @@ from . import panel_parts, results, viewer
 from .job_arguments import output_folder
 from .operators_view import COMMANDS
 
-FIGURES = (("relative_l2", "Rel. L2"), ("bias", "Bias"), ("flip", "FLIP"))
+FIGURES = (("relative_l2", "L2 %"), ("bias", "Bias %"), ("flip", "FLIP"))
 
 
 def draw_figures(layout, context, result, choice) -> None:
@@ -58,7 +58,7 @@ def _figure(key: str, value: float | None) -> str:
         return "\u2013"
     if key == "flip":
         return f"{value:.4f}"
-    return f"{100.0 * value:+.2f} %" if key == "bias" else f"{100.0 * value:.2f} %"
+    return f"{100.0 * value:+.2f}" if key == "bias" else f"{100.0 * value:.2f}"
 
 
 class _Results:
@@ -83,10 +83,10 @@ class _Results:
         self.draw_choice(context, result)
         draw_figures(layout, context, result, results.choice_of(scene.ltsh, result))
         self.draw_warnings(context, result)
-        row = layout.row(align=True)
         if context.space_data.type != "IMAGE_EDITOR":
-            row.operator("ltsh.open_results", icon="IMAGE_DATA")
-        row.operator("ltsh.save_exr", text="Save As", icon="FILE_TICK")
+            layout.operator("ltsh.open_results", icon="IMAGE_DATA")
+        row = layout.row(align=True)
+        row.operator("ltsh.save_exr", icon="FILE_TICK")
         row.operator("ltsh.open_folder", text="", icon="FILE_FOLDER")
 
     def draw_choice(self, context, result):
@@ -116,7 +116,7 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
         if not viewer.is_viewer(context.space_data.image):
             layout.operator("ltsh.open_results", text="Show Comparison", icon="IMAGE_DATA")
         column = layout.column()
-        column.row(align=True).prop(settings, "mode", expand=True)
+        panel_parts.toggles(column, context, 4).prop(settings, "mode", expand=True)
         group = result.groups[results.choice_of(settings, result).group]
         self._draw_names(column, settings, "first", "A", group)
         if settings.mode != "A":
@@ -129,7 +129,7 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
             row.prop(settings, "split", slider=True)
             row.operator("ltsh.swap", text="", icon="ARROW_LEFTRIGHT")
         elif settings.mode == "ERROR":
-            column.prop(settings, "error_scale")
+            column.prop(settings, "error_scale", text="Scale (0: Automatic)")
         view = context.scene.view_settings
         column.prop(view, "exposure", text="Exposure of the Scene")
         layout.operator("ltsh.probe", icon="EYEDROPPER")

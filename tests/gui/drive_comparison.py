@@ -58,7 +58,8 @@ def finished(rig):
               "pictures are images of Blender")  # fmt: skip
     with rig.override():
         bpy.ops.ltsh.open_results()
-    yield 2
+    # The picture is fitted into its new area one redraw after that area is there.
+    yield 5
     rig.shot("4_wipe.png")
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
+from . import output_names
 from .compare import DEFAULT_TECHNIQUES, known_technique
 from .shading import PASSES, SHIPPED_TABLES
 
 # Blender's own limits: of a side of the picture in pixels, and of frames.
 SMALLEST_SIDE, LARGEST_SIDE = 4, 65536
 LAST_FRAME = 1048574
+_FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 
 
 class Misuse(Exception):
@@ -58,11 +61,46 @@ def resolution(text: str) -> tuple[int, int]:
     )
 
 
-def frame(text: str) -> int:
-    """A frame number."""
-    if text.removeprefix("-").isdecimal() and abs(int(text)) <= LAST_FRAME:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"frame is {text!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}")
+def frames(text: str) -> tuple[int, ...]:
+    """Frame numbers: single ones and ranges FIRST-LAST or FIRST-LAST:STEP, separated by commas; each once."""
+    found: dict[int, None] = {}
+    for part in text.split(","):
+        match = _FRAMES.fullmatch(part.strip())
+        first, last, step = (None if group is None else int(group) for group in match.groups()) if match else [None] * 3
+        if first is None or max(abs(first), abs(last or 0)) > LAST_FRAME:
+            raise argparse.ArgumentTypeError(
+                f"frame is {part!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}, or a range such as "
+                "1-240 or 1-240:2"
+            )
+        if last is not None and (last < first or step == 0):
+            raise argparse.ArgumentTypeError(f"frames are {part!r}, expected FIRST-LAST:STEP, upwards, STEP above 0")
+        found.update(dict.fromkeys(range(first, (first if last is None else last) + 1, step or 1)))
+    return tuple(found)
+
+
+def shard(text: str) -> tuple[int, int]:
+    """I/N with 1 <= I <= N."""
+    number, separator, count = text.partition("/")
+    if separator and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
+        return int(number), int(count)
+    raise argparse.ArgumentTypeError(f"shard is {text!r}, expected I/N with I from 1 to N, such as 1/4 to 4/4")
+
+
+def name_of_picture(text: str) -> str:
+    """A pattern for the names of pictures."""
+    return _pattern(text, tuple(name for name in output_names.FIELDS if name != "object"))
+
+
+def name_of_bake(text: str) -> str:
+    """A pattern for the names of baked objects."""
+    return _pattern(text, output_names.FIELDS)
+
+
+def _pattern(text, fields):
+    try:
+        return output_names.check_pattern(text, fields)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def positive(text: str) -> int:
@@ -80,10 +118,10 @@ def cycles_samples(text: str) -> int:
     return value
 
 
-def scene(arguments, open_file: str | None) -> Path:
-    """The .blend to work on: the one named, or the one that Blender has open. Raises Misuse."""
-    if arguments.scene and open_file:
-        raise Misuse(f"SCENE is {arguments.scene!r}, but Blender has {open_file!r} open already; give one of them")
-    if not (arguments.scene or open_file):
+def scenes(arguments, open_file: str | None) -> tuple[Path, ...]:
+    """The files to work on: those named, or the one that Blender has open. Raises Misuse."""
+    if arguments.scenes and open_file:
+        raise Misuse(f"SCENE is {arguments.scenes[0]!r}, but Blender has {open_file!r} open already; give one of them")
+    if not (arguments.scenes or open_file):
         raise Misuse("SCENE.blend is missing: name a file (or open one in Blender first)")
-    return Path(arguments.scene or open_file)
+    return tuple(Path(scene) for scene in dict.fromkeys(arguments.scenes or [open_file]))

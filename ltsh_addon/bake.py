@@ -11,11 +11,15 @@ from pathlib import Path
 
 from . import compare, imaging
 from .bake_object import ObjectBaker, applied_layer, block_rows, shaded_passes
-from .bake_resume import finished_tiles, job_key
+from .compare import Made
+from .output_names import file_stems
 from .scene import AreaLight
+from .task_records import Records, contents_digest, options_digest
 
 BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
 SIZES = (64, 8192)
+# Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
+MARGIN_TYPES = ("extend", "adjacent")
 # Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
 NOTED_SHARE_OUTSIDE = 0.01
 
@@ -33,6 +37,7 @@ class BakeOptions:
     width: int = 1024
     height: int = 1024
     margin: int = 16  # texels
+    margin_type: str = "extend"  # one of MARGIN_TYPES
     conservative: bool = False  # also texels that a triangle touches without covering their center
     view: tuple[float, float, float] | str = "camera"  # a position in m, "camera" or "above"
     techniques: tuple[str, ...] = ("ltsh4",)
@@ -51,38 +56,74 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
     but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
     """
+    made = bake_objects(options, progress)
+    document = made.report
+    if options.apply and document["objects"]:
+        document["applied"] = apply_textures(
+            options.scene, options.output, document["objects"], applied_layer(options), progress
+        )
+    imaging.write_json(options.output / "report.json", document)
+    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
+    return {**document, "seconds": made.seconds}
+
+
+def bake_objects(
+    options: BakeOptions, progress: Progress | None = None, stems: dict[str, str] | None = None
+) -> Made:
+    """Bake the objects and write their files, but no report.json; `stems` are the names of files by object.
+
+    Raises as `bake_scene` does.
+    """
     from .blender import bake_child, child
 
     start = time.perf_counter()
     _check(options)
     tables = compare.prepare(options)
     child.check_readable(options.scene)
-    key = job_key(options)
-    finished = finished_tiles(options.output, key) if options.resume else {}
+    tiles = TileRecords(options)
     with tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        manifest = bake_child.extract_bake(_job(options, finished), folder, progress=progress)
+        manifest = bake_child.extract_bake(_job(options, tiles.finished), folder, progress=progress)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
-        stems = _file_stems([record["name"] for record in manifest["objects"]])
-        records, seconds = [], {"blender": manifest["seconds"]}
-        for record, stem in zip(manifest["objects"], stems, strict=True):
+        names = [record["name"] for record in manifest["objects"]]
+        found = [stems[name] for name in names] if stems else file_stems(names)
+        records, files, seconds = [], [], {"blender": manifest["seconds"]}
+        for record, stem in zip(manifest["objects"], found, strict=True):
             if record["problem"] is None:
+                (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                 baker = ObjectBaker(options, tables, lights, manifest, record, folder / record["folder"])
-                records.append(baker.bake(stem, key, finished, seconds, progress))
+                records.append(baker.bake(stem, tiles, files, seconds, progress))
                 shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
-    if options.apply and records:
-        document["applied"] = _apply(options, tables, records, progress)
-    imaging.write_json(options.output / "report.json", document)
     seconds["total"] = time.perf_counter() - start
-    imaging.write_json(options.output / "timing.json", {"seconds": seconds})
-    return {**document, "seconds": seconds}
+    return Made(document, seconds, tuple(files))
+
+
+class TileRecords:
+    """Which tiles of objects the same job has finished (with `resume`), and those that follow."""
+
+    def __init__(self, options: BakeOptions):
+        self._records = Records(options.output, "tiles")
+        self._key = options_digest("bake", options, contents_digest(options))
+        whole = self._records.all_whole(self._key) if options.resume else []
+        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
+
+    def take(self, name: str, tile: int, file: str) -> dict | None:
+        """What was found for a finished tile of the object `name` in `file`, and its files; else None."""
+        record = self.finished.get((name, tile))
+        return record if record is not None and file in record["files"] else None
+
+    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
+        """Record that a tile is finished."""
+        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
 
 
 def _check(options: BakeOptions) -> None:
     for side in (options.width, options.height):
         if not SIZES[0] <= side <= SIZES[1]:
             raise ValueError(f"size is {options.width}x{options.height}, expected {SIZES[0]} to {SIZES[1]} each")
+    if options.margin_type not in MARGIN_TYPES:
+        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
@@ -108,33 +149,20 @@ def _job(options, finished):
     )
 
 
-def _file_stems(names: list[str]) -> list[str]:
-    """A file name for each object: only letters that every file system takes, each once."""
-    stems = []
-    for name in names:
-        stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
-        candidate, number = stem[:100], 1
-        while candidate.casefold() in {other.casefold() for other in stems}:
-            number += 1
-            candidate = f"{stem[:100]}_{number}"
-        stems.append(candidate)
-    return stems
-
-
-def _apply(options, tables, records, progress) -> str:
-    """Save the .blend that shows the textures; its name."""
+def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
+    """Save the copy of the .blend whose objects show the textures of `records`, those of a report; its name."""
     from .blender import bake_child
 
     textures = []
     for record in records:
         files = [
-            {"path": str((options.output / tile["texture"]).absolute()), "tile": int(number)}
+            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
             for number, tile in record["tiles"].items()
         ]
-        name = f"{record['name']} {applied_layer(options, tables)}"
+        name = f"{record['name']} {layer}"
         textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
-    path = options.output / f"{Path(options.scene).stem}_baked.blend"
-    bake_child.apply_bake(options.scene, path, textures, progress=progress)
+    path = output / f"{Path(scene).stem}_baked.blend"
+    bake_child.apply_bake(scene, path, textures, progress=progress)
     return path.name
 
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import json
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from . import compare, shading
 from .bake_errors import ErrorPictures, ErrorSums
 from .bake_planes import Planes
-from .bake_resume import job_metadata
 from .scene import Cancelled, SurfaceSamples
 from .shading.workers import cores
 
@@ -39,11 +37,14 @@ class ObjectBaker:
     """Bakes all tiles of one object, block of rows by block of rows from the top."""
 
     def __init__(self, options, tables, lights, manifest, record, folder):
-        from .blender import texel_samples, uv_raster
+        from .blender import texel_samples, uv_raster, uv_seams
 
         self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
         self.mesh = texel_samples.TexelMesh.load(folder / "mesh.npz")
-        self.materials = [texel_samples.BakeMaterial.of(material) for material in record["materials"]]
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [
+            texel_samples.BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]
+        ]
         self.view = texel_samples.BakeView(**manifest["view"])
         self.manifest = manifest
         self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
@@ -52,50 +53,67 @@ class ObjectBaker:
         if not options.cycles_samples:
             self.compared = ()
         self._sample, self._raster = texel_samples.texel_samples, uv_raster.UvTriangles
+        self._seams = uv_seams.UvSeams.of
 
-    def bake(self, stem: str, key: str, finished: dict, seconds: dict, progress) -> dict:
-        """Write the files of the object that are not `finished`; its record for the report."""
-        result = {"name": self.record["name"], "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+    def bake(self, stem: str, records, files: list[str], seconds: dict, progress) -> dict:
+        """Write the files of the object that are not finished according to `records` (bake.TileRecords), add all to
+        `files`; the object's record for the report."""
+        name = self.record["name"]
+        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
         for tile in self.tiles:
-            path = self.options.output / f"{stem}{self._suffix(tile)}.exr"
+            file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
-            record = finished.get((self.record["name"], tile)) or self._tile(tile, path, key, progress)
-            seconds[path.name] = time.perf_counter() - start
-            # The order of a record that was read back.
-            result["tiles"][str(tile)] = {"file": path.name, **json.loads(json.dumps(record, sort_keys=True))}
+            record = records.take(name, tile, file)
+            if record is None:
+                found, written = self._tile(tile, stem, progress)
+                record = records.write(name, tile, stem, written, found)
+            seconds[file] = time.perf_counter() - start
+            files += record["files"]
+            found = record["report"]
+            result["tiles"][str(tile)] = {"file": file, **found}
             if self.area > 0.0:
-                baked = (record["texels"] + record["overlapping_texels"]) / (self.options.width * self.options.height)
+                baked = (found["texels"] + found["overlapping_texels"]) / (self.options.width * self.options.height)
                 result["outside"] = max(0.0, 1.0 - baked / self.area)
         return result
 
     def _suffix(self, tile) -> str:
         return "" if len(self.tiles) == 1 else f".{tile}"
 
-    def _tile(self, tile, path, key, progress):
-        """Write the file of one tile; its record."""
-        options = self.options
-        errors = ErrorSums()
-        with Planes(self.folder / f"planes_{tile}", self.channels(), options.width, options.height) as planes:
+    def _tile(self, tile, stem, progress):
+        """Write the files of one tile; its record and their names."""
+        options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
+        path = options.output / file
+        errors, written = ErrorSums(), [file]
+        with self._planes(tile) as planes:
             record = self._shade(tile, planes, errors, progress)
             pictures = None
             if self.compared:
                 size = options.width, options.height
                 pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
-                record |= {"pictures": pictures.names, "errors": errors.report()}
+                named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
+                record |= {"pictures": named, "errors": errors.report()}
+                written += named
             texture = None
             if options.apply:
-                layer = applied_layer(options, self.tables)
-                record["texture"] = f"{path.stem.removesuffix(f'.{tile}')}.{layer}{self._suffix(tile)}.exr"
-                texture = path.with_name(record["texture"]), layer
-            metadata = self._metadata(tile) | job_metadata(key, record)
-            planes.write(path, options.margin, metadata, pictures, texture)
-        return record
+                layer = applied_layer(options)
+                record["texture"] = f"{stem}.{layer}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], layer
+                written.append(record["texture"])
+            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+        return record, written
+
+    def _planes(self, tile) -> Planes:
+        options, seams = self.options, None
+        size = options.width, options.height
+        if options.margin_type == "adjacent" and options.margin > 0:
+            seams = self._seams(self.mesh.uv, self.mesh.vertices, *size, _place(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; how many texels there were."""
         options, covered, overlaps = self.options, 0, 0
-        rows, place = block_rows(options), ((tile - 1001) % 10, (tile - 1001) // 10)
-        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, place)
+        rows = block_rows(options)
+        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, _place(tile))
 
         def shaded(first):
             texels = triangles.texels(first, min(rows, options.height - first), options.conservative)
@@ -105,7 +123,7 @@ class ObjectBaker:
         for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
             covered += len(texels.index)
             overlaps += texels.overlaps
-            planes.put(first, min(rows, options.height - first), texels.index, values)
+            planes.put(first, min(rows, options.height - first), texels, values)
             self._sum_up(errors, values, halves)
             share = (number + 1) / len(firsts)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
@@ -211,6 +229,11 @@ class ObjectBaker:
         }
 
 
+def _place(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
+
+
 def _in_order(function, items, threads: int):
     """Yield function(item) in the order of `items`, of which `threads` are worked on at a time."""
     with ThreadPoolExecutor(threads) as pool:
@@ -228,10 +251,10 @@ def _in_order(function, items, threads: int):
                 future.cancel()
 
 
-def applied_layer(options, tables) -> str:
+def applied_layer(options) -> str:
     """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
     pass_name = "combined" if "combined" in options.passes else options.passes[0]
-    return f"{next(iter(tables))}.{pass_name}"
+    return f"{next(iter(compare.technique_names(options.techniques)))}.{pass_name}"
 
 
 def _put(values: dict, layer: str, pixels) -> None:

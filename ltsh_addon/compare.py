@@ -1,6 +1,7 @@
 """The whole way: a .blend in, shaded images out, beside Cycles where asked for.
 
-`shade_scene` writes OUT/shade.exr; `compare_scene` writes OUT/compare.exr, compare.png, report.json and report.html.
+`shade_scene` writes OUT/shade.exr; `compare_scene` writes OUT/compare.exr, compare.png and report.html; both write
+report.json, in which nothing depends on the machine's speed, and timing.json.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ class Options:
     camera: str | None = None
     cycles_samples: int = 512  # of both halves together
     reference_samples: int = 150_000  # above this many, `reference` takes a random subset
+    name: str | None = None  # stem of the files, below `output`; None: "shade" or "compare"
+    page: str = "report.html"  # of a comparison
 
 
 @dataclass(frozen=True)
@@ -50,19 +53,35 @@ class Result:
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
 
 
+@dataclass(frozen=True)
+class Made:
+    """What a task has done: its report, the seconds it took, and its files by their names below the output folder."""
+
+    report: dict
+    seconds: dict
+    files: tuple[str, ...]
+
+
 def shade_scene(options: Options, progress: Progress | None = None) -> dict:
-    """Shade a scene per pixel, write shade.exr, return the report.
+    """Shade a scene per pixel, write shade.exr, report.json and timing.json; the report with times as "seconds".
 
     Raises SceneError, TableError, OSError, Cancelled.
     """
-    return _run(options, False, progress)
+    return _with_report(options, False, progress)
 
 
 def compare_scene(options: Options, progress: Progress | None = None) -> dict:
-    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png, report.json and report.html."""
-    if options.cycles_samples < 2:
-        raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
-    return _run(options, True, progress)
+    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html too."""
+    return _with_report(options, True, progress)
+
+
+def _with_report(options, with_cycles, progress):
+    from . import imaging
+
+    picture = make_picture(options, with_cycles, progress)
+    imaging.write_json(Path(options.output) / "report.json", picture.report)
+    imaging.write_json(Path(options.output) / "timing.json", {"seconds": picture.seconds})
+    return {**picture.report, "seconds": picture.seconds}
 
 
 def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
@@ -70,12 +89,21 @@ def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
 
     Done before anything takes long. Raises TableError, OSError.
     """
-    tables = {}
-    for given in options.techniques:
-        name = given if given in (*shading.SHIPPED_TABLES, shading.REFERENCE) else _short_name(given, tables)
-        tables[name] = given if given == shading.REFERENCE else shading.load_table(given)
+    tables = {
+        name: given if given == shading.REFERENCE else shading.load_table(given)
+        for name, given in technique_names(options.techniques).items()
+    }
     _make_writable(Path(options.output))
     return tables
+
+
+def technique_names(techniques: Sequence[str]) -> dict[str, str]:
+    """What was given, by the names under which techniques appear in results: those of tables are short."""
+    names = {}
+    for given in techniques:
+        name = given if given in (*shading.SHIPPED_TABLES, shading.REFERENCE) else _short_name(given, names)
+        names[name] = given
+    return names
 
 
 def _short_name(path: str, taken) -> str:
@@ -86,9 +114,15 @@ def _short_name(path: str, taken) -> str:
     return next(name for name in candidates if name not in reserved)
 
 
-def _run(options, with_cycles, progress):
+def make_picture(options: Options, with_cycles: bool, progress: Progress | None = None) -> Made:
+    """Shade one picture, beside Cycles where asked for, and write its files but report.json.
+
+    Raises as `shade_scene` does.
+    """
     from .blender import child
 
+    if with_cycles and options.cycles_samples < 2:
+        raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
     start = time.perf_counter()
     tables = prepare(options)
     extraction = child.extract(
@@ -107,10 +141,11 @@ def _run(options, with_cycles, progress):
     from .comparison_output import Comparison
 
     comparison = Comparison(options, extraction, results)
-    document = comparison.report()
-    document["seconds"]["total"] = time.perf_counter() - start
-    comparison.write(Path(options.output), document, with_cycles, progress)
-    return document
+    report = comparison.report()
+    files = comparison.write(Path(options.output), report, with_cycles, progress)
+    techniques = {name: result.seconds for name, result in results.items()}
+    seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
+    return Made(report, seconds, tuple(files))
 
 
 def _make_writable(path: Path) -> None:

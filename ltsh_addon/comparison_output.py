@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from . import compare, imaging, shading
+from .comparison_summary import percent, unbiased
 from .scene import Cancelled, Film
 
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
@@ -100,10 +101,6 @@ class Comparison:
             "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
             "passes": {name: self._pass_report(name) for name in options.passes},
-            "seconds": {
-                **extraction.seconds,
-                "techniques": {name: sum(result.seconds.values()) for name, result in self.results.items()},
-            },
             "warnings": list(extraction.warnings),
         }
 
@@ -137,7 +134,7 @@ class Comparison:
 
     def _technique_report(self, name: str, pass_name: str) -> dict:
         result = self.results[name]
-        report = {"seconds": result.seconds[pass_name]}
+        report = {}
         if self.cycles:
             halves = self.cycles[pass_name]
             statistics = imaging.noisy_error_statistics(
@@ -165,11 +162,11 @@ class Comparison:
 
     # -- files --------------------------------------------------------------------------------------------------------
 
-    def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> None:
-        """Write all files into the folder `output`, once all that goes into them is there."""
+    def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> list[str]:
+        """Write all files into the folder `output`, once all that goes into them is there; their names."""
         if progress is not None and progress("write", 0.0) is False:
             raise Cancelled("stopped before the files were written")
-        name = "compare" if with_cycles else "shade"
+        name = self.options.name or ("compare" if with_cycles else "shade")
         metadata = {
             "ltsh:scene": Path(self.options.scene).name,
             "ltsh:frame": str(self.extraction.frame),
@@ -184,15 +181,15 @@ class Comparison:
             metadata["ltsh:reference"] = notice
         layers, sheet = self.layers(), self.sheet() if with_cycles else None
         chromaticities = imaging.chromaticities(self.extraction.color_space)
-        imaging.write_layers(
-            output / f"{name}.exr", layers, metadata, chromaticities, self.extraction.pixel_aspect
-        )
+        files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
+        (output / files[0]).parent.mkdir(parents=True, exist_ok=True)
+        imaging.write_layers(output / files[0], layers, metadata, chromaticities, self.extraction.pixel_aspect)
         if with_cycles:
-            imaging.write_png(output / "compare.png", sheet)
-            imaging.write_json(output / "report.json", document)
-            imaging.write_html(output / "report.html", document)
+            imaging.write_png(output / files[1], sheet)
+            imaging.write_html(output, self.options.page, files[1], files[0], document)
         if progress is not None:
             progress("write", 1.0)
+        return files
 
     def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
         """All layers of the EXR by name."""
@@ -240,21 +237,11 @@ class Comparison:
         title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
         notes = [
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
-            f"noise of the Cycles reference {_percent(noise)}",
+            f"noise of the Cycles reference {percent(noise)}",
         ]
         if notice := self._subset_notice():
             notes.append(notice)
         return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
-
-
-def _percent(value) -> str:
-    return "-" if value is None else f"{100.0 * value:.2f} %"
-
-
-def _unbiased(figures: dict) -> str:
-    """The error against two noisy halves; its square is negative where the noise is all there is to see."""
-    squared = figures.get("unbiased_squared_error")
-    return "in noise" if squared is not None and squared < 0.0 else _percent(figures.get("unbiased_relative_error"))
 
 
 def _group_names(groups) -> list[str]:
@@ -266,26 +253,7 @@ def _group_names(groups) -> list[str]:
 
 
 def _caption(report: dict) -> list[str]:
-    lines = [f"against Cycles {_unbiased(report['against_cycles'])}"]
+    lines = [f"against Cycles {unbiased(report['against_cycles'])}"]
     if "against_reference" in report:
-        lines.append(f"against reference {_percent(report['against_reference']['relative_l2'])}")
-    lines.append(f"{report['seconds']:.2f} s")
+        lines.append(f"against reference {percent(report['against_reference']['relative_l2'])}")
     return lines
-
-
-def summary(report: dict, output: Path) -> str:
-    """A table for the terminal: errors per pass and technique."""
-    lines = []
-    for pass_name, figures in report["passes"].items():
-        noise = f", noise of Cycles {_percent(figures['noise'])}" if "noise" in figures else ""
-        lines.append(f"{pass_name}{noise}")
-        heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
-        lines.append(f"  {'technique':<12}{heads}")
-        for name, row in figures["techniques"].items():
-            reference = row.get("against_reference", {})
-            classes = [_percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
-            cycles, truth = _unbiased(row.get("against_cycles", {})), _percent(reference.get("relative_l2"))
-            errors = f"{cycles:>12}{truth:>14}{classes[0]:>10}{classes[1]:>13}"
-            lines.append(f"  {name:<12}{errors}{row['seconds']:>8.2f}")
-    lines.append(f"written to {output}")
-    return "\n".join(lines)

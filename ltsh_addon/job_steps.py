@@ -10,6 +10,8 @@ import contextlib
 import io
 import json
 import os
+import sys
+import threading
 import time
 from pathlib import Path
 
@@ -48,9 +50,7 @@ class LineProgress:
 
 def perform(job: dict, stream) -> None:
     """Run the command lines of job["runs"], each {"arguments", "output", "partial"}, until one fails."""
-    from .blender import worker
-
-    worker.end_with_parent()
+    _end_with_parent()
     if hasattr(os, "nice"):
         os.nice(NICENESS)
     progress = LineProgress(stream)
@@ -66,6 +66,17 @@ def perform(job: dict, stream) -> None:
             progress.send({"error": str(error) or type(error).__name__})
             return
         progress.send({"result": str(folder)})
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as the Blender that started it closes our stdin, or is gone."""
+
+    def watch():
+        while sys.stdin.buffer.read(1):
+            pass
+        os._exit(3)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _command(arguments: list[str], progress: LineProgress) -> tuple[dict | None, str]:

@@ -20,7 +20,7 @@ from .imaging.exr import write_channels
 from .shading import load_table
 from .shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
 from .shading.spherical_harmonics import hemisphere_integrals
-from .table_header import header_text
+from .shading.table_header import header_text
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 

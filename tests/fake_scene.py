@@ -6,7 +6,7 @@ import numpy as np
 
 from ltsh_addon import shading
 from ltsh_addon.blender import child
-from ltsh_addon.scene import AreaLight, Film, SurfaceSamples
+from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
 # Of both halves of the Cycles image around the true one; the factor of A is 1 + NOISE, of B 1 - NOISE.
@@ -92,7 +92,7 @@ class FakeChild:
         points, some_lights = samples(len(some_film.pixel)), lights(self.groups)
         for stage in ("samples", "Cycles A", "Cycles B"):
             if progress is not None and progress(stage, 1.0) is False:
-                raise child.Cancelled(f"cancelled at {stage}")
+                raise Cancelled(f"cancelled at {stage}")
         return child.Extraction(
             lights=some_lights,
             samples=points,

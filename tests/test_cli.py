@@ -12,8 +12,9 @@ import fake_scene
 import numpy as np
 import pytest
 
-from ltsh_addon import __version__, argument_values, cli, shading
-from ltsh_addon.blender.child import Cancelled, SceneError
+from ltsh_addon import __version__, argument_values, cli, cli_tables, shading
+from ltsh_addon.blender.child import SceneError
+from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -116,9 +117,9 @@ def test_a_scene_beside_an_open_file_is_misuse(capsys, child, room, out, command
     assert child.asked == [] and not out.exists()
 
 
-def test_the_open_file_is_the_scene(capsys, child, out):
-    assert run(capsys, "shade", "-o", out, "--quiet", open_file="/scenes/open.blend")[0] == 0
-    assert child.asked[0].scene == Path("/scenes/open.blend")
+def test_the_open_file_is_the_scene(capsys, child, room, out):
+    assert run(capsys, "shade", "-o", out, "--quiet", open_file=room)[0] == 0
+    assert child.asked[0].scene == Path(room)
 
 
 def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
@@ -127,7 +128,7 @@ def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
 
 
 def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(cli, "__file__", str(tmp_path / "site" / "ltsh_addon" / "cli.py"))
+    monkeypatch.setattr(cli_tables, "__file__", str(tmp_path / "site" / "ltsh_addon" / "cli.py"))
     assert_misuse(run(capsys, "tables", "fit"), "needs the source checkout")
 
 
@@ -154,7 +155,7 @@ def test_the_demo_is_built_and_compared(capsys, child, out):
     assert child.built == [out / "demo.blend"] and child.asked[0].scene == out / "demo.blend"
     assert (child.asked[0].width, child.asked[0].height, child.asked[0].cycles_samples) == (480, 270, 10)
     names = {path.name for path in out.iterdir()}
-    assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html"}
+    assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html", "timing.json", ".ltsh"}
 
 
 def test_json_is_one_document_on_stdout_and_the_same_as_the_file(capsys, child, room, out):

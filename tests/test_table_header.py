@@ -6,7 +6,7 @@ import pytest
 
 from ltsh_addon import shading
 from ltsh_addon.shading.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
-from ltsh_addon.table_header import data_blocks
+from ltsh_addon.shading.table_header import data_blocks
 
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
 

@@ -25,6 +25,7 @@ class BakeJob:
     cycles_samples: int
     passes: tuple[str, ...]  # of Cycles
     finished: tuple[tuple[str, int], ...] = ()  # (object, tile): of these no maps are needed
+    look_up_images: bool = True  # False: everything that varies is a map
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: child.Progress | None = None) -> dict:

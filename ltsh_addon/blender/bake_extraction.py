@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from . import cameras, extraction, render_settings
 from .child import SceneError
@@ -22,6 +23,7 @@ from .materials import (
     lobes_of,
     objects_without_material,
 )
+from .plain_textures import SavedImages
 from .texel_bake import (
     Block,
     ObjectBake,
@@ -52,7 +54,8 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
     inventory, meshes, problems, bare = _inspect(scene, objects, job)
-    plans = _material_plans([ob for ob in objects if ob.name in meshes], bare, inventory.emitting_materials, warnings)
+    images = SavedImages(folder) if job["look_up_images"] else None
+    plans = _material_plans(objects, meshes, bare, inventory.emitting_materials, images, warnings)
     inventory.receivers.mark()
     lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -130,10 +133,15 @@ def _inspect(scene, objects, job):
     return with_render_depsgraph(scene, visit)
 
 
-def _material_plans(objects, bare, emitting, warnings) -> dict[str, list[MaterialPlan]]:
-    """For every object by name the plans of its material slots; `bare` get a material first."""
+def _material_plans(objects, meshes, bare, emitting, images, warnings) -> dict[str, list[MaterialPlan]]:
+    """For every object with a mesh by name the plans of its material slots; `bare` get a material first."""
     give_default_material(bare)
     report, made = MaterialReport(), {}
+    objects = [ob for ob in objects if ob.name in meshes]
+
+    def uv_names(material):
+        users = [ob for ob in objects if any(slot.material == material for slot in ob.material_slots)]
+        return set.intersection(*(set(meshes[ob.name][2]) for ob in users))
 
     def plan(material):
         if material.name_full not in made:
@@ -143,7 +151,7 @@ def _material_plans(objects, bare, emitting, warnings) -> dict[str, list[Materia
             if any("sheen_weight" in lobe for lobe in values):
                 report.warn(material.name, "its sheen is not baked")
             trees = tuple(leaf.tree for leaf in lobes.leaves) if lobes is not None else ()
-            made[material.name_full] = MaterialPlan(material, values, trees)
+            made[material.name_full] = MaterialPlan(material, values, trees, images, uv_names(material))
         return made[material.name_full]
 
     plans = {ob.name: [plan(slot.material) for slot in ob.material_slots] for ob in objects}
@@ -156,12 +164,16 @@ def _material_plans(objects, bare, emitting, warnings) -> dict[str, list[Materia
 
 def _object(scene, ob, mesh_and_uv, plans, job, folder, progress) -> dict:
     """Write what belongs to one object into `folder`; its record."""
-    mesh, uv_name = mesh_and_uv
+    mesh, uv_name, uv_maps = mesh_and_uv
     folder.mkdir(parents=True, exist_ok=True)
     mesh.save(folder / "mesh.npz")
     distinct = list({id(plan): plan for plan in plans}.values())
     record = {"folder": folder.name, "uv": uv_name, "materials": [plan.record() for plan in plans], "maps": False}
     record["receiver"] = int(ob.get(RECEIVER_PROPERTY, 0))
+    used = sorted({texture["uv"] for plan in plans for texture in plan.textures})
+    record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
+    for name, file in record["uv_maps"].items():
+        np.save(folder / file, uv_maps[name])
     record["maps"] = any(plan.count for plan in distinct)
     if not record["maps"] and not job["cycles_samples"]:
         return record

@@ -7,34 +7,19 @@ and the data of a running Blender stay untouched.
 from __future__ import annotations
 
 import contextlib
-import importlib.util
-import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import threading
-from collections import deque
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..scene import REC709, AreaLight, Border, Cancelled, ColorSpace, Film, SurfaceSamples
+from ..scene import REC709, AreaLight, Border, ColorSpace, Film, SurfaceSamples
 from . import gbuffer
+from .blender_process import Progress, SceneError, run_child
 from .specular_horizon import end_at_horizons_of_cycles
-
-WORKER = Path(__file__).with_name("worker.py")
-Progress = Callable[[str, float], "bool | None"]
-OUTPUT_LINES_KEPT = 12
-TERMINATION_SECONDS = 5.0
-BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
-
-
-class SceneError(Exception):
-    """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +33,8 @@ class ExtractOptions:
     cycles_samples: int = 0
     frame: int | None = None
     camera: str | None = None
+    scene_name: str | None = None
+    view_layer: str | None = None
 
 
 @dataclass(frozen=True)
@@ -159,90 +146,6 @@ def termination_as_exception():
     finally:
         if ours:
             signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def child_command(job: Path, script: Path = WORKER) -> list[str]:
-    """The command that runs `script` on `job`: this Blender's own binary, or this Python with pip's bpy."""
-    bpy = sys.modules.get("bpy")
-    binary = bpy.app.binary_path if bpy is not None else ""
-    if binary:
-        return [
-            *(binary, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1"),
-            *("--python", str(script), "--", str(job)),
-        ]
-    if bpy is None and importlib.util.find_spec("bpy") is None:
-        wanted = BPY_FOR_PYTHON.get(sys.version_info[:2])
-        other = "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
-        remedy = f"pip install bpy=={wanted}" if wanted else other
-        raise SceneError(f"{sys.executable} has no module bpy, which opens .blend files: {remedy}")
-    return [sys.executable, str(script), str(job)]
-
-
-def start(command: list[str], folder: Path) -> subprocess.Popen:
-    """`command` as a process that works in `folder`; it is told by the end of its stdin that we are gone."""
-    return subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        encoding="utf-8",
-        errors="replace",
-        cwd=folder,
-        # The user's preferences and start-up files have no say in the result.
-        # Blender leaves its own temporary folder behind when it is ended: ours goes with all that is in it.
-        env={
-            **os.environ,
-            **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder)),
-            "BLENDER_USER_RESOURCES": str(folder / "user"),
-            "PYTHONUNBUFFERED": "1",
-        },
-        # Ctrl-C goes to the parent alone, which ends the child.
-        start_new_session=True,
-    )
-
-
-def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
-    """Run worker.py on `job` in `folder`, report its progress; the manifest it wrote."""
-    job_path = folder / "job.json"
-    job_path.write_text(json.dumps({**job, "watch_parent": True}), encoding="utf-8")
-    child = start(child_command(job_path), folder)
-    last_lines: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
-    try:
-        for line in child.stdout:
-            if line.startswith("LTSH "):
-                report = json.loads(line[len("LTSH ") :])
-                if progress is not None and progress(report["stage"], report["fraction"]) is False:
-                    raise Cancelled(f"cancelled at {report['stage']}")
-            elif line.strip():
-                last_lines.append(line.strip())
-        child.wait()
-    finally:
-        _end(child)
-    return _read_manifest(folder / "manifest.json", child.returncode, last_lines)
-
-
-def _end(child: subprocess.Popen) -> None:
-    """Terminate and reap `child`, whatever state it is in."""
-    if child.poll() is None:
-        child.terminate()
-        try:
-            child.wait(TERMINATION_SECONDS)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-    child.stdin.close()
-    child.stdout.close()
-
-
-def _read_manifest(path: Path, returncode: int, last_lines) -> dict:
-    if not path.is_file():
-        output = " | ".join(last_lines) or "none"
-        raise SceneError(f"Blender ended with code {returncode} and no result; its last output: {output}")
-    manifest = json.loads(path.read_text(encoding="utf-8"))
-    if "error" in manifest:
-        raise SceneError(manifest["error"])
-    return manifest
 
 
 def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:

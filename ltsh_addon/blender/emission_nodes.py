@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from .node_sources import source_of
 from .shader_graph import live_link
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
@@ -98,28 +99,6 @@ def _note_values(tree, socket, groups, found: Emission, seen: set) -> None:
 
 def _sources(tree, socket, groups) -> Iterator[tuple]:
     """(tree, node, output, groups) of what feeds the input `socket`, past reroutes, muted nodes and groups."""
-    link = live_link(socket)
-    if link is None:
-        return
-    node, output = link.from_node, link.from_socket
-    if node.mute:
-        for passed in node.internal_links:
-            if passed.to_socket == output:
-                yield from _sources(tree, passed.from_socket, groups)
-    elif node.bl_idname == "NodeReroute":
-        yield from _sources(tree, node.inputs[0], groups)
-    elif node.bl_idname == "ShaderNodeGroup":
-        if node.node_tree is not None:
-            for inner in node.node_tree.nodes:
-                if inner.bl_idname == "NodeGroupOutput" and inner.is_active_output:
-                    for entry in inner.inputs:
-                        if entry.identifier == output.identifier:
-                            yield from _sources(node.node_tree, entry, (*groups, (tree, node)))
-    elif node.bl_idname == "NodeGroupInput":
-        if groups:
-            outer, group = groups[-1]
-            for entry in group.inputs:
-                if entry.identifier == output.identifier:
-                    yield from _sources(outer, entry, groups[:-1])
-    else:
-        yield tree, node, output, groups
+    source = source_of(tree, socket, groups)
+    if source is not None and source.node is not None:
+        yield source.tree, source.node, source.socket, source.groups

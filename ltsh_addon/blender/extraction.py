@@ -78,10 +78,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings)
-    scene = bpy.context.scene
+    scene = _scene_named(job.get("scene_name"))
     cameras.go_to_frame(scene, job["frame"])
     camera = cameras.choose_camera(scene, job["camera"])
-    view_layer = render_settings.choose_view_layer(scene, warnings)
+    view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
     picture = _picture(scene, job)
     inventory = prepare_scene(scene, view_layer, camera, warnings)
     seconds["start"] = time.monotonic() - started
@@ -106,6 +106,16 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "passes": render_settings.pass_names(),
         "seconds": seconds,
     }
+
+
+def _scene_named(name: str | None):
+    """The scene `name` of the open file; None: the one it was saved with."""
+    if name is None:
+        return bpy.context.scene
+    if name not in bpy.data.scenes:
+        scenes = ", ".join(repr(scene.name) for scene in bpy.data.scenes)
+        raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
+    return bpy.data.scenes[name]
 
 
 def _picture(scene, job: dict) -> dict:

@@ -9,6 +9,7 @@ import importlib.util
 import json
 import queue
 import shutil
+import subprocess
 import tempfile
 import threading
 import time
@@ -16,7 +17,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import child
+from . import blender_process
 
 SCRIPT = Path(__file__).resolve().parents[1] / "job_worker.py"
 MESSAGE = "LTSH "
@@ -48,11 +49,11 @@ class Job:
         job = self.folder / "job.json"
         job.write_text(json.dumps({"runs": runs, "path": _library_folders()}), encoding="utf-8")
         self._messages: queue.SimpleQueue = queue.SimpleQueue()
-        self._process = child.start(child.child_command(job, SCRIPT), self.folder)
+        self._process = blender_process.start(blender_process.child_command(job, SCRIPT), self.folder)
         threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
 
     def _listen(self) -> None:
-        last_lines: deque[str] = deque(maxlen=child.OUTPUT_LINES_KEPT)
+        last_lines: deque[str] = deque(maxlen=blender_process.OUTPUT_LINES_KEPT)
         with self._process.stdout:
             for line in self._process.stdout:
                 message = parsed(line)
@@ -109,7 +110,7 @@ class Job:
         self._process.stdin.close()
         try:
             self._process.wait(ENDING_SECONDS)
-        except child.subprocess.TimeoutExpired:
+        except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
         self.remove_folder()

@@ -75,7 +75,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
             continue
-        light = _area_light(ob, matrix, EmitterTraits.of(instance), receivers)
+        light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
             placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
             note_unsupported(ob, matrix, inventory)
@@ -117,6 +117,7 @@ def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
 
 
 def reason_to_leave_out(ob, matrix: np.ndarray) -> str:
+    """Why the evaluated light `ob` at `matrix` (4, 4) is not shaded; "" where it is."""
     light = ob.data
     if light.type != "AREA":
         return f"{light.type} lights are not shaded, only area lights are"
@@ -139,7 +140,8 @@ def _sizes(light) -> tuple[float, float]:
     return light.size, light.size if light.shape in ("SQUARE", "DISK") else light.size_y
 
 
-def _area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
+def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
+    """The evaluated light `ob` at `matrix` (4, 4), without what its node tree makes of it."""
     light = ob.data
     size_u, size_v = _sizes(light)
     half_u, half_v = 0.5 * size_u * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]

@@ -82,6 +82,20 @@ def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn
     return lights
 
 
+def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[AreaLight]:
+    """The lights of the objects `found` without a look at them: `radiance_of(material)` (3,) is known."""
+    lights = []
+    for mesh_light in found:
+        radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
+        side = _emitting_side(mesh_light, eye, warn)
+        own = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+        if len(own) > MOST_POLYGONS:
+            warn(f"object {mesh_light.ob.name!r}: it emits from {len(own)} flat faces, more than {MOST_POLYGONS}")
+        else:
+            lights.extend(own)
+    return lights
+
+
 def mark_transparent(ob, side: int, materials: list) -> None:
     """Give the original `ob` SIDE_PROPERTY `side`, and its `materials` one that only tells them apart from others."""
     ob[SIDE_PROPERTY] = side

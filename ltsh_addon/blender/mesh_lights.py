@@ -48,8 +48,11 @@ class MeshLight:
         return [material.name_full for material, emission in pairs if emission.emits]
 
 
-def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list[MeshLight]:
-    """Objects that a render of `depsgraph` sees with materials that may emit; `override` replaces all materials."""
+def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies: bool = True) -> list[MeshLight]:
+    """Objects that a render of `depsgraph` sees with materials that may emit; `override` replaces all materials.
+
+    Without `copies` of their meshes, textures cannot be looked at, and no data is made.
+    """
     found: dict[tuple, MeshLight | None] = {}
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
@@ -65,7 +68,8 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn) -> list
                 warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
                 found[key] = None
         if found[key] is not None:
-            placement = _placement(ob, np.array(instance.matrix_world, dtype=np.float64), found[key], depsgraph)
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            placement = _placement(ob, matrix, found[key], depsgraph if copies else None)
             if placement is not None:
                 found[key].placements.append(placement)
                 instancer = surface_instancer(instance)
@@ -136,7 +140,7 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     if not len(slots) or not any(light.emission[slot].emits for slot in np.unique(slots)):
         return None
     copy = None
-    if light.varies:
+    if light.varies and depsgraph is not None:
         copy = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=depsgraph)
     world = vertices.reshape(-1, 3).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
     triangles = triangles.reshape(-1, 3).astype(np.int64)

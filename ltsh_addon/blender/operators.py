@@ -9,7 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as translated
 
 from . import job_arguments, preflight, results, viewer
-from .child import SceneError
+from .blender_process import SceneError
 from .job import Job, clock, new_folder
 
 TIMER_SECONDS = 0.1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import importlib
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -11,6 +12,8 @@ import bpy
 # Modules of this package with register() and unregister(), in the order in which they need each other.
 PARTS = (
     "preferences",
+    "view_properties",
+    "engine",
     "properties",
     "operators",
     "operators_fix",
@@ -29,7 +32,7 @@ _registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything or, where a part fails, nothing; `command_line` is `cli.main`. `unregister` removes it."""
+    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
 
     def run(arguments: list[str]) -> int:
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
@@ -41,11 +44,14 @@ def register(command_line: Callable[..., int]) -> None:
             part.register()
             added.callback(part.unregister)
         _registered.push(added.pop_all())
+    # Blender 4.5 hangs at exit when an engine is still registered.
+    atexit.register(unregister)
 
 
 def unregister() -> None:
     """Remove what `register` added."""
     from . import availability
 
+    atexit.unregister(unregister)
     availability.missing_libraries.cache_clear()
     _registered.close()

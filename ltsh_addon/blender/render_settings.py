@@ -14,9 +14,14 @@ from .inventory import SURFACE_TYPES
 VIEW_LAYER = "ltsh"
 
 
-def choose_view_layer(scene, warnings: list[str]):
-    """The only view layer that is rendered from now on."""
+def choose_view_layer(scene, warnings: list[str], name: str | None = None):
+    """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
+    if name is not None and name not in scene.view_layers:
+        layers = ", ".join(repr(layer.name) for layer in scene.view_layers)
+        raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
     used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
+    if name is not None:
+        used = [scene.view_layers[name]]
     if len(used) > 1:
         warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is shaded")
     for layer in scene.view_layers:

@@ -79,8 +79,9 @@ def check_object(ob) -> None:
         raise ObjectError(f"object {ob.name!r} is hidden in renders: show it")
 
 
-def read_mesh(ob, depsgraph, uv_name: str | None) -> tuple[TexelMesh, str]:
-    """The object `ob` as `depsgraph` evaluates it, and the name of its UV map. Raises ObjectError."""
+def read_mesh(ob, depsgraph, uv_name: str | None) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
+    """The object `ob` as `depsgraph` evaluates it, the name of its UV map, and all of its UV maps (T, 3, 2) by name, ""
+    for the one that renders. Raises ObjectError."""
     evaluated = ob.evaluated_get(depsgraph)
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
@@ -102,7 +103,8 @@ def _read(ob, mesh, matrix, uv_name):
     loops, vertices = _get(mesh.loop_triangles, "loops", 3 * count), _get(mesh.loop_triangles, "vertices", 3 * count)
     positions = _get(mesh.vertices, "co", 3 * len(mesh.vertices), np.float32).reshape(-1, 3)
     normals = _get(mesh.corner_normals, "vector", 3 * len(mesh.loops), np.float32).reshape(-1, 3)
-    uv = _get(layer.uv, "vector", 2 * len(mesh.loops), np.float32).reshape(-1, 2)[loops].reshape(count, 3, 2)
+    maps = {other.name: _uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
+    uv = maps[layer.name]
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-30:
         raise ObjectError(f"object {ob.name!r}: its transform has no inverse, expected a scale other than 0")
@@ -114,6 +116,7 @@ def _read(ob, mesh, matrix, uv_name):
         normals=world_normals.reshape(count, 3, 3),
         uv=uv,
         material=np.minimum(_get(mesh.loop_triangles, "material_index", count), slots - 1),
+        vertices=vertices.reshape(count, 3),
     )
     a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
     if not np.any((b - a)[:, 0] * (c - a)[:, 1] != (b - a)[:, 1] * (c - a)[:, 0]):
@@ -123,7 +126,12 @@ def _read(ob, mesh, matrix, uv_name):
             f"object {ob.name!r}: all of UV map {layer.name!r} lies outside of the texture, expected some of it "
             "between 0 and 1, or whole faces in UDIM tiles: move it"
         )
-    return found, layer.name
+    rendered = next((other.name for other in mesh.uv_layers if other.active_render), layer.name)
+    return found, layer.name, {**maps, "": maps[rendered]}
+
+
+def _uv_of(layer, count):
+    return _get(layer.uv, "vector", 2 * count, np.float32).reshape(-1, 2)
 
 
 def _get(collection, name, count, dtype=np.int32):
@@ -208,7 +216,7 @@ class ObjectBake:
     def _place(self, block):
         layers = self.ob.data.uv_layers
         count = len(self.ob.data.loops)
-        uv = _get(layers[self.uv_name].uv, "vector", 2 * count, np.float32).reshape(-1, 2).astype(np.float64)
+        uv = _uv_of(layers[self.uv_name], count).astype(np.float64)
         layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
         self.ob.data.update()
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..scene import AreaLight, SurfaceSamples
 from .aovs import LOBE_AOVS
 from .gbuffer import HITS_PER_BLOCK, joined
+from .image_textures import GRAY, ImageTexture
 from .lobe_samples import samples_of_lobes
 from .lobe_slots import Hits
 from .shading_normals import unit
@@ -28,6 +29,7 @@ class TexelMesh:
     normals: np.ndarray  # (T, 3, 3) unit, as shaded, custom normals included
     uv: np.ndarray  # (T, 3, 2)
     material: np.ndarray  # (T,) number of the material
+    vertices: np.ndarray  # (T, 3) numbers in the mesh
 
     def save(self, path) -> None:
         """Write an .npz."""
@@ -67,15 +69,26 @@ class BakeView:
 @dataclass(frozen=True)
 class BakeMaterial:
     """What one material writes: `aovs.LOBE_AOVS` for each of its lobes. A value is a number, a color, or where it
-    varies the name of its map and the map's channels."""
+    varies its map or one of the `textures`, and which part of their color."""
 
     corrected: bool
     lobes: tuple[dict, ...]
+    textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # with the UV map (T, 3, 2)
 
     @classmethod
-    def of(cls, record: dict) -> BakeMaterial:
-        """From what JSON makes of it."""
-        return cls(record["corrected"], tuple(record["lobes"]))
+    def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
+        """From what JSON makes of it, the folder of `images`, and the files of UV maps by name."""
+        textures = []
+        for texture in record["textures"]:
+            pixels = np.load(images / texture["file"], mmap_mode="r")
+            read_as = {name: texture[name] for name in ("extension", "interpolation", "srgb")}
+            textures.append((ImageTexture(pixels, **read_as), np.load(uv_maps[texture["uv"]])))
+        return cls(record["corrected"], tuple(record["lobes"]), tuple(textures))
+
+    def colors(self, number: int, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Colors (Q, 3) of texture `number` at points of triangles (Q,) with barycentric weights (Q, 3)."""
+        texture, uv = self.textures[number]
+        return texture.colors(_interpolated(uv, triangle, weights))
 
 
 def texel_samples(
@@ -114,7 +127,7 @@ def texel_samples(
             diffuse_albedo=None,
         )
         of_block = {name: values[block] for name, values in maps.items()}
-        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block))
+        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
         pieces.append(end_at_horizons_of_cycles(samples, lights))
         index.append(texel + start)
     return joined(pieces), np.concatenate(index)
@@ -123,7 +136,7 @@ def texel_samples(
 def _maps_read(materials) -> set[int]:
     """Numbers of the maps that some material reads."""
     values = (value for material in materials for lobe in material.lobes for value in lobe.values())
-    return {value["map"] for value in values if isinstance(value, dict)}
+    return {value["map"] for value in values if isinstance(value, dict) and "map" in value}
 
 
 def _interpolated(values, triangle, weights):
@@ -131,8 +144,24 @@ def _interpolated(values, triangle, weights):
     return sum(values[triangle, corner] * weights[:, corner, None] for corner in range(3))
 
 
-def _lobes(materials, number, maps) -> list[dict[str, np.ndarray]]:
+def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndarray]]:
     """For each slot its quantities at texels of materials `number` (Q,), of which `maps` has the baked ones (Q, 3)."""
+    texels = [np.flatnonzero(number == which) for which in range(len(materials))]
+    colors = {}
+
+    def varying(which, value, kind):
+        at = texels[which]
+        if "map" in value:
+            found = maps[value["map"]][at]
+            return found if kind == "COLOR" else found[:, value["channel"]]
+        key = which, value["texture"]
+        if key not in colors:
+            colors[key] = materials[which].colors(value["texture"], triangle[at], weights[at])
+        part = value["part"]
+        if part == "gray":
+            return colors[key] @ GRAY
+        return colors[key] if part == "color" else colors[key][:, int(part)]
+
     slots = []
     for slot in range(max((len(material.lobes) for material in materials), default=0)):
         names = {name for material in materials if len(material.lobes) > slot for name in material.lobes[slot]}
@@ -144,13 +173,11 @@ def _lobes(materials, number, maps) -> list[dict[str, np.ndarray]]:
             for which, material in enumerate(materials):
                 if len(material.lobes) <= slot or name not in material.lobes[slot]:
                     continue
-                at = np.flatnonzero(number == which)
                 value = material.lobes[slot][name]
                 if isinstance(value, dict):
-                    found = maps[value["map"]][at]
-                    value = found if kind == "COLOR" else found[:, value["channel"]]
+                    value = varying(which, value, kind)
                 elif kind == "COLOR":
                     value = np.asarray(value)[:3]
-                values[name][at] = value
+                values[name][texels[which]] = value
         slots.append(values)
     return slots

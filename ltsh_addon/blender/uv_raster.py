@@ -78,12 +78,12 @@ def _center_spans(corners, first_row, row_count, size):
     sides = [_side_rows(corners[:, k], corners[:, (k + 1) % 3], first_row, row_count, height) for k in range(3)]
     first = np.min([side.first for side in sides], axis=0)
     last = np.max([side.last for side in sides], axis=0)
-    triangle, step = _repeat(last - first + 1)
+    triangle, step = repeated(last - first + 1)
     row = first[triangle] + step
     offset = np.cumsum(np.maximum(last - first + 1, 0)) - np.maximum(last - first + 1, 0)
     left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for side in sides:
-        of, number = _repeat(side.last - side.first + 1)
+        of, number = repeated(side.last - side.first + 1)
         position = offset[of] + (side.first - first)[of] + number
         x = side.x[side.start[of] + number]
         left[position], right[position] = np.minimum(left[position], x), np.maximum(right[position], x)
@@ -137,7 +137,7 @@ def _side_rows(start, end, first_row, row_count, height):
 def _touching_spans(corners, first_row, row_count, width):
     """(triangle, row, first x, last x) of the runs of unit squares that triangles (T, 3, 2) touch."""
     low, middle, high = _by_height(corners)
-    area = _cross(middle - low, high - low)
+    area = cross(middle - low, high - low)
     solid = np.flatnonzero(np.isfinite(area) & (area != 0.0))
     low, middle, high = low[solid], middle[solid], high[solid]
     # A triangle that ends on the border between two rows does not reach into the next.
@@ -166,11 +166,11 @@ def _rows_of(first, last, first_row, row_count):
         seen = np.isfinite(first) & np.isfinite(last)
     first = np.maximum(np.where(seen, first, 0.0), first_row)
     last = np.minimum(np.where(seen, last, -1.0), first_row + row_count - 1.0)
-    triangle, step = _repeat(last - first + 1.0)
+    triangle, step = repeated(last - first + 1.0)
     return triangle, first[triangle] + step
 
 
-def _repeat(counts):
+def repeated(counts):
     """Numbers 0 0 0 1 1 3 ... as often as counts (N,) say, and 0 1 2 0 1 0 ... within each."""
     counts = np.where(counts > 0.0, counts, 0.0).astype(np.int64)
     number = np.repeat(np.arange(len(counts)), counts)
@@ -194,7 +194,7 @@ def _x_on(start, end, y):
 def _expand(span_triangle, row, first_x, last_x, width, first_row):
     """(triangle, index in the block) of every texel of the spans, in the order of the triangles."""
     first_x = np.clip(first_x, 0.0, width)
-    span, step = _repeat(last_x - first_x + 1.0)
+    span, step = repeated(last_x - first_x + 1.0)
     index = ((row[span] - first_row) * width + first_x[span]).astype(np.int64) + step
     return span_triangle[span], index
 
@@ -205,9 +205,9 @@ def barycentric_of_nearest(corners: np.ndarray, points: np.ndarray) -> np.ndarra
     Of a triangle without area the nearest point of its sides.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
-    area = _cross(b - a, c - a)
+    area = cross(b - a, c - a)
     safe = np.where(area != 0.0, area, 1.0)
-    weights = np.stack([_cross(b - points, c - points), _cross(c - points, a - points), _cross(a - points, b - points)])
+    weights = np.stack([cross(b - points, c - points), cross(c - points, a - points), cross(a - points, b - points)])
     weights = (weights / safe).T
     outside = np.flatnonzero((weights < 0.0).any(axis=1) | (area == 0.0))
     if len(outside):
@@ -231,7 +231,7 @@ def _nearest_on_sides(corners, points):
     return best
 
 
-def _cross(u, v):
+def cross(u, v):
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
@@ -243,7 +243,7 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
     """
     uv = np.asarray(uv, dtype=np.float64)
-    area = np.abs(_cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
+    area = np.abs(cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
     solid = np.isfinite(area) & (area > 0.0)
     uv, area = uv[solid], area[solid]
     column, row = np.moveaxis(np.floor(uv.mean(axis=1)).astype(np.int64), -1, 0)

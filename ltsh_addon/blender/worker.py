@@ -8,6 +8,8 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import queue
+import shutil
 import sys
 import threading
 import traceback
@@ -16,19 +18,26 @@ from pathlib import Path
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 
 
-def end_with_parent() -> None:
-    """End this process as soon as the parent, which holds the other end of stdin, is gone."""
+def _listen(jobs: queue.SimpleQueue, temporary: list[Path]) -> None:
+    """Put the paths of jobs that come on stdin into `jobs`. End this process as soon as the parent, which holds the
+    other end, is gone, and remove the `temporary` folders that it made."""
 
-    def watch():
-        while os.read(0, 4096):
-            pass
+    def listen():
+        for line in iter(sys.stdin.buffer.readline, b""):
+            jobs.put(Path(line.decode("utf-8", "surrogateescape").removesuffix("\n")))
+        for folder in temporary:
+            shutil.rmtree(folder, ignore_errors=True)
         os._exit(3)
 
-    threading.Thread(target=watch, daemon=True).start()
+    threading.Thread(target=listen, daemon=True).start()
 
 
 def _progress(stage: str, fraction: float) -> None:
-    print("LTSH " + json.dumps({"stage": stage, "fraction": fraction}), flush=True)
+    _tell({"stage": stage, "fraction": fraction})
+
+
+def _tell(report: dict) -> None:
+    print("LTSH " + json.dumps(report), flush=True)
 
 
 def _perform(job: dict, folder: Path) -> dict:
@@ -38,6 +47,8 @@ def _perform(job: dict, folder: Path) -> dict:
         return {}
     if job["task"] == "bake":
         return _module("bake_extraction").extract_bake(job, folder, _progress)
+    if job["task"] == "facts":
+        return _module("scene_facts").answer(job, _progress)
     if job["task"] == "apply":
         return _module("bake_apply").apply_bake(job, folder, _progress)
     return _module("extraction").extract(job, folder, _progress)
@@ -48,26 +59,39 @@ def _module(name: str):
     return importlib.import_module(f"{PACKAGE_FOLDER.name}.blender.{name}")
 
 
-def main() -> int:
-    """Exit code 0, or 1 with the error in the manifest."""
-    job_path = Path(sys.argv[-1])
-    job = json.loads(job_path.read_text(encoding="utf-8"))
-    if job.get("watch_parent"):
-        end_with_parent()
-    # Running a script puts its own folder first, where `lights` and others would be found as top-level modules.
-    sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
+def _do(job: dict, folder: Path) -> bool:
+    """Do `job`, write manifest.json into `folder`; False where the manifest is an error."""
     scene_error = _module("child").SceneError
     try:
-        manifest = _perform(job, job_path.parent)
+        manifest = _perform(job, folder)
     except scene_error as error:
         manifest = {"error": str(error)}
     except Exception as error:
         traceback.print_exc()
         manifest = {"error": f"Blender failed with {type(error).__name__}: {error}"}
-    unfinished = job_path.with_name("manifest.tmp")
+    unfinished = folder / "manifest.tmp"
     unfinished.write_text(json.dumps(manifest), encoding="utf-8")
-    os.replace(unfinished, job_path.with_name("manifest.json"))
-    return 1 if "error" in manifest else 0
+    os.replace(unfinished, folder / "manifest.json")
+    return "error" not in manifest
+
+
+def main() -> int:
+    """Exit code 0, or 1 with the error in the manifest; with a parent, go on with the jobs that it hands over."""
+    job_path = Path(sys.argv[-1])
+    # Running a script puts its own folder first, where `lights` and others would be found as top-level modules.
+    sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
+    jobs: queue.SimpleQueue = queue.SimpleQueue()
+    temporary: list[Path] = []
+    job = json.loads(job_path.read_text(encoding="utf-8"))
+    if not job.get("watch_parent"):
+        return 0 if _do(job, job_path.parent) else 1
+    _listen(jobs, temporary)
+    while True:
+        temporary[:] = map(Path, job["temporary"])
+        _do(job, job_path.parent)
+        _tell({"done": True})
+        job_path = jobs.get()
+        job = json.loads(job_path.read_text(encoding="utf-8"))
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ import html
 import json
 import math
 import os
+import posixpath
+import urllib.parse
 from collections.abc import Mapping
 
 from .atomic import write_bytes
@@ -49,8 +51,12 @@ def _plain(value):
     return value
 
 
-def write_html(path: str | os.PathLike, report: Mapping) -> None:
-    """Write the page of a comparison's `report`, beside compare.png and compare.exr; complete or not at all."""
+def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, report: Mapping) -> None:
+    """Write the page `page` of a comparison's `report`, complete or not at all.
+
+    It links the `sheet` (PNG) and the `layers` (EXR); all three are paths below `folder`, where report.json lies.
+    """
+    sheet, layers, figures = (_link(page, name) for name in (sheet, layers, "report.json"))
     width, height = report["resolution"]
     facts = ", ".join(
         (
@@ -66,17 +72,22 @@ def write_html(path: str | os.PathLike, report: Mapping) -> None:
     body = [
         f"<h1>{_text(report['scene'])}</h1>",
         f'<p class="facts">{_text(facts)}</p>',
-        '<p><a href="compare.png"><img src="compare.png" alt="Cycles and the techniques, with signed errors"></a></p>',
+        f'<p><a href="{sheet}"><img src="{sheet}" alt="Cycles and the techniques, with signed errors"></a></p>',
         *(_pass_table(name, figures) for name, figures in report["passes"].items()),
         _warnings(report["warnings"]),
-        '<p>All layers: <a href="compare.exr">compare.exr</a>. All figures: <a href="report.json">report.json</a>.</p>',
+        f'<p>All layers: <a href="{layers}">{layers}</a>. All figures: <a href="{figures}">report.json</a>.</p>',
     ]
-    page = (
+    text = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f"<title>{_text(report['scene'])}: comparison</title><style>{_STYLE}</style></head>"
         f"<body>{''.join(body)}</body></html>\n"
     )
-    write_bytes(path, page.encode())
+    write_bytes(os.path.join(folder, page), text.encode())
+
+
+def _link(page: str, name: str) -> str:
+    """The file `name` as the page names it; both lie below the same folder."""
+    return _text(urllib.parse.quote(posixpath.relpath(name, posixpath.dirname(page) or ".")))
 
 
 def _picture_facts(report: Mapping) -> list[str]:

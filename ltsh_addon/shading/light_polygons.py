@@ -16,7 +16,7 @@ MOSTLY_WHOLE = 0.6
 # Corners of a round light by how far it reaches, in units of the lobe's width where it meets the light: below 8 of them
 # 32 corners are within 0.1 % of an ellipse, and so on.
 ROUND_CORNERS = (32, 64, 128, 256)
-_ROUND_LIMITS = (8.0, 40.0, 300.0)
+ROUND_LIMITS = (8.0, 40.0, 300.0)
 _FOCUSED_ROUND_CORNERS = (32, 64)
 
 
@@ -47,7 +47,7 @@ def round_levels(light, position, width):
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     beyond = np.sqrt(sum(component * component for component in offset)) - reach
     distance = np.maximum(np.maximum(height, beyond), 1e-12 * reach)
-    level = np.searchsorted(_ROUND_LIMITS, reach / (distance * width))
+    level = np.searchsorted(ROUND_LIMITS, reach / (distance * width))
     for number in np.unique(level):
         corners = light.polygon(ROUND_CORNERS[number])
         chosen = np.nonzero(level == number)[0]

@@ -128,12 +128,15 @@ def test_after_a_kill_resume_gives_the_same_bytes(tmp_path):
             process.send_signal(signal.SIGKILL)
             process.wait()
     assert start_bake(tmp_path / "killed", "--resume").wait() == 0
-    names = {file.name for file in (tmp_path / "whole").iterdir()}
+    whole, killed = (contents(tmp_path / name) for name in ("whole", "killed"))
     # A killed process cannot take its hidden temporary file away; nothing else may be left.
-    visible = {file.name for file in (tmp_path / "killed").iterdir() if not file.name.startswith(".")}
-    assert visible == names
-    for name in names - {"timing.json"}:
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+    assert {name: data for name, data in killed.items() if not name.endswith(".tmp")} == whole
+
+
+def contents(folder):
+    """Bytes by name of all files below `folder` but for times."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def test_resume_bakes_again_what_belongs_to_another_job(tmp_path):

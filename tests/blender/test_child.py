@@ -15,7 +15,9 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.child import Cancelled, ExtractOptions, SceneError, child_command, extract
+from ltsh_addon.blender.blender_process import child_command
+from ltsh_addon.blender.child import ExtractOptions, SceneError, extract
+from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[2]
 

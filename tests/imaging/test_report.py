@@ -61,7 +61,7 @@ class Tags(HTMLParser):
 
 @pytest.mark.parametrize("noise", [True, False])
 def test_page_is_well_formed_and_escapes_names(tmp_path, noise):
-    report.write_html(tmp_path / "report.html", document("<b>&.blend", noise))
+    report.write_html(tmp_path, "report.html", "compare.png", "compare.exr", document("<b>&.blend", noise))
     page = Tags()
     page.feed((tmp_path / "report.html").read_text(encoding="utf-8"))
     assert page.open == []

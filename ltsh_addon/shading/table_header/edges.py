@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from ..shading import edge_integrals, lookup_table
+from .. import edge_integrals, lookup_table
 from .literals import float_literal
 
 _PSI_DEGREE = 9
@@ -51,12 +51,15 @@ def _arc_node_lines():
 
 
 _EDGES = """\
-LTSH_FUNCTION ltsh_edge ltsh_make_edge(ltsh_polygon unit, int i)
+/* The edge between two unit vectors. */
+LTSH_FUNCTION ltsh_edge ltsh_edge_between(ltsh_vec3 start, ltsh_vec3 end)
 {
     ltsh_edge edge;
-    edge.start = unit.corners[i];
-    edge.total = ltsh_edge_sum(unit, i);
-    edge.normal = ltsh_cross(edge.start, edge.total);
+    edge.start = start;
+    edge.total = ltsh_add_scaled(start, 1.0f, end);
+    /* start x end from the difference of ends that are close, which is exact, or the sum of ends nearly opposite. */
+    float sign = ltsh_dot(edge.total, edge.total) > 2.0f ? -1.0f : 1.0f;
+    edge.normal = ltsh_cross(start, ltsh_add_scaled(end, sign, start));
     float shifted = ltsh_larger(ltsh_one_plus_cosine(edge.total), @TINY_SHIFT@);
     float kappa = LTSH_SQRT(ltsh_clamped(0.5f * shifted, 1.0f));
     float psi = @PSI_HIGHEST@;
@@ -65,6 +68,11 @@ LTSH_FUNCTION ltsh_edge ltsh_make_edge(ltsh_polygon unit, int i)
     edge.phi = 1.0f + ltsh_larger(2.0f - shifted, 0.0f) * edge.psi;
     edge.q = 1.0f / shifted;
     return edge;
+}
+
+LTSH_FUNCTION ltsh_edge ltsh_make_edge(ltsh_polygon unit, int i)
+{
+    return ltsh_edge_between(unit.corners[i], unit.corners[i + 1 < unit.count ? i + 1 : 0]);
 }
 
 /* Signed integral of max(0, z) over a spherical polygon in z >= 0 (Lambert 1760). */
@@ -151,14 +159,14 @@ LTSH_FUNCTION float ltsh_edge_moment(ltsh_edge edge, float u_x, float u_z, int k
     return normal * ltsh_arc_power(edge, k, start, total);
 }
 
-/* The cell of a table with uniform roughness and theta_o uniform in 1 - sqrt(1 - theta_o / 90 deg); clamps both. */
-LTSH_FUNCTION ltsh_cell ltsh_make_cell(float cos_theta_o, float roughness, int rows, int columns)
+/* As ltsh_make_cell, for who knows the sine better than it follows from a cosine close to one; both from 0 to 1. */
+LTSH_FUNCTION ltsh_cell ltsh_make_cell_at(float cos_theta_o, float sin_theta_o, float roughness, int rows, int columns)
 {
     ltsh_cell cell;
-    cell.cos_theta_o = ltsh_clamped(cos_theta_o, 1.0f);
+    cell.cos_theta_o = cos_theta_o;
+    cell.sin_theta_o = sin_theta_o;
     cell.roughness = ltsh_clamped(roughness, 1.0f);
     /* 1 - theta_o / 90 deg as an elevation keeps its digits at grazing angles. */
-    float sin_theta_o = LTSH_SQRT((1.0f - cell.cos_theta_o) * (1.0f + cell.cos_theta_o));
     float elevation = @TWO_OVER_PI@ * LTSH_ATAN2(cell.cos_theta_o, sin_theta_o);
     float column_position = ltsh_clamped(1.0f - LTSH_SQRT(elevation), 1.0f) * LTSH_FLOAT(columns - 1);
     float row_position = cell.roughness * LTSH_FLOAT(rows - 1);
@@ -172,12 +180,19 @@ LTSH_FUNCTION ltsh_cell ltsh_make_cell(float cos_theta_o, float roughness, int r
     return cell;
 }
 
+/* The cell of a table with uniform roughness and theta_o uniform in 1 - sqrt(1 - theta_o / 90 deg); clamps both. */
+LTSH_FUNCTION ltsh_cell ltsh_make_cell(float cos_theta_o, float roughness, int rows, int columns)
+{
+    float cosine = ltsh_clamped(cos_theta_o, 1.0f);
+    return ltsh_make_cell_at(cosine, LTSH_SQRT((1.0f - cosine) * (1.0f + cosine)), roughness, rows, columns);
+}
+
 /* The warp from the interpolated channels A, B, C and the tilt. */
 LTSH_FUNCTION ltsh_warp ltsh_make_warp(ltsh_cell cell, float a, float b, float c, float tilt)
 {
     float alpha = ltsh_larger(cell.roughness * cell.roughness, @MIN_ALPHA@);
     float cos_squared = cell.cos_theta_o * cell.cos_theta_o;
-    float sin_squared = (1.0f - cell.cos_theta_o) * (1.0f + cell.cos_theta_o);
+    float sin_squared = cell.sin_theta_o * cell.sin_theta_o;
     float g_squared = cos_squared + @REGULARIZATION@ * alpha * alpha * sin_squared;
     ltsh_warp warp;
     warp.xx = a * g_squared;

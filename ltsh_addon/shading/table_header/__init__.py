@@ -10,6 +10,7 @@ pointers, and a struct may hold an array everywhere; a few macros cover the rest
     lobes      text of its lobes and their integrals
 """
 
-from .header import data_blocks, header_text
+from .header import data_blocks, header_text, shared_text
+from .lobes import moment_lines
 
-__all__ = ["data_blocks", "header_text"]
+__all__ = ["data_blocks", "header_text", "moment_lines", "shared_text"]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..shading.edge_integrals import RIDGE_DIRECTIONS
-from ..shading.lookup_table import LookupTable
-from ..shading.spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
+from ..edge_integrals import RIDGE_DIRECTIONS
+from ..lookup_table import LookupTable
+from ..spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
 from .literals import float_literal
 
 _TERMS_PER_LINE = 3
@@ -30,7 +30,7 @@ def _expansion_functions(table) -> str:
     ]
     replacements = {
         "@WEIGHT_LINES@": "\n".join(_weight_lines(table.ridge_weights)),
-        "@MOMENT_LINES@": "\n".join(_moment_lines(table.degree)),
+        "@MOMENT_LINES@": "\n".join(moment_lines(table.degree)),
         "@EXPANSION_LINES@": "\n".join(_expansion_lines(table.degree)),
         "@ALBEDO@": _sum(albedo_terms),
     }
@@ -56,8 +56,8 @@ def _weight_lines(ridge_weights):
         yield f"    weights.values[{moment}] = {_sum(terms) or '0.0f'};"
 
 
-def _moment_lines(degree):
-    """Rows as in `edge_integrals.moments`."""
+def moment_lines(degree):
+    """Statements that add an edge to all moments but the solid angle, rows as in `edge_integrals.moments`."""
     for k in range(degree):
         for j, (u_x, u_z) in enumerate(RIDGE_DIRECTIONS[: k + 2]):
             row = 1 + k * (k + 3) // 2 + j

@@ -39,7 +39,9 @@ struct ltsh_frame { ltsh_vec3 tangent; ltsh_vec3 bitangent; ltsh_vec3 normal; };
 /* The first `count` corners are in use; any winding. */
 struct ltsh_polygon { int count; ltsh_vec3 corners[LTSH_MAX_CORNERS]; };
 /* Where a lookup falls: the node of lower roughness and theta_o, and how far it is to the next one of each. */
-struct ltsh_cell { float cos_theta_o; float roughness; int node; float row_weight; float column_weight; };
+struct ltsh_cell {
+    float cos_theta_o; float sin_theta_o; float roughness; int node; float row_weight; float column_weight;
+};
 /* W of the lobe D_orig(W w / |W w|) |W| / |W w|^3, upper triangular; tilt in radians is 0 but for LTC. */
 struct ltsh_warp { float xx; float xz; float yy; float zz; float tilt; };
 /* An edge of a spherical polygon of length theta: phi = theta / sin(theta), psi = (phi - 1) / (1 - cos(theta)),

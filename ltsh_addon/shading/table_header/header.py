@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..shading.lookup_table import LookupTable
+from ..lookup_table import LookupTable
 from .edges import edge_functions
 from .geometry import GEOMETRY
 from .literals import float_literal
@@ -17,7 +17,7 @@ from .lobes import lobe_functions
 from .lookup import LOOKUP
 
 # Raise it when a shared function changes: headers of different versions refuse to be included together.
-SHARED_VERSION = 1
+SHARED_VERSION = 2
 _VALUES_PER_LINE = 8
 
 
@@ -37,11 +37,15 @@ def data_blocks(table: LookupTable) -> dict[str, np.ndarray]:
 def header_text(table: LookupTable, prefix: str, about: str) -> str:
     """The header; `prefix` begins every name of its own, `about` are the lines of its first comment."""
     blocks = data_blocks(table)
-    shared = "\n".join([GEOMETRY, edge_functions(), _SHARED_END]).replace("@VERSION@", str(SHARED_VERSION))
-    text = "\n".join([_TOP, shared, _constants(table, blocks), LOOKUP, lobe_functions(table), _data(blocks)])
+    text = "\n".join([_TOP, shared_text(), _constants(table, blocks), LOOKUP, lobe_functions(table), _data(blocks)])
     plain = about.encode("ascii", "backslashreplace").decode("ascii").replace("*/", "* /").replace("/*", "/ *")
     text = text.replace("@ABOUT@", "\n   ".join(plain.splitlines()))
     return text.replace("@prefix@", prefix).replace("@PREFIX@", prefix.upper())
+
+
+def shared_text() -> str:
+    """What does not depend on the table: the language layer, types, vectors, frames, polygons, edges, cells, warps."""
+    return "\n".join([GEOMETRY, edge_functions(), _SHARED_END]).replace("@VERSION@", str(SHARED_VERSION))
 
 
 def _constants(table, blocks) -> str:

@@ -1,0 +1,234 @@
+"""What the inputs of shader nodes are worth where that is known without rendering; nothing is edited.
+
+Constants and flat images on UV maps are followed through the nodes that keep them linear; everything else is None.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from .linear_values import ImageUse, Value, combined, constant, is_gray, product
+from .node_sources import Source, source_of
+
+
+def value_at(tree, socket, groups: tuple = ()) -> Value | None:
+    """The value at the input `socket` of `tree`, as the kind of value that it takes; None: unknown."""
+    value = value_of_source(source_of(tree, socket, groups))
+    if value is not None and socket.type == "VALUE":
+        return value if is_gray(value) else value.as_number()
+    return value
+
+
+def value_of_source(source: Source | None) -> Value | None:
+    """The value that `source` gives; None: unknown."""
+    if source is None:
+        return None
+    if source.node is None:
+        return constant(source.socket.default_value) if hasattr(source.socket, "default_value") else None
+    reader = READERS.get(source.node.bl_idname)
+    return None if reader is None else reader(source)
+
+
+def _input(source: Source, name) -> Value | None:
+    return value_at(source.tree, source.node.inputs[name], source.groups)
+
+
+def _own_value(source: Source) -> Value:
+    return constant(source.node.outputs[0].default_value)
+
+
+def _image(source: Source) -> Value | None:
+    node = source.node
+    if node.image is None or node.projection != "FLAT" or node.image.source not in ("FILE", "GENERATED"):
+        return None
+    if node.interpolation not in ("Closest", "Linear"):
+        return None
+    place = coordinates(source.input("Vector"))
+    if place is None:
+        return None
+    uv_map, mapping = place
+    use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension)
+    matrix = np.zeros((3, 4))
+    if source.socket.name == "Alpha":
+        matrix[:, 3] = 1.0
+    else:
+        matrix[:, :3] = np.eye(3)
+    return Value(np.zeros(3), matrix, use)
+
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def coordinates(source: Source | None):
+    """(UV map, mapping) of a texture's vector; None for all but UV maps under Mapping nodes of constants."""
+    if source is None:
+        return None
+    node = source.node
+    if node is None:
+        # A texture without a vector takes the active UV map.
+        return ("", IDENTITY) if source.socket.hide_value else None
+    if node.bl_idname == "ShaderNodeUVMap" and not node.from_instancer:
+        return node.uv_map, IDENTITY
+    if node.bl_idname == "ShaderNodeTexCoord" and source.socket.name == "UV" and not node.from_instancer:
+        return "", IDENTITY
+    if node.bl_idname != "ShaderNodeMapping" or node.vector_type not in ("POINT", "TEXTURE"):
+        return None
+    inner = coordinates(source.input("Vector"))
+    parts = [value_at(source.tree, node.inputs[name], source.groups) for name in ("Location", "Rotation", "Scale")]
+    if inner is None or any(part is None or not part.is_constant for part in parts):
+        return None
+    return inner[0], _mapping(node.vector_type, *(part.offset for part in parts), inner[1])
+
+
+def _mapping(kind: str, location, rotation, scale, inner):
+    """The affine map (2, 3) of a Mapping node after `inner`; None where it turns out of the plane."""
+    if rotation[0] != 0.0 or rotation[1] != 0.0:
+        return inner
+    cosine, sine = math.cos(rotation[2]), math.sin(rotation[2])
+    turned = [[cosine * scale[0], -sine * scale[1]], [sine * scale[0], cosine * scale[1]]]
+    own = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
+    if kind == "TEXTURE":
+        own = np.linalg.pinv(own)
+    whole = own @ np.vstack([inner, [0.0, 0.0, 1.0]])
+    return tuple(tuple(float(number) for number in row) for row in whole[:2])
+
+
+def _separate(source: Source) -> Value | None:
+    if getattr(source.node, "mode", "RGB") != "RGB":
+        return None
+    value = _input(source, 0)
+    channel = next(index for index, socket in enumerate(source.node.outputs) if socket == source.socket)
+    pick = np.zeros((3, 3))
+    pick[:, channel] = 1.0
+    return None if value is None else value.mapped(pick)
+
+
+def _combine(source: Source) -> Value | None:
+    if getattr(source.node, "mode", "RGB") != "RGB":
+        return None
+    parts = [_input(source, index) for index in range(3)]
+    if any(part is None or not part.is_constant for part in parts):
+        return None
+    return constant([part.offset[0] for part in parts])
+
+
+def _to_number(source: Source) -> Value | None:
+    value = _input(source, 0)
+    return None if value is None else value.as_number()
+
+
+MATH: dict[str, Callable] = {
+    "POWER": lambda a, b: np.power(np.maximum(a, 0.0), b),
+    "MINIMUM": np.minimum,
+    "MAXIMUM": np.maximum,
+    "DIVIDE": lambda a, b: np.divide(a, b, out=np.zeros(3), where=b != 0.0),
+    "SQRT": lambda a, b: np.sqrt(np.maximum(a, 0.0)),
+    "ABSOLUTE": lambda a, b: np.abs(a),
+    "GREATER_THAN": lambda a, b: (a > b).astype(float),
+    "LESS_THAN": lambda a, b: (a < b).astype(float),
+}
+
+
+def _math(source: Source) -> Value | None:
+    node, first, second = source.node, _input(source, 0), _input(source, 1)
+    if node.operation == "MULTIPLY_ADD":
+        result = combined(product(first, second), _input(source, 2), 1.0, 1.0)
+    else:
+        result = _math_of(node.operation, first, second)
+    return _clamped(result) if node.use_clamp else result
+
+
+def _math_of(operation: str, first: Value | None, second: Value | None) -> Value | None:
+    if operation in ("ADD", "SUBTRACT"):
+        return combined(first, second, 1.0, 1.0 if operation == "ADD" else -1.0)
+    if operation == "MULTIPLY":
+        return product(first, second)
+    if operation == "DIVIDE" and second is not None and second.is_constant and np.all(second.offset != 0.0):
+        return product(first, constant(1.0 / second.offset))
+    if operation in MATH and first is not None and second is not None and first.is_constant and second.is_constant:
+        return constant(MATH[operation](first.offset, second.offset))
+    return None
+
+
+def _clamped(value: Value | None) -> Value | None:
+    return constant(np.clip(value.offset, 0.0, 1.0)) if value is not None and value.is_constant else None
+
+
+def _mix(source: Source) -> Value | None:
+    """Mix and MixRGB by a constant factor."""
+    node = source.node
+    factor, first, second = 0, 1, 2
+    if node.bl_idname == "ShaderNodeMix":
+        if node.data_type == "RGBA":
+            factor, first, second = 0, 6, 7
+        elif node.data_type == "FLOAT":
+            factor, first, second = 0, 2, 3
+        else:
+            return None
+    blend = node.blend_type if getattr(node, "data_type", "RGBA") == "RGBA" else "MIX"
+    share, first, second = _input(source, factor), _input(source, first), _input(source, second)
+    if share is None or not share.is_constant:
+        return None
+    share = float(share.offset[0])
+    if getattr(node, "clamp_factor", True):
+        share = min(max(share, 0.0), 1.0)
+    if blend == "MIX":
+        return combined(first, second, 1.0 - share, share)
+    if blend in ("ADD", "SUBTRACT"):
+        return combined(first, second, 1.0, share if blend == "ADD" else -share)
+    if blend == "MULTIPLY":
+        return combined(first, product(first, second), 1.0 - share, share)
+    return None
+
+
+def _invert(source: Source) -> Value | None:
+    share, value = _input(source, 0), _input(source, 1)
+    if share is None or value is None or not share.is_constant:
+        return None
+    factor = float(share.offset[0])
+    return value.mapped((1.0 - 2.0 * factor) * np.eye(3), factor)
+
+
+def _gamma(source: Source) -> Value | None:
+    color, power = _input(source, 0), _input(source, 1)
+    if color is None or power is None or not (color.is_constant and power.is_constant):
+        return color if power is not None and power.is_constant and np.all(power.offset == 1.0) else None
+    return constant(np.power(np.maximum(color.offset, 0.0), power.offset))
+
+
+def _ramp(source: Source) -> Value | None:
+    factor = _input(source, 0)
+    if factor is None or not factor.is_constant:
+        return None
+    color = source.node.color_ramp.evaluate(float(factor.offset[0]))
+    return constant(color[3]) if source.socket.name == "Alpha" else constant(color)
+
+
+def _clamp(source: Source) -> Value | None:
+    value, low, high = (_input(source, index) for index in range(3))
+    if any(part is None or not part.is_constant for part in (value, low, high)):
+        return None
+    return replace(value, offset=np.clip(value.offset, low.offset, high.offset))
+
+
+READERS: dict[str, Callable[[Source], Value | None]] = {
+    "ShaderNodeValue": _own_value,
+    "ShaderNodeRGB": _own_value,
+    "ShaderNodeTexImage": _image,
+    "ShaderNodeSeparateColor": _separate,
+    "ShaderNodeSeparateXYZ": _separate,
+    "ShaderNodeCombineColor": _combine,
+    "ShaderNodeCombineXYZ": _combine,
+    "ShaderNodeRGBToBW": _to_number,
+    "ShaderNodeMath": _math,
+    "ShaderNodeMix": _mix,
+    "ShaderNodeMixRGB": _mix,
+    "ShaderNodeInvert": _invert,
+    "ShaderNodeGamma": _gamma,
+    "ShaderNodeValToRGB": _ramp,
+    "ShaderNodeClamp": _clamp,
+}

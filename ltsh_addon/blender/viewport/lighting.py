@@ -1,0 +1,163 @@
+"""The lighting pass: reflected radiance of a G-buffer under area lights, on the graphics card.
+
+Same lights, tables and integrals as `shading.shade`, in float32 throughout.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+
+from ...scene import AreaLight
+from ...shading import load_table
+from ...shading.lookup_table import LookupTable
+from .gbuffer_textures import GBufferTextures, float_texture
+from .light_texture import light_texels, visible_lights
+from .lighting_source import VERTEX, Features, fragment_source
+from .table_texture import dielectric_texels, table_texels
+
+PASSES = ("specular", "diffuse", "combined")
+_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
+_GBUFFER_SAMPLERS = {
+    "positions": "position",
+    "normals": "normal",
+    "bases": "base",
+    "f0s": "f0",
+    "f90s": "f90",
+    "dielectric_weights": "dielectric",
+    "geometric_normals": "geometric_normal",
+    "diffuse_normals": "diffuse_normal",
+    "smooth_normals": "smooth_normal",
+}
+
+
+class LightingPass:
+    """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
+
+    def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
+        """`technique` is "ltc", "ltsh2", "ltsh4", a table's path or a table of degree up to 4.
+
+        Dielectrics of the indices of refraction `iors`, multiples of 0.005, are faster; others are as exact.
+        Raises TableError and ValueError.
+        """
+        self.table = technique if isinstance(technique, LookupTable) else load_table(technique)
+        self._shaders: dict[Features, tuple] = {}
+        self._iors: tuple[float, ...] = ()
+        self._table = self._dielectrics = None
+        self.set_iors(iors)
+        self._light_values = None
+        self.set_lights(())
+
+    def free(self) -> None:
+        """Let go of shaders and textures; the pass cannot draw any more."""
+        self._shaders.clear()
+        self._table = self._dielectrics = self._lights = self._light_values = None
+
+    def set_iors(self, iors: Sequence[float]) -> None:
+        """The indices of refraction that most dielectrics have, as for the constructor."""
+        iors = tuple(dict.fromkeys(float(ior) for ior in iors))
+        if self._table is not None and iors == self._iors:
+            return
+        self._iors = iors
+        self._table = float_texture(table_texels(self.table, iors))
+        self._dielectrics = float_texture(dielectric_texels(self.table, iors))
+
+    def set_lights(self, lights: Iterable[AreaLight]) -> None:
+        """The lights from now on; does nothing where they are the same. Light groups are added up."""
+        lights = visible_lights(lights)
+        texels = light_texels(lights)
+        if self._light_values is None or not np.array_equal(texels, self._light_values):
+            self._light_values, self._lights = texels, float_texture(texels)
+        self._light_count = len(lights)
+
+    def draw(
+        self,
+        gbuffer: GBufferTextures,
+        target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer | None,
+        passes: str = "combined",
+        *,
+        view_position: Sequence[float] | None = None,
+        view_direction: Sequence[float] | None = None,
+        rect: tuple[int, int, int, int] | None = None,
+        add: bool = False,
+    ) -> None:
+        """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
+
+        `passes` is one of `PASSES`. Give the camera's place, or for orthographic cameras the unit direction toward
+        it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in `target` (None: what
+        is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of the same surfaces.
+        """
+        if passes not in PASSES:
+            raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(PASSES)}")
+        if (view_position is None) == (view_direction is None):
+            raise ValueError("lighting pass: give either view_position or view_direction")
+        x, y, width, height = rect or (0, 0, *gbuffer.size)
+        view = (*view_position, 1.0) if view_direction is None else (*view_direction, 0.0)
+        features = Features(
+            specular=passes != "diffuse",
+            diffuse=passes != "specular",
+            geometric=passes != "diffuse" and gbuffer.geometric_normal is not None,
+            bumped=passes != "specular" and gbuffer.diffuse_normal is not None,
+        )
+        if target is None:
+            self._draw(features, gbuffer, view, (x, y, width, height), add)
+            return
+        with target.bind():
+            self._draw(features, gbuffer, view, (x, y, width, height), add)
+
+    def _draw(self, features, gbuffer, view, rect, add):
+        shader, batch, samplers = self._shader(features)
+        x, y, width, height = rect
+        previous = gpu.state.viewport_get(), gpu.state.blend_get()
+        gpu.state.viewport_set(x, y, width, height)
+        gpu.state.blend_set("ADDITIVE" if add else "NONE")
+        try:
+            shader.bind()
+            for name in samplers:
+                shader.uniform_sampler(name, self._texture(name, gbuffer))
+            if features.specular:
+                shader.uniform_float("view", view)
+            shader.uniform_int("place", (x, y, self._light_count, 0))
+            batch.draw(shader)
+        finally:
+            gpu.state.viewport_set(*previous[0])
+            gpu.state.blend_set(previous[1])
+
+    def _texture(self, name, gbuffer):
+        own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}
+        return own[name] if name in own else getattr(gbuffer, _GBUFFER_SAMPLERS[name])
+
+    def _shader(self, features):
+        """The shader for `features`, its batch and the names of its textures; compiled when first wanted."""
+        found = self._shaders.get(features)
+        if found is None:
+            info, samplers = _create_info(self.table, features)
+            shader = gpu.shader.create_from_info(info)
+            batch = batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
+            found = self._shaders[features] = shader, batch, samplers
+        return found
+
+
+def _create_info(table, features):
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    info.fragment_out(0, "VEC4", "color")
+    # What a shader does not use is not there for whom sets it.
+    info.push_constant("IVEC4", "place")
+    if features.specular:
+        info.push_constant("VEC4", "view")
+    samplers = ["positions", "normals", "bases", "lights"]
+    if features.specular:
+        samplers += ["f0s", "f90s", "dielectric_weights", "table", "dielectrics"]
+    if features.geometric:
+        samplers.append("geometric_normals")
+    if features.bumped:
+        samplers += ["diffuse_normals", "smooth_normals"]
+    for slot, name in enumerate(samplers):
+        info.sampler(slot, "FLOAT_2D_ARRAY" if name == "table" else "FLOAT_2D", name)
+    info.vertex_source(VERTEX)
+    info.fragment_source(fragment_source(table, features))
+    return info, tuple(samplers)

@@ -1,0 +1,97 @@
+"""Evaluated meshes as batches for the graphics card: one per material slot, corners as vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gpu
+import numpy as np
+
+
+@dataclass
+class MeshBatches:
+    """One evaluated mesh; `slots` are the material slots that have faces."""
+
+    slots: tuple[int, ...]
+    triangles: int
+    indices: dict[int, gpu.types.GPUIndexBuf]
+    corners: gpu.types.GPUVertBuf | None
+    corner_count: int
+    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
+    middle: np.ndarray  # (3,) of the bounding box
+    _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
+    _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
+
+    def batch(self, slot: int, uv_map: str) -> gpu.types.GPUBatch:
+        """What draws the faces of `slot` with a UV map; maps that the mesh lacks are zero, as in Cycles."""
+        key = slot, uv_map
+        if key not in self._batches:
+            batch = gpu.types.GPUBatch(type="TRIS", buf=self.corners, elem=self.indices[slot])
+            batch.vertbuf_add(self._uv_buffer(uv_map))
+            self._batches[key] = batch
+        return self._batches[key]
+
+    def _uv_buffer(self, uv_map: str) -> gpu.types.GPUVertBuf:
+        if uv_map not in self._uv_buffers:
+            values = self.uv.get(uv_map)
+            if values is None:
+                values = np.zeros((self.corner_count, 2), np.float32)
+            self._uv_buffers[uv_map] = _vertex_buffer({"uv": values})
+        return self._uv_buffers[uv_map]
+
+
+def _vertex_buffer(attributes: dict[str, np.ndarray]) -> gpu.types.GPUVertBuf:
+    layout = gpu.types.GPUVertFormat()
+    for name, values in attributes.items():
+        layout.attr_add(id=name, comp_type="F32", len=values.shape[1], fetch_mode="FLOAT")
+    buffer = gpu.types.GPUVertBuf(layout, len(next(iter(attributes.values()))))
+    for name, values in attributes.items():
+        buffer.attr_fill(name, values)
+    return buffer
+
+
+def mesh_batches(ob) -> MeshBatches | None:
+    """Those of the evaluated object `ob`; None where it has no faces."""
+    mesh = ob.to_mesh()
+    if mesh is None:
+        return None
+    try:
+        mesh.calc_loop_triangles()
+        count = len(mesh.loop_triangles)
+        if count == 0:
+            return None
+        triangles = _get(mesh.loop_triangles, "loops", (count, 3), np.int32)
+        material = _get(mesh.loop_triangles, "material_index", (count,), np.int32)
+        corners = len(mesh.loops)
+        vertex = _get(mesh.loops, "vertex_index", (corners,), np.int32)
+        place = _get(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)[vertex]
+        normal = _get(mesh.corner_normals, "vector", (corners, 3), np.float32)
+        uv = _uv_maps(mesh, corners)
+    finally:
+        ob.to_mesh_clear()
+    slots = np.clip(material, 0, max(len(ob.material_slots) - 1, 0))
+    used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
+    indices = {
+        slot: gpu.types.GPUIndexBuf(
+            type="TRIS", seq=triangles if len(used) == 1 else np.ascontiguousarray(triangles[slots == slot])
+        )
+        for slot in used
+    }
+    buffer = _vertex_buffer({"position": place, "normal": normal})
+    middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
+    return MeshBatches(used, count, indices, buffer, corners, uv, middle)
+
+
+def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:
+    maps = {}
+    for layer in mesh.uv_layers:
+        maps[layer.name] = _get(layer.uv, "vector", (corners, 2), np.float32)
+        if layer.active_render:
+            maps[""] = maps[layer.name]
+    return maps
+
+
+def _get(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
+    values = np.empty(int(np.prod(shape)), dtype)
+    collection.foreach_get(name, values)
+    return values.reshape(shape)

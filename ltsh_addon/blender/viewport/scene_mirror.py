@@ -1,0 +1,210 @@
+"""What the viewport draws, kept in step with the scene: only what a change touches is read again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...scene import AreaLight
+from ..inventory import SURFACE_TYPES
+from ..light_linking import Receivers
+from ..surface_looks import Look, look_of
+from ..world_look import world_radiance
+from .mesh_batches import MeshBatches, mesh_batches
+from .surface_uniforms import look_values, uniform_buffer
+from .view_lights import view_lights
+
+
+@dataclass
+class ShownLook:
+    """A look with its uniform buffer; `textures` by slot come when it is first drawn."""
+
+    look: Look
+    uniforms: object
+    textures: dict | None = None
+
+
+@dataclass(frozen=True)
+class ShownInstance:
+    """One placement of a mesh."""
+
+    mesh: MeshBatches
+    model: Matrix
+    looks: tuple[ShownLook, ...]  # one for each slot of the mesh
+    receiver: int
+    side: float  # -1 where the transform mirrors
+    center: np.ndarray  # (4,) of the bounding box in the world
+
+
+@dataclass
+class Changes:
+    """What an update of the depsgraph touches."""
+
+    everything: bool = False
+    geometry: set[int] = field(default_factory=set)  # session uids of original objects and their data
+    materials: set[str] = field(default_factory=set)  # full names
+    images: bool = False
+    instances: bool = False
+    lights: bool = False
+    world: bool = False
+
+    @property
+    def surfaces(self) -> bool:
+        """Is anything of the G-buffer different?"""
+        return self.everything or self.instances or self.images or bool(self.geometry or self.materials)
+
+
+def changes_of(depsgraph, first: bool) -> Changes:
+    """What `depsgraph.updates` says; all of it on the `first` call, where the list is empty."""
+    changes = Changes(everything=first)
+    for update in depsgraph.updates:
+        block = update.id.original
+        if isinstance(block, bpy.types.Object):
+            _note_object(changes, block, update)
+        elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
+            # Materials and worlds are named beside their node trees.
+            changes.lights = True
+        elif isinstance(block, bpy.types.Material):
+            changes.materials.add(block.name_full)
+        elif isinstance(block, bpy.types.Image):
+            changes.images = True
+        elif isinstance(block, bpy.types.World):
+            changes.world = True
+        elif isinstance(block, bpy.types.Collection | bpy.types.Scene):
+            changes.instances = changes.lights = changes.world = True
+        elif update.is_updated_geometry:
+            changes.geometry.add(block.session_uid)
+    return changes
+
+
+def _note_object(changes: Changes, block, update) -> None:
+    if block.type == "LIGHT":
+        changes.lights = True
+        return
+    # Objects may be mesh lights, or instance lights.
+    changes.lights |= update.is_updated_transform or update.is_updated_geometry
+    changes.instances = True
+    if update.is_updated_geometry:
+        changes.geometry.add(block.session_uid)
+
+
+class SceneMirror:
+    """Meshes, looks, instances and lights of one view of a scene."""
+
+    def __init__(self):
+        self.instances: list[ShownInstance] = []
+        self.lights: tuple[AreaLight, ...] = ()
+        self.background = np.zeros(3)
+        self.surfaces_version = 0
+        self._meshes: dict[tuple, MeshBatches | None] = {}
+        self._looks: dict[str, ShownLook] = {}
+        self._light_notes: tuple[str, ...] = ()
+        self._world_note: tuple[str, ...] = ()
+        self._synced = False
+
+    @property
+    def notes(self) -> list[str]:
+        """What is not shown as Cycles has it, each once."""
+        found = [note for shown in self._looks.values() for note in shown.look.notes]
+        return list(dict.fromkeys([*found, *self._light_notes, *self._world_note]))
+
+    @property
+    def triangles(self) -> int:
+        return sum(instance.mesh.triangles for instance in self.instances)
+
+    def sync(self, depsgraph, space=None) -> None:
+        """Take over what has changed; `space` is the 3D view, whose local view counts."""
+        changes = changes_of(depsgraph, not self._synced)
+        self._drop_changed(changes)
+        in_view = _visibility(depsgraph, space)
+        if changes.surfaces:
+            self._read_instances(depsgraph, changes, in_view)
+            self.surfaces_version += 1
+        if changes.lights or changes.everything or changes.materials:
+            self.lights, self._light_notes = view_lights(depsgraph, in_view)
+        if changes.world or changes.everything:
+            self._read_world(depsgraph.scene)
+        self._synced = True
+
+    def _drop_changed(self, changes: Changes) -> None:
+        if changes.everything:
+            self._meshes.clear()
+            self._looks.clear()
+        for name in changes.materials:
+            self._looks.pop(name, None)
+        if changes.images:
+            for shown in self._looks.values():
+                shown.textures = None
+
+    def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
+        override = depsgraph.view_layer_eval.material_override
+        receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
+        instances, meshes, looks = [], {}, {}
+        for instance in depsgraph.object_instances:
+            ob = instance.object
+            if ob.type not in SURFACE_TYPES or not instance.show_self or not in_view(instance):
+                continue
+            key = _mesh_key(instance)
+            if key not in meshes:
+                known = key in self._meshes and not changes.geometry.intersection(key[:3])
+                meshes[key] = self._meshes[key] if known else mesh_batches(ob)
+            mesh = meshes[key]
+            if mesh is None:
+                continue
+            slots = [slot.material for slot in ob.material_slots] or [None]
+            materials = [override or slots[slot] for slot in mesh.slots]
+            names = {material.name_full if material else "": material for material in materials}
+            for name, material in names.items():
+                if name not in looks:
+                    looks[name] = self._looks.get(name) or _shown_look(material)
+            parent = instance.parent.original.name_full if instance.is_instance and instance.parent else ""
+            receiver = receivers.numbers.get(parent, receivers.numbers.get(ob.original.name_full, 0))
+            shown = tuple(looks[material.name_full if material else ""] for material in materials)
+            model = instance.matrix_world.copy()
+            side = -1.0 if model.determinant() < 0.0 else 1.0
+            center = np.array(model) @ [*mesh.middle, 1.0]
+            instances.append(ShownInstance(mesh, model, shown, receiver, side, center))
+        self.instances, self._meshes, self._looks = instances, meshes, looks
+
+    def _read_world(self, scene) -> None:
+        self.background, whole = world_radiance(scene.world)
+        world = scene.world
+        self._world_note = () if whole else (f"{world.name}: its nodes are not resolved, its viewport color is shown",)
+
+
+def _shown_look(material) -> ShownLook:
+    look = look_of(None if material is None else material.original)
+    return ShownLook(look, uniform_buffer(look_values(look)))
+
+
+def _originals(depsgraph) -> list:
+    return [ob.original for ob in depsgraph.objects]
+
+
+def _mesh_key(instance) -> tuple:
+    """What tells evaluated meshes apart: object, data and instancer, then the evaluated data itself.
+
+    Blender may use the place of freed data again, but then one of the first three has changed.
+    """
+    ob = instance.object
+    data = ob.data
+    parent = instance.parent.original.session_uid if instance.is_instance and instance.parent else 0
+    original = data.original.session_uid if data is not None and data.original is not None else 0
+    pointer = data.as_pointer() if data is not None else 0
+    shared = isinstance(data, bpy.types.Mesh) and not ob.modifiers and not instance.is_instance
+    return (0 if shared else ob.original.session_uid, original, parent, pointer)
+
+
+def _visibility(depsgraph, space):
+    """A test of depsgraph instances: are they seen in `space`? Only its local view makes a difference."""
+    if space is None or space.local_view is None:
+        return lambda instance: True
+
+    def in_local_view(instance) -> bool:
+        ob = instance.parent if instance.is_instance and instance.parent else instance.object
+        return ob.original.local_view_get(space)
+
+    return in_local_view

@@ -1,0 +1,152 @@
+"""Draws the surfaces of a mirrored scene into a G-buffer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gpu
+import numpy as np
+from mathutils import Matrix
+
+from ..surface_looks import IMAGE_SLOTS
+from . import surface_source as source
+from .gbuffer_textures import GBufferTextures, float_texture
+from .scene_mirror import ShownInstance, ShownLook
+from .surface_uniforms import DEFINES, LOOK_SIZE, albedo_table, blend_table, float_table, uniform_buffer
+
+# No more than six textures can be drawn into at once.
+SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
+NORMALS = ("diffuse_normal", "smooth_normal")
+
+
+@dataclass(frozen=True)
+class View:
+    """From where a picture is seen: matrices (4, 4), and the eye's place or, in parallel views, the way to it."""
+
+    projection: np.ndarray  # world to clip space
+    eye: np.ndarray  # (3,)
+    is_parallel: bool
+
+    @classmethod
+    def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
+        """That of a region's matrices."""
+        to_world = view_matrix.inverted()
+        eye = to_world.col[2].xyz.normalized() if is_parallel else to_world.translation
+        return cls(np.array(window_matrix @ view_matrix, np.float64), np.array(eye), is_parallel)
+
+
+class SurfacePass:
+    """Shaders and textures of one view's G-buffer; needs an active GPU context."""
+
+    def __init__(self):
+        self._shaders = {outputs: _shader(outputs) for outputs in (SURFACES, NORMALS)}
+        self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
+        self._nothing = float_texture(np.zeros((1, 1, 4)))
+        self._size, self._textures, self._buffers = None, {}, {}
+
+    def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
+        """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call."""
+        self._resize(size)
+        self._draw_into(SURFACES, instances, view, size)
+        textures = {name: self._textures[name] for name in SURFACES}
+        if any(_bends(look) for instance in instances for look in instance.looks):
+            self._draw_into(NORMALS, instances, view, size)
+            textures.update({name: self._textures[name] for name in NORMALS})
+            textures["geometric_normal"] = textures["smooth_normal"]
+        return GBufferTextures(**textures)
+
+    @property
+    def depth(self) -> gpu.types.GPUTexture:
+        """The depth of what was drawn last."""
+        return self._depth
+
+    def free(self) -> None:
+        """Let go of everything."""
+        self._size, self._textures, self._buffers, self._tables, self._shaders = None, {}, {}, {}, {}
+        self._nothing = self._depth = None
+
+    def _resize(self, size) -> None:
+        if size == self._size:
+            return
+        self._textures = {name: gpu.types.GPUTexture(size, format="RGBA32F") for name in (*SURFACES, *NORMALS)}
+        self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+        self._buffers = {
+            outputs: gpu.types.GPUFrameBuffer(
+                depth_slot=self._depth, color_slots=[self._textures[name] for name in outputs]
+            )
+            for outputs in (SURFACES, NORMALS)
+        }
+        self._size = size
+
+    def _draw_into(self, outputs, instances, view: View, size) -> None:
+        buffer = self._buffers[outputs]
+        with buffer.bind():
+            gpu.state.viewport_set(0, 0, *size)
+            # Only the position tells where there is a surface, but no number may be left that is not one.
+            buffer.clear(color=(0.0, 0.0, 0.0, 0.0), depth=1.0)
+            gpu.state.blend_set("NONE")
+            gpu.state.depth_test_set("LESS_EQUAL")
+            gpu.state.depth_mask_set(True)
+            gpu.state.face_culling_set("NONE")
+            try:
+                self._draw_instances(self._shaders[outputs], instances, view)
+            finally:
+                gpu.state.depth_test_set("NONE")
+                gpu.state.depth_mask_set(False)
+
+    def _draw_instances(self, shader, instances, view: View) -> None:
+        shader.bind()
+        values = np.vstack([view.projection.T, [*view.eye, 0.0 if view.is_parallel else 1.0]])
+        # Kept until all is drawn: the card reads it then.
+        self._view_values = uniform_buffer(values)
+        shader.uniform_block("view", self._view_values)
+        for name, table in self._tables.items():
+            shader.uniform_sampler(name, table)
+        # From near to far: what is hidden need not be computed.
+        for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
+            shader.uniform_float("model", instance.model)
+            shader.uniform_float("receiver_and_side", (instance.receiver, instance.side))
+            for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
+                self._bind_look(shader, look)
+                instance.mesh.batch(slot, look.look.uv_map).draw(shader)
+
+    def _bind_look(self, shader, shown: ShownLook) -> None:
+        if shown.textures is None:
+            shown.textures = {name: gpu.texture.from_image(use.image) for name, use in shown.look.images.items()}
+        shader.uniform_block("look", shown.uniforms)
+        for name in IMAGE_SLOTS:
+            shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
+
+
+def _bends(shown: ShownLook) -> bool:
+    """True where the diffuse lobe has a normal of its own."""
+    return shown.look.normal is not None or shown.look.kind == "translucent"
+
+
+def _shader(outputs):
+    info = gpu.types.GPUShaderCreateInfo()
+    info.typedef_source(
+        f"struct SurfaceView {{ mat4 projection; vec4 eye; }};\nstruct SurfaceLook {{ vec4 data[{LOOK_SIZE}]; }};\n"
+    )
+    for name, value in DEFINES.items():
+        info.define(name, value)
+    info.uniform_buf(0, "SurfaceView", "view")
+    info.uniform_buf(1, "SurfaceLook", "look")
+    info.push_constant("MAT4", "model")
+    info.push_constant("VEC2", "receiver_and_side")
+    for slot, name in enumerate((*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")):
+        info.sampler(slot, "FLOAT_2D", name)
+    info.vertex_in(0, "VEC3", "position")
+    info.vertex_in(1, "VEC3", "normal")
+    info.vertex_in(2, "VEC2", "uv")
+    passed = gpu.types.GPUStageInterfaceInfo("ltsh_surface")
+    passed.smooth("VEC3", "v_position")
+    passed.smooth("VEC3", "v_normal")
+    passed.smooth("VEC2", "v_uv")
+    info.vertex_out(passed)
+    for slot, name in enumerate(outputs):
+        info.fragment_out(slot, "VEC4", f"out_{name}")
+    info.vertex_source(source.VERTEX)
+    end = source.FRAGMENT_OF_SURFACES if outputs == SURFACES else source.FRAGMENT_OF_NORMALS
+    info.fragment_source(source.IMAGES + source.REFLECTANCE + source.NORMALS + source.FRAGMENT + end)
+    return gpu.shader.create_from_info(info)

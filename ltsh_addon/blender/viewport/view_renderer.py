@@ -1,0 +1,122 @@
+"""One frame of the viewport: G-buffer, lighting, picture. What has not changed is not drawn again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gpu
+import numpy as np
+
+from ..linear_values import Value
+from .gbuffer_textures import GBufferTextures
+from .lighting import LightingPass
+from .picture_pass import PicturePass
+from .scene_mirror import SceneMirror
+from .surface_pass import SurfacePass, View
+
+# The lighting pass is fast for so many indices of refraction, and exact for all.
+MOST_IORS = 6
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """What of the lighting is shown, and how."""
+
+    technique: str
+    passes: str  # combined, specular or diffuse
+    mode: str  # of `picture_pass.MODES`
+    second_technique: str
+    split: float
+    difference_scale: float
+    exposure: float
+    transparent: bool
+    line_width: float = 1.0
+
+
+class ViewRenderer:
+    """The GPU's side of one view; needs an active GPU context."""
+
+    def __init__(self):
+        self._surfaces = SurfacePass()
+        self._picture = PicturePass()
+        self._lighting: dict[str, LightingPass] = {}
+        self._targets: list = []
+        self._gbuffer: GBufferTextures | None = None
+        self._drawn = None
+
+    def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
+        """Draw the scene into `frame_buffer`, which has `size` pixels."""
+        self._draw_surfaces(mirror, view, size)
+        first = self._lit(0, shown.technique, mirror, view, size, shown.passes)
+        second = None
+        if shown.mode != "single":
+            second = self._lit(1, shown.second_technique, mirror, view, size, shown.passes)
+        # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
+        with frame_buffer.bind():
+            self._picture.draw(
+                first,
+                second,
+                (0, 0, *size),
+                mode=shown.mode,
+                exposure=shown.exposure,
+                background=mirror.background if shown.passes == "combined" else np.zeros(3),
+                transparent=shown.transparent,
+                split=shown.split,
+                difference_scale=shown.difference_scale,
+                line_width=shown.line_width,
+            )
+
+    def _draw_surfaces(self, mirror, view: View, size) -> None:
+        drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), size)
+        if drawn != self._drawn:
+            self._drawn = None
+            self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+            self._drawn = drawn
+
+    def _lit(self, number: int, technique: str, mirror, view: View, size, passes: str):
+        lighting = self._lighting.get(technique)
+        if lighting is None:
+            lighting = self._lighting[technique] = LightingPass(technique)
+        lighting.set_iors(common_iors(mirror))
+        lighting.set_lights(mirror.lights)
+        texture, buffer = self._target(number, size)
+        place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
+        lighting.draw(self._gbuffer, buffer, passes, **place)
+        return texture
+
+    def _target(self, number: int, size):
+        """Texture and frame buffer that the technique `number` is drawn into."""
+        while len(self._targets) <= number:
+            self._targets.append(None)
+        if self._targets[number] is None or self._targets[number][2] != size:
+            texture = gpu.types.GPUTexture(size, format="RGBA32F")
+            self._targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
+        return self._targets[number][:2]
+
+    def read(self, number: int = 0) -> np.ndarray:
+        """The last picture (H, W, 4) of the first technique or the second, row 0 at the bottom."""
+        texture = self._targets[number][0]
+        buffer = texture.read()
+        buffer.dimensions = texture.width * texture.height * 4
+        return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+
+    def free(self) -> None:
+        """Let go of everything."""
+        for lighting in self._lighting.values():
+            lighting.free()
+        self._lighting.clear()
+        self._targets.clear()
+        self._surfaces.free()
+        self._gbuffer = self._drawn = None
+
+
+def common_iors(mirror: SceneMirror) -> tuple[float, ...]:
+    """The constant indices of refraction of most instances, as the lighting pass takes them."""
+    counts: dict[float, int] = {}
+    for instance in mirror.instances:
+        for shown in instance.looks:
+            value: Value = shown.look.value("ior")
+            ior = round(200.0 * float(value.offset[0])) / 200.0
+            if value.is_constant and ior > 1.0:
+                counts[ior] = counts.get(ior, 0) + 1
+    return tuple(sorted(counts, key=counts.get, reverse=True)[:MOST_IORS]) or (1.5,)

@@ -1,0 +1,138 @@
+"""Margins of adjacent faces: against a surface laid flat, and against what Blender's own bake fills in."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+from bake_scenes import baked, save, start
+from scene_parts import add_plane, principled
+
+from ltsh_addon import imaging
+from ltsh_addon.bake_planes import Planes
+from ltsh_addon.blender import texel_bake
+from ltsh_addon.blender.uv_raster import UvTriangles
+from ltsh_addon.blender.uv_seams import UvSeams
+
+SIZE, MARGIN = 128, 6
+
+
+def filled(folder, uv, vertices, colors):
+    """Image (SIZE, SIZE, 3) of what `colors` gives for the covered texels, with its margin, row 0 below; coverage."""
+    texels = UvTriangles.in_tile(uv, SIZE, SIZE).texels(0, SIZE)
+    seams = UvSeams.of(uv, vertices, SIZE, SIZE)
+    values = colors(texels)
+    with Planes(folder / "planes", ["x.R", "x.G", "x.B"], SIZE, SIZE, seams) as planes:
+        planes.put(0, SIZE, texels, {f"x.{letter}": values[:, axis] for axis, letter in enumerate("RGB")})
+        planes.write(folder / "x.exr", MARGIN, {}, None)
+    layers = imaging.read_layers(folder / "x.exr")
+    return layers["x"][::-1], layers["coverage.hit"][::-1] > 0.0
+
+
+def strip(turn):
+    """Two squares of 0.3 that share an edge: uv (4, 3, 2) cut there, the second one turned about its middle by quarter
+    turns and, where `turn` is negative, mirrored; vertices; positions (4, 3, 2) on the strip laid flat."""
+    flat = np.array([[(0, 0), (1, 0), (1, 1), (0, 1)], [(1, 0), (2, 0), (2, 1), (1, 1)]])
+    numbers = np.array([[0, 1, 2, 3], [1, 4, 5, 2]])
+    local = flat[1] - (1.5, 0.5)
+    if turn < 0:
+        local = local * (1, -1)
+    for _ in range(abs(turn)):
+        local = np.stack([-local[:, 1], local[:, 0]], axis=-1)
+    uv = 0.3 * np.stack([flat[0], local]) + np.array([(0.12, 0.55), (0.7, 0.25)])[:, None]
+    halves = [[0, 1, 2], [0, 2, 3]]
+    split = [values[:, halves].reshape(4, 3, *values.shape[2:]) for values in (uv, numbers, flat)]
+    return split[0], split[1], split[2]
+
+
+@pytest.mark.parametrize("turn", [0, 1, 2, 3, -1, -4])
+def test_beyond_a_cut_the_margin_continues_the_surface_laid_flat(tmp_path, turn):
+    uv, vertices, flat = strip(turn)
+
+    def colors(texels):
+        place = np.einsum("qk,qkc->qc", texels.barycentric, flat[texels.triangle])
+        return np.stack([place[:, 0], place[:, 1], 1.0 + place[:, 0] - place[:, 1]], axis=-1).astype(np.float32)
+
+    image, covered = filled(tmp_path, uv, vertices, colors)
+    x, y = np.meshgrid(*2 * [(np.arange(SIZE) + 0.5) / SIZE])
+    # The texels right of the first square, up to the margin and away from its corners.
+    beside = (x > 0.42) & (x < 0.42 + (MARGIN - 1) / SIZE) & (y > 0.57) & (y < 0.83) & ~covered
+    assert beside.sum() > 100
+    across = (x[beside] - 0.12) / 0.3
+    assert across.min() > 1.0
+    expected = np.stack([across, (y[beside] - 0.55) / 0.3], axis=-1)
+    # Positions of texels are off by 0.002 of a texel where their center is on an edge, which is 1 / 38 of a square; at
+    # the cut itself one texel may stand for four.
+    far = np.abs(image[beside][:, :2] - expected).max(axis=1)
+    assert np.quantile(far, 0.8) < 1e-3 and far.max() < 1.0 / (0.3 * SIZE)
+    # Its left side is no cut but where the surface ends: there the nearest texel is repeated.
+    open_side = (x < 0.12) & (x > 0.12 - (MARGIN - 1) / SIZE) & (y > 0.57) & (y < 0.83) & ~covered
+    assert np.abs(image[open_side][:, 0]).max() < 1.0 / (0.3 * SIZE)
+
+
+def position_material():
+    material, tree, output = scene_parts.new_material("Position")
+    geometry, emission = tree.nodes.new("ShaderNodeNewGeometry"), tree.nodes.new("ShaderNodeEmission")
+    tree.links.new(geometry.outputs["Position"], emission.inputs["Color"])
+    tree.links.new(emission.outputs[0], output.inputs["Surface"])
+    return material
+
+
+def blender_bake(ob, margin):
+    """Positions (SIZE, SIZE, 3) as Blender bakes them, row 0 below; 0 beyond the margin."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    image = bpy.data.images.new("Bake", SIZE, SIZE, alpha=True, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.zeros(SIZE * SIZE * 4, np.float32))
+    tree = ob.data.materials[0].node_tree
+    tree.nodes.active = tree.nodes.new("ShaderNodeTexImage")
+    tree.nodes.active.image = image
+    bpy.ops.object.bake(type="EMIT", margin=margin, margin_type="ADJACENT_FACES", use_clear=False)
+    pixels = np.empty(SIZE * SIZE * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(SIZE, SIZE, 4)[..., :3]
+
+
+@pytest.mark.parametrize(
+    ("kind", "share"),
+    # Of the margin, in front of an edge of the faces; the rest are corners, where Blender takes some farther edge, and
+    # gaps between the triangles at a pole, which it crosses several times.
+    [("cube", 0.93), ("uv_sphere", 0.9), ("monkey", 0.7)],
+)
+def test_margins_agree_with_blenders_own(tmp_path, kind, share):
+    scene_parts.empty_scene()
+    getattr(bpy.ops.mesh, f"primitive_{kind}_add")()
+    ob = bpy.context.object
+    ob.data.materials.clear()
+    ob.data.materials.append(position_material())
+    plain, wide = blender_bake(ob, 0), blender_bake(ob, MARGIN)
+    mesh, _, _ = texel_bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+
+    def colors(texels):
+        return plain.reshape(-1, 3)[texels.index]
+
+    image, covered = filled(tmp_path, mesh.uv, mesh.vertices, colors)
+    margin = ~covered & image.any(axis=-1) & wide.any(axis=-1)
+    assert margin.sum() > 0.9 * (~covered & image.any(axis=-1)).sum() > 500
+    # Objects of 2 m on a few dozen texels: one stands for this many meters.
+    texel = np.abs(np.diff(plain, axis=0)).max(axis=-1)[covered[1:] & covered[:-1]]
+    apart = np.abs(image - wide).max(axis=-1)[margin]
+    assert (apart < np.median(texel)).mean() > share, np.percentile(apart / np.median(texel), [50, 70, 90, 95])
+    assert np.median(apart) < 0.12 * np.median(texel)
+
+
+def test_a_bake_with_adjacent_faces_differs_in_the_margin_alone(tmp_path):
+    start(camera=None)
+    ob = add_plane(principled(Roughness=0.5)[0], size=2.0)
+    bpy.ops.mesh.primitive_cube_add(size=1.0)
+    bpy.context.object.data.materials.append(ob.data.materials[0])
+    path = save(tmp_path)
+    options = {"objects": ("Cube",), "view": "above", "passes": ("diffuse",), "margin": 3}
+    _, plain = baked(path, tmp_path / "extend", **options)
+    _, across = baked(path, tmp_path / "adjacent", margin_type="adjacent", **options)
+    before, after = plain["Cube.exr"], across["Cube.exr"]
+    covered = before["coverage.hit"] > 0.0
+    assert np.array_equal(before["coverage.hit"], after["coverage.hit"])
+    assert np.array_equal(before["ltsh4.diffuse"][covered], after["ltsh4.diffuse"][covered])
+    assert np.abs(before["ltsh4.diffuse"] - after["ltsh4.diffuse"]).max() > 0.0
+    with pytest.raises(ValueError, match="margin_type is 'wide', expected extend or adjacent"):
+        baked(path, tmp_path / "wrong", margin_type="wide")

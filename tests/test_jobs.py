@@ -1,0 +1,260 @@
+"""Jobs of many tasks without Blender: names, order, shards, what is kept, what is named as missing."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import fake_scene
+import pytest
+
+from ltsh_addon import argument_values, batch, cli, output_names, task_records
+from ltsh_addon.blender.child import SceneError
+from ltsh_addon.compare import Options
+from ltsh_addon.merge import merge
+from ltsh_addon.tasks import Job, shard_of, tasks_of
+
+SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
+
+
+@pytest.fixture
+def child(monkeypatch):
+    return fake_scene.FakeChild().install(monkeypatch)
+
+
+@pytest.fixture
+def room(tmp_path):
+    path = tmp_path / "room.blend"
+    path.write_bytes(b"BLENDER")
+    return path
+
+
+def job(room, output, command="shade", **changes):
+    options = Options(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
+    return Job(command, options, **{"scenes": (room,), **changes})
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout, and stderr without the warnings about the scene."""
+    code = cli.main([str(argument) for argument in arguments])
+    stdout, stderr = capsys.readouterr()
+    return code, stdout, stderr.replace(f"warning: {fake_scene.WARNING}\n", "")
+
+
+def contents(folder):
+    """Bytes by name of all files below `folder` but for times."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("7", (7,)),
+        ("-3", (-3,)),
+        ("1-4", (1, 2, 3, 4)),
+        ("1-9:3,300", (1, 4, 7, 300)),
+        ("-2-1", (-2, -1, 0, 1)),
+        ("-4--2", (-4, -3, -2)),
+        ("3,1,2-3", (3, 1, 2)),
+        ("5-5", (5,)),
+    ],
+)
+def test_frames_are_ranges_and_single_ones_each_once(text, expected):
+    assert argument_values.frames(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "complaint"),
+    [
+        *(("--frames", text, "frame is") for text in ("", "1,", "1..4", "1-4:x", "a-b", "1048575", "1-1048575", "+1")),
+        *(("--frames", text, "upwards, STEP above 0") for text in ("4-1", "1-4:0")),
+        *(("--shard", text, "expected I/N") for text in ("0/4", "5/4", "1", "1/0", "-1/4", "a/b", "1/4/2", "/")),
+        *(("--name", text, "is unknown, expected fields") for text in ("{object}", "{0}", "{}", "{frame!r}", "{x.y}")),
+        *(("--name", text, "expected names below the output folder")
+          for text in ("../x", "/x", "a//b", "a/../../b", ".hidden", "x/.y", "x.", "a/")),
+        *(("--name", text, "letter") for text in ("a\\b", "c:x", "a*", "x\ny")),
+        ("--name", "{frame:q}", "name '{frame:q}'"),
+        ("--name", "{frame", "name '{frame'"),
+        ("--name", "", "0 letters"),
+    ],
+)  # fmt: skip
+def test_wrong_values_are_misuse(capsys, child, room, tmp_path, option, text, complaint):
+    code, stdout, stderr = run(capsys, "shade", room, "-o", tmp_path / "out", f"{option}={text}")
+    assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1] and not (tmp_path / "out").exists()
+
+
+def test_stems_differ_in_any_case_and_hold_no_separators():
+    names = ["Floor", "floor", "a/b", "a:b", "../../x", "", "Bücher", "x" * 300, "x" * 301]
+    stems = output_names.file_stems(names)
+    assert len({stem.casefold() for stem in stems}) == len(names) and stems[0] == "Floor" and stems[6] == "Bücher"
+    assert not [stem for stem in stems if set(stem) & set("/\\:.") or not stem.strip() or len(stem) > 110]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, ["shade"]),
+        ({"frames": (5,)}, ["shade"]),
+        ({"frames": (1, -20)}, ["shade_0001", "shade_-020"]),
+        ({"cameras": ("A", "B")}, ["shade_A", "shade_B"]),
+        ({"cameras": ("A", "B"), "frames": (1, 2)}, ["shade_A_0001", "shade_A_0002", "shade_B_0001", "shade_B_0002"]),
+        ({"cameras": ("A",), "frames": (1,), "name": "{scene}/{camera}.{frame}"}, ["room/A.1"]),
+        ({"cameras": ("../A", "..:A"), "name": "{camera}"}, ["___A", "___A_2"]),
+    ],
+)
+def test_names_have_what_there_is_several_of(room, tmp_path, changes, expected):
+    assert [task.name for task in tasks_of(job(room, tmp_path, **changes))] == expected
+
+
+def test_scenes_of_one_name_get_different_names(room, tmp_path):
+    other = tmp_path / "other" / "room.blend"
+    other.parent.mkdir()
+    shutil.copy(room, other)
+    assert [task.name for task in tasks_of(job(room, tmp_path, scenes=(room, other)))] == ["shade_room", "shade_room_2"]
+
+
+def test_tasks_that_would_write_the_same_file_are_misuse(capsys, child, room, tmp_path):
+    code, _, stderr = run(capsys, "shade", room, "-o", tmp_path / "out", "--frames", "1-2", "--name", "x", *SMALL)
+    assert code == 2 and "the same name 'x'; add {frame}" in stderr and child.asked == []
+
+
+def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatch, capsys, child, room, tmp_path):
+    from ltsh_addon.blender import scene_facts
+
+    monkeypatch.setattr(scene_facts, "ask", lambda *a, **k: [{"frame": 12, "camera": "Main/1", "objects": []}])
+    name = "{camera}_{frame:03d}"
+    assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0
+    assert (tmp_path / "out" / "Main_1_012.exr").is_file() and child.asked[0].frame is None
+
+
+def test_shards_are_disjoint_and_together_everything(room, tmp_path):
+    tasks = tasks_of(job(room, tmp_path, frames=tuple(range(23))))
+    for count in (1, 2, 4, 23, 40):
+        shards = [shard_of(tasks, (number, count)) for number in range(1, count + 1)]
+        assert sorted((task for shard in shards for task in shard), key=tasks.index) == tasks
+        assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+@pytest.mark.parametrize("command", ["shade", "compare"])
+def test_shards_merged_are_the_single_run_byte_for_byte(capsys, child, room, tmp_path, command):
+    arguments = [command, room, "--frames", "1-3,9", "--camera", "A", "--camera", "B", *SMALL]
+    assert run(capsys, *arguments, "-o", tmp_path / "one")[0] == 0
+    for number in (3, 1, 4, 2):
+        assert run(capsys, *arguments, "-o", tmp_path / "four", "--shard", f"{number}/4")[0] == 0
+    assert run(capsys, "merge", tmp_path / "four", "--quiet")[0] == 0
+    one = contents(tmp_path / "one")
+    assert contents(tmp_path / "four") == one
+    report = json.loads(one["report.json"])
+    assert [(entry["camera"], entry["frame"]) for entry in report["reports"]] == [
+        (camera, frame) for camera in "AB" for frame in (1, 2, 3, 9)
+    ]
+    assert all((tmp_path / "four" / name).is_file() for entry in report["reports"] for name in entry["files"])
+    timing = json.loads((tmp_path / "four" / "timing.json").read_text())["seconds"]
+    assert len(timing) == 8 and all(seconds["total"] > 0.0 for seconds in timing.values())
+
+
+def test_merging_names_what_is_missing(capsys, child, room, tmp_path):
+    out = tmp_path / "out"
+    code, _, stderr = run(capsys, "merge", tmp_path)
+    assert code == 1 and "no task has finished there" in stderr and "-o" in stderr
+    assert run(capsys, "shade", room, "-o", out, "--frames", "1-5", "--shard", "1/2", *SMALL)[0] == 0
+    code, _, stderr = run(capsys, "merge", out, "--quiet")
+    assert code == 1 and stderr.splitlines() == ["missing: shade_0002", "missing: shade_0004"]
+    assert json.loads((out / "report.json").read_text())["missing"] == ["shade_0002", "shade_0004"]
+    assert run(capsys, "shade", room, "-o", out, "--frames", "1-5", "--shard", "2/2", *SMALL)[0] == 0
+    assert run(capsys, "merge", out, "--quiet")[0] == 0
+    (out / "shade_0003.exr").write_bytes((out / "shade_0002.exr").read_bytes())
+    assert run(capsys, "merge", out, "--quiet")[2] == "missing: shade_0003\n"
+    (out / ".ltsh" / "job.json").write_text("{")
+    code, _, stderr = run(capsys, "merge", out, "--quiet")
+    assert code == 1 and "job.json: is damaged" in stderr
+
+
+def test_shards_of_other_options_or_scenes_are_missing(capsys, child, room, tmp_path):
+    out, arguments = tmp_path / "out", ["shade", room, "-o", tmp_path / "out", "--frames", "1-2", *SMALL]
+    assert run(capsys, *arguments, "--shard", "1/2", "--aa", "2")[0] == 0
+    assert run(capsys, *arguments, "--shard", "2/2")[0] == 0
+    assert run(capsys, "merge", out)[2] == "missing: shade_0001\n"
+    room.write_bytes(b"BLENDER2")
+    assert run(capsys, *arguments, "--shard", "1/2")[0] == 0
+    assert run(capsys, "merge", out)[2] == "missing: shade_0002\n"
+
+
+def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
+    wanted = job(room, tmp_path / "out", frames=(1, 2, 3))
+    assert batch.run_tasks(wanted).done == 3
+    before = contents(tmp_path / "out")
+    assert batch.run_tasks(wanted, existing=batch.RESUME).kept == 3 and len(child.asked) == 3
+    (tmp_path / "out" / "shade_0002.exr").unlink()
+    done = batch.run_tasks(wanted, existing=batch.RESUME)
+    assert (done.done, done.kept, child.asked[-1].frame) == (1, 2, 2) and contents(tmp_path / "out") == before
+    # More frames of the same job keep what is there; other options do not.
+    assert batch.run_tasks(replace(wanted, frames=(3, 4)), existing=batch.RESUME).kept == 1
+    changed = replace(wanted, options=replace(wanted.options, passes=("specular",)))
+    assert batch.run_tasks(changed, existing=batch.RESUME).kept == 0
+    assert batch.run_tasks(wanted, existing=batch.SKIP).kept == 3 and merge(tmp_path / "out").missing == ()
+    assert batch.run_tasks(wanted).kept == 0
+
+
+@pytest.mark.parametrize("existing", [batch.RESUME, batch.SKIP])
+@pytest.mark.parametrize("damage", ["cut", "changed", "record", "foreign record", "empty record"])
+def test_what_is_not_whole_is_done_again(child, room, tmp_path, existing, damage):
+    wanted = job(room, tmp_path / "out", frames=(1, 2))
+    batch.run_tasks(wanted)
+    before = contents(tmp_path / "out")
+    image = tmp_path / "out" / "shade_0001.exr"
+    record = tmp_path / "out" / task_records.FOLDER / "tasks" / "shade_0001.json"
+    if damage == "cut":
+        image.write_bytes(image.read_bytes()[:-1])
+    elif damage == "changed":
+        image.write_bytes(image.read_bytes()[:-1] + b"x")
+    else:
+        record.write_text({"record": "{", "foreign record": '{"format": 99}', "empty record": ""}[damage])
+    done = batch.run_tasks(wanted, existing=existing)
+    assert (done.done, done.kept) == (1, 1)
+    after = contents(tmp_path / "out")
+    after.pop(".ltsh/job.json"), before.pop(".ltsh/job.json")
+    assert after == before
+
+
+def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch, room, tmp_path):
+    fake = fake_scene.FakeChild().install(monkeypatch)
+    extract = fake.extract
+
+    def fail_at_two(options, *, progress=None):
+        if options.frame == 2:
+            raise SceneError("room.blend: no area light\nat this frame")
+        return extract(options, progress=progress)
+
+    from ltsh_addon.blender import child as child_module
+
+    monkeypatch.setattr(child_module, "extract", fail_at_two)
+    arguments = ["shade", room, "--frames", "1-3", *SMALL]
+    code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one")
+    assert code == 1 and "failed: shade_0002: room.blend: no area light at this frame" in stderr.splitlines()
+    codes = [run(capsys, *arguments, "-o", tmp_path / "two", "--shard", shard)[0] for shard in ("1/2", "2/2")]
+    assert codes == [0, 1] and run(capsys, "merge", tmp_path / "two")[0] == 1
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+    monkeypatch.setattr(child_module, "extract", extract)
+    code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one", "--resume")
+    assert (code, [options.frame for options in fake.asked[-1:]]) == (0, [2]) and "failed" not in stderr
+
+
+def test_results_of_different_versions_are_not_mixed(child, room, tmp_path):
+    batch.run_tasks(job(room, tmp_path / "out", frames=(1, 2)))
+    path = tmp_path / "out" / task_records.FOLDER / "tasks" / "shade_0002.json"
+    path.write_text(path.read_text().replace("5.2.3", "4.5.15"))
+    (problem,) = merge(tmp_path / "out").problems
+    assert "different versions" in problem and "5.2.3" in problem and "4.5.15" in problem
+
+
+def test_two_jobs_in_one_folder_leave_each_others_files(child, room, tmp_path):
+    first, second = (job(room, tmp_path / "out", command, frames=(1, 2)) for command in ("shade", "compare"))
+    batch.run_tasks(first)
+    before = contents(tmp_path / "out")
+    batch.run_tasks(second)
+    after = contents(tmp_path / "out")
+    assert all(after[name] == data for name, data in before.items() if name != ".ltsh/job.json")
+    assert batch.run_tasks(first, existing=batch.RESUME).kept == 2
+    assert batch.run_tasks(second, existing=batch.RESUME).kept == 2

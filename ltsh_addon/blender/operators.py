@@ -93,6 +93,7 @@ class _JobOperator:
         try:
             copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
             bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, compress=False)
+            self._output = job_arguments.output_folder(context.scene, self.command)
             job.start(job_arguments.runs(context, self.command, copy))
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
@@ -142,7 +143,7 @@ class _JobOperator:
         scene = bpy.data.scenes.get(self._scene)
         result = results.result_of(scene) if scene is not None and self._shown else None
         if result is None:
-            return "nothing was finished yet"
+            return f"what was finished is in {self._output}" if self.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
         return f"kept: {', '.join(names)}"
 

@@ -29,10 +29,10 @@ def line_position(context) -> float:
     return context.region.view2d.view_to_region(context.scene.ltsh.split, 0.0, clip=False)[0]
 
 
-class LTSH_GT_split(bpy.types.Gizmo):
+class LTSH_GT_wipe(bpy.types.Gizmo):
     """The line itself; `_draw` shows it, so that it looks the same where gizmos are switched off."""
 
-    bl_idname = "LTSH_GT_split"
+    bl_idname = "LTSH_GT_wipe"
 
     def draw(self, context):
         """Nothing beside what `_draw` shows."""
@@ -58,10 +58,10 @@ class LTSH_GT_split(bpy.types.Gizmo):
             bpy.ops.ed.undo_push(message="Drag Split")
 
 
-class LTSH_GGT_split(bpy.types.GizmoGroup):
+class LTSH_GGT_wipe(bpy.types.GizmoGroup):
     """Takes the mouse at the line before any tool of the Image Editor does"""
 
-    bl_idname = "LTSH_GGT_split"
+    bl_idname = "LTSH_GGT_wipe"
     bl_label = "Split of the Comparison"
     bl_space_type = "IMAGE_EDITOR"
     bl_region_type = "WINDOW"
@@ -72,7 +72,7 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
         return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _shown(context) is not None
 
     def setup(self, context):
-        self.gizmos.new(LTSH_GT_split.bl_idname)
+        self.gizmos.new(LTSH_GT_wipe.bl_idname)
 
 
 def _draw() -> None:
@@ -128,7 +128,7 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     drawing.draw_label(bar + width, below, end, scale)
 
 
-CLASSES = (LTSH_GT_split, LTSH_GGT_split)
+CLASSES = (LTSH_GT_wipe, LTSH_GGT_wipe)
 _register, _unregister = bpy.utils.register_classes_factory(CLASSES)
 
 

@@ -32,7 +32,7 @@ def cancelled(rig):
     while job() is not None and not job().results and time.monotonic() < end:
         yield 0.2
     yield 1.0
-    rig.fact("longest pause while the first pictures are made, s", round(pulse.stop(), 3))
+    pulse.stop(rig, "until the first pictures are there")
     rig.shot("2_running.png")
     rig.check(job() is not None and len(job().results) == 1, "the techniques are shown while Cycles still renders")
     start = time.monotonic()
@@ -52,7 +52,7 @@ def finished(rig):
     rig.check(job() is not None, "a second comparison starts")
     pulse = Pulse()
     yield from wait_for_job(rig, 240)
-    rig.fact("longest pause while a comparison runs, s", round(pulse.stop(), 3))
+    pulse.stop(rig, "while a comparison runs")
     names = {image.name for image in bpy.data.images}
     rig.check({"LTSH ltsh4.combined", "LTSH cycles.combined", "LTSH error_ltsh4.combined"} <= names,
               "pictures are images of Blender")  # fmt: skip

@@ -65,17 +65,25 @@ def wait_for_job(rig, seconds, shots=()):
 
 
 class Pulse:
-    """The longest time for which the window did not answer, by a timer of Blender's own event loop."""
+    """How long the window did not answer, by a timer of Blender's own event loop.
+
+    `longest` is the longest time between two calls; `longest_work` the most that Blender's main thread itself worked
+    in between, which does not depend on what else the machine does.
+    """
 
     def __init__(self):
-        self.longest, self._last, self._on = 0.0, time.monotonic(), True
+        self.longest = self.longest_work = 0.0
+        self._on, self._last, self._worked = True, time.monotonic(), time.thread_time()
         bpy.app.timers.register(self._tick, first_interval=0.0)
 
     def _tick(self):
-        now = time.monotonic()
+        now, worked = time.monotonic(), time.thread_time()
         self.longest, self._last = max(self.longest, now - self._last), now
+        self.longest_work, self._worked = max(self.longest_work, worked - self._worked), worked
         return 0.01 if self._on else None
 
-    def stop(self):
+    def stop(self, rig, what):
+        """Note both as facts."""
         self._on = False
-        return self.longest
+        rig.fact(f"{what}: longest pause, s", round(self.longest, 3))
+        rig.fact(f"{what}: longest work of the main thread, s", round(self.longest_work, 3))

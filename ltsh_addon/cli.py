@@ -30,8 +30,11 @@ EXAMPLES = """examples:
 """
 
 
-def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None) -> int:
-    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code."""
+def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None, bar=None) -> int:
+    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code.
+
+    `bar` shows progress in place of a ProgressBar on stderr.
+    """
     try:
         options = _parser(program).parse_args(arguments)
     except SystemExit as stop:  # argparse has printed help (0) or the mistake (2)
@@ -42,7 +45,8 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
         return _fail(program, ProgressBar(sys.stderr), error, 1)
     with log:
         log.line(f"{program} {shlex.join(arguments)}")
-        code = _run(options, program, ProgressBar(sys.stderr, quiet=options.quiet, log=log), open_file)
+        bar = bar or ProgressBar(sys.stderr, quiet=options.quiet, log=log)
+        code = _run(options, program, bar, open_file)
         log.line(f"exit code {code}")
     return code
 

@@ -140,7 +140,11 @@ class Comparison:
             statistics = imaging.noisy_error_statistics(
                 self.images[name, pass_name], halves[0], halves[1], self._mask(result)
             )
-            report["against_cycles"] = statistics.to_dict()
+            # Only pixels that the technique has shaded may differ.
+            shaded = np.where(self._mask(result)[..., None], self.images[name, pass_name], halves.mean(axis=0))
+            rec709, mask = self.extraction.color_space.rec709, self._mask(result)
+            difference = imaging.mean_flip(rec709(halves.mean(axis=0)), rec709(shaded), mask)
+            report["against_cycles"] = {**statistics.to_dict(), "flip": difference}
         reference = self.results.get(shading.REFERENCE)
         if reference is not None and name != shading.REFERENCE:
             report["against_reference"] = self._against_reference(result, reference, pass_name)

@@ -125,7 +125,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
         (SHADE.replace("shade", "bake") + "error = 1\n", ["line 5: error is 1, expected true or false"]),
         (SHADE.replace("shade", "bake") + "all = true\nselected = true\n", ["line 1:", "not allowed with"]),
         (SHADE.replace("shade", "bake") + "apply = true\ncamera = ['A', 'B']\n", ["line 1: --apply"]),
-        (SHADE.replace("shade", "bake") + 'margin-type = "none"\n', ["line 5: margin-type is 'none', expected extend or"]),
+        (SHADE.replace("shade", "bake") + 'margin-type = "none"\n', ["line 5: margin-type is 'none', expected"]),
         (SHADE + "frames = \n", ["is no TOML", "line 5"]),
         ("defaults = 3\n" + SHADE, ["line 1: defaults: expected a table"]),
         ("job = 3\n", ["line 1: no job is there"]),

@@ -30,21 +30,45 @@ class SceneError(Exception):
     """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
 
 
-def child_command(job: Path) -> list[str]:
-    """The command that runs worker.py on `job`: this Blender's own binary, or this Python with pip's bpy."""
+def child_command(job: Path, script: Path = WORKER) -> list[str]:
+    """The command that runs `script` on `job`: this Blender's own binary, or this Python with pip's bpy."""
     bpy = sys.modules.get("bpy")
     binary = bpy.app.binary_path if bpy is not None else ""
     if binary:
         return [
             *(binary, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1"),
-            *("--python", str(WORKER), "--", str(job)),
+            *("--python", str(script), "--", str(job)),
         ]
     if bpy is None and importlib.util.find_spec("bpy") is None:
         wanted = BPY_FOR_PYTHON.get(sys.version_info[:2])
         other = "use Python 3.13 and pip install bpy==5.2.3, or run inside Blender"
         remedy = f"pip install bpy=={wanted}" if wanted else other
         raise SceneError(f"{sys.executable} has no module bpy, which opens .blend files: {remedy}")
-    return [sys.executable, str(WORKER), str(job)]
+    return [sys.executable, str(script), str(job)]
+
+
+def start(command: list[str], folder: Path) -> subprocess.Popen:
+    """`command` as a process whose own files go to `folder`; the end of its stdin tells it that we are gone."""
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        encoding="utf-8",
+        errors="replace",
+        cwd=folder,
+        # The user's preferences and start-up files have no say in the result.
+        # Blender leaves its own temporary folder behind when it is ended: ours goes with all that is in it.
+        env={
+            **os.environ,
+            **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder)),
+            "BLENDER_USER_RESOURCES": str(folder / "user"),
+            "PYTHONUNBUFFERED": "1",
+        },
+        # Ctrl-C goes to the parent alone, which ends the child.
+        start_new_session=True,
+    )
 
 
 class BlenderProcess:
@@ -77,26 +101,7 @@ class BlenderProcess:
                 return
             except OSError:  # it is gone
                 self.end()
-        self._child = subprocess.Popen(
-            child_command(job_path),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            encoding="utf-8",
-            errors="replace",
-            cwd=self._folder,
-            # The user's preferences and start-up files have no say in the result.
-            # Blender leaves its own temporary folder behind when it is ended: ours goes with all that is in it.
-            env={
-                **os.environ,
-                **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(self._folder)),
-                "BLENDER_USER_RESOURCES": str(self._folder / "user"),
-                "PYTHONUNBUFFERED": "1",
-            },
-            # Ctrl-C goes to the parent alone, which ends the child.
-            start_new_session=True,
-        )
+        self._child = start(child_command(job_path), self._folder)
 
     def _follow(self, progress, last_lines) -> None:
         """Report progress until the job is done, or Blender has ended."""

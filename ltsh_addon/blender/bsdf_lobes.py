@@ -10,6 +10,7 @@ from .aovs import LOBE_AOVS, LOBE_KINDS
 from .shader_graph import cut, is_constant, is_socket, live_link, product, value_of
 
 PRINCIPLED = "ShaderNodeBsdfPrincipled"
+METALLIC = "ShaderNodeBsdfMetallic"
 # BSDF -> kind of lobe, {AOV of aovs.LOBE_AOVS: socket name}.
 LOBE_SOCKETS = {
     PRINCIPLED: (
@@ -68,7 +69,7 @@ NOT_SHADED = {
     "ShaderNodeBsdfAnisotropic": {"Anisotropy": (0.0, "is shaded as 0")},
     "ShaderNodeBsdfDiffuse": {"Roughness": (0.0, "is shaded as 0")},
     "ShaderNodeBsdfGlass": {"Thin Film Thickness": (0.0, "is shaded as 0")},
-    "ShaderNodeBsdfMetallic": {
+    METALLIC: {
         "Anisotropy": (0.0, "is shaded as 0"),
         "Thin Film Thickness": (0.0, "is shaded as 0"),
     },
@@ -77,7 +78,7 @@ NOT_SHADED = {
 MULTIPLE_SCATTERING_NODES = (
     PRINCIPLED,
     "ShaderNodeBsdfAnisotropic",
-    "ShaderNodeBsdfMetallic",
+    METALLIC,
     "ShaderNodeBsdfGlass",
 )
 
@@ -88,12 +89,12 @@ def lobe_of(node, warn: Callable[[str], None]) -> dict:
     Quantities that change nothing are left out. `warn` gets what is not shaded as Cycles does.
     """
     sockets = LOBE_SOCKETS.get(node.bl_idname)
-    if node.bl_idname == "ShaderNodeBsdfMetallic":
+    if node.bl_idname == METALLIC:
         sockets = METALLIC_SOCKETS[node.fresnel_type]
     if sockets is None or (node.bl_idname == "ShaderNodeBsdfToon" and node.component != "DIFFUSE"):
         warn(f"node {node.name!r} {NOT_SUPPORTED}")
         return {}
-    _note_unsupported(node, warn)
+    note_unsupported(node, warn)
     kind, names = sockets
     values = {"kind": LOBE_KINDS[kind], **{aov: value_of(node.inputs[name]) for aov, name in names.items()}}
     nearest_alpha = NEAREST_ALPHA.get(getattr(node, "distribution", ""))
@@ -153,7 +154,8 @@ def _drop_absent_layers(node, values) -> None:
         del values["transmission"]
 
 
-def _note_unsupported(node, warn) -> None:
+def note_unsupported(node, warn: Callable[[str], None]) -> None:
+    """Call `warn` with what the lobe of a BSDF `node` is shaded as and is not; changes nothing."""
     kind = node.bl_idname
     if kind in NEAREST:
         warn(f"node {node.name!r} {NEAREST[kind]}")

@@ -77,8 +77,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             continue
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
-            placed.append((ob.original.name_full, light, _unseen(ob, matrix, inventory)))
-            _note_unsupported(ob, matrix, inventory)
+            placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
+            note_unsupported(ob, matrix, inventory)
             _note_instancer(instance, inventory)
     # One unusable instance takes all instances of the object along: the reference can only drop the object.
     for name, light, unseen in placed:
@@ -172,7 +172,7 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     return value
 
 
-def _unseen(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
+def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
     """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
     light = ob.data
     tree = light.node_tree
@@ -190,7 +190,7 @@ def _unseen(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | 
     return UnseenLight(light.original, matrix, emission.varies)
 
 
-def _note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
+def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     """Warn of what Cycles renders for this light and the techniques do not."""
     light, name = ob.data, ob.original.name
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)

@@ -12,7 +12,25 @@ import bpy
 from . import standard_output
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
-PARTS = ("preferences", "view_properties", "engine", "engine_panels", "engine_preview", "split_gizmo")
+PARTS = (
+    "preferences",
+    "view_properties",
+    "engine",
+    "engine_panels",
+    "engine_preview",
+    "split_gizmo",
+    "properties",
+    "operators",
+    "operators_fix",
+    "operators_view",
+    "overview",
+    "viewer",
+    "probe",
+    "wipe",
+    "settings_presets",
+    "panels",
+    "image_panels",
+)
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
 _registered = ExitStack()

@@ -8,6 +8,7 @@ reference, red too bright, blue too dark.
 from .color_space import chromaticities
 from .exr import Layer, read_channels, read_layers, write_layers
 from .false_color import signed_error_colors
+from .flip import mean_flip
 from .metrics import (
     ErrorStatistics,
     error_statistics,
@@ -28,6 +29,7 @@ __all__ = [
     "comparison_sheet",
     "error_statistics",
     "exposure_factor",
+    "mean_flip",
     "noisy_error_statistics",
     "read_channels",
     "read_layers",

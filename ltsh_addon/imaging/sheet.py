@@ -48,7 +48,7 @@ def comparison_sheet(
             if part.shape != image.shape:
                 raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
     exposure = exposure_factor(image)
-    scale = error_scale or _common_scale([tile.error for tile in techniques], image)
+    scale = error_scale or common_error_scale([tile.error for tile in techniques], image)
     pictures = [to_srgb8(exposure * _resized(part)) for part in (image, *(tile.image for tile in techniques))]
     errors = [_to_8bit(signed_error_colors(_resized(tile.error), scale)) for tile in techniques]
     height, width = pictures[0].shape[:2]
@@ -65,8 +65,8 @@ def _lines(tile: Tile) -> int:
     return len(tile.caption)
 
 
-def _common_scale(errors, image) -> float:
-    """A round number near the 99.5th percentile of the luminance of all errors."""
+def common_error_scale(errors, image) -> float:
+    """A round number near the 99.5th percentile of the luminance of all `errors`, each (H, W, 3), of an image."""
     values = [np.abs(luminance(error[np.isfinite(error).all(axis=-1)])) for error in errors]
     values = np.concatenate([part[part > 0.0] for part in values]) if values else np.empty(0)
     if not values.size:

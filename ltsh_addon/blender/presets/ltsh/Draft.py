@@ -1,0 +1,11 @@
+import bpy
+
+settings = bpy.context.scene.ltsh
+
+settings.techniques = {"ltc", "ltsh4"}
+settings.passes = {"specular", "diffuse"}
+settings.resolution_percentage = 50
+settings.anti_aliasing = 1
+settings.cycles_samples = 64
+settings.bake_size = "512"
+settings.bake_error = False

@@ -1,0 +1,123 @@
+"""Compare with Cycles by the mouse: cancel one, finish one, drag the wipe, change the technique, save, reload."""
+
+import time
+
+import bpy
+from hands import CLICK_SECONDS, Pulse, click, drag, job, module, settings, to_window, wait_for_job
+
+# From the right and the upper end of the sidebar, at interface scale 1.
+COMPARE, CANCEL = (148, 281), (99, 89)
+
+
+def main(rig):
+    rig.camera_view()
+    rig.panel()
+    yield 1
+    rig.tab("LTSH")
+    yield 1.5
+    rig.shot("1_panel.png")
+    rig.check(settings().techniques == {"ltc", "ltsh4"}, "LTC and LTSH 4 are chosen at the start")
+    settings().cycles_samples = 64
+    yield from cancelled(rig)
+    yield from finished(rig)
+    yield from looked_at(rig)
+    yield from saved(rig)
+
+
+def cancelled(rig):
+    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *COMPARE))
+    rig.check(job() is not None, "a click on Compare with Cycles starts a job")
+    pulse = Pulse()
+    end = time.monotonic() + 90
+    while job() is not None and not job().results and time.monotonic() < end:
+        yield 0.2
+    yield 1.0
+    pulse.stop(rig, "until the first pictures are there")
+    rig.shot("2_running.png")
+    rig.check(job() is not None and len(job().results) == 1, "the techniques are shown while Cycles still renders")
+    start = time.monotonic()
+    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *CANCEL))
+    while job() is not None and time.monotonic() < start + 5:
+        yield 0.05
+    # The click itself takes two steps of the driver.
+    rig.check(job() is None and time.monotonic() - start < 0.5 + 2.2 * CLICK_SECONDS, "Cancel ends the job at once")
+    result = module("results").result_of(bpy.context.scene)
+    rig.check(result is not None and "Cycles" in result.partial, "what was finished is kept, and marked as partial")
+    yield 1
+    rig.shot("3_cancelled.png")
+
+
+def finished(rig):
+    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *COMPARE))
+    rig.check(job() is not None, "a second comparison starts")
+    pulse = Pulse()
+    yield from wait_for_job(rig, 240)
+    pulse.stop(rig, "while a comparison runs")
+    names = {image.name for image in bpy.data.images}
+    rig.check({"LTSH ltsh4.combined", "LTSH cycles.combined", "LTSH error_ltsh4.combined"} <= names,
+              "pictures are images of Blender")  # fmt: skip
+    with rig.override():
+        bpy.ops.ltsh.open_results()
+    # The picture is fitted into its new area one redraw after that area is there.
+    yield 5
+    rig.shot("4_wipe.png")
+
+
+def looked_at(rig):
+    left, right = (column_color(rig, x) for x in (0.25, 0.75))
+    rig.check(max(left) > 0 and max(right) > 0, "the comparison shows something on both sides")
+    region = rig.region("IMAGE_EDITOR")
+    x, _ = region.view2d.view_to_region(settings().split, 0.5)
+    middle = region.view2d.view_to_region(0.0, 0.5)[1]
+    y = rig.size[1] - (region.y + middle)
+    target = region.view2d.view_to_region(0.25, 0.5)[0]
+    yield from drag(rig, (region.x + x, y - 40), (region.x + target, y - 40))
+    rig.check(abs(settings().split - 0.25) < 0.02, f"the line follows the mouse: split is {settings().split:.3f}")
+    rig.shot("5_dragged.png")
+    image = bpy.data.images["LTSH Comparison"]
+    cycles = bpy.data.images["LTSH cycles.combined"]
+    width, height = image.size
+    index = 4 * (height // 2 * width + width // 2)
+    rig.check(image.pixels[index : index + 3] == cycles.pixels[index : index + 3], "right of the line is Cycles")
+    for mode in ("SIDE", "ERROR"):
+        settings().mode = mode
+        yield 1
+        with rig.override("IMAGE_EDITOR"):
+            bpy.ops.image.view_all(fit_view=True)
+        yield 1
+        rig.shot(f"6_{mode.lower()}.png")
+    settings().mode = "WIPE"
+    yield 1
+    settings().first = "ltc"
+    yield 1
+    rig.shot("7_ltc.png")
+    ltc = bpy.data.images["LTSH ltc.combined"]
+    index = 4 * (height // 2 * width + width // 8)
+    rig.check(image.pixels[index : index + 3] == ltc.pixels[index : index + 3], "left of the line is now LTC")
+    with rig.override("IMAGE_EDITOR", "UI"):
+        bpy.ops.ltsh.probe("INVOKE_DEFAULT")
+    rig.xdo("mousemove", region.x + round(target) + 90, round(y))
+    yield 1
+    rig.shot("8_probe.png")
+    rig.xdo("key", "Escape")
+    yield 1
+
+
+def saved(rig):
+    path = bpy.data.filepath
+    bpy.ops.wm.save_mainfile()
+    yield 2
+    bpy.ops.wm.open_mainfile(filepath=path)
+    yield 2
+    rig.check(settings().first == "ltc" and settings().mode == "WIPE", "what was chosen is in the file")
+    image = bpy.data.images.get("LTSH Comparison")
+    rig.check(image is not None and image.size[0] > 4 and image.has_data, "after loading the comparison is there")
+    rig.check(not bpy.data.is_dirty, "and nothing wants to be saved again")
+    rig.shot("9_reloaded.png")
+
+
+def column_color(rig, share):
+    region = rig.region("IMAGE_EDITOR")
+    x, y = region.view2d.view_to_region(share, 0.4)
+    path = str(rig.out / "4_wipe.png")
+    return rig.pixel(path, (region.x + x) / rig.size[0], (region.y + y) / rig.size[1])

@@ -1,0 +1,89 @@
+"""What the drivers share: where things are in the window, clicking them by the mouse, waiting for a job."""
+
+import importlib
+import time
+
+import bpy
+
+ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
+# Height of a row of buttons and the gap around it at interface scale 1, as Blender's widgets have them.
+CLICK_SECONDS = 0.6
+
+
+def module(name):
+    """A module of the installed add-on."""
+    return importlib.import_module(f"{ADDON}.blender.{name}")
+
+
+def job():
+    """The job that runs, or None."""
+    return module("operators").running_job()
+
+
+def settings():
+    return bpy.context.scene.ltsh
+
+
+def to_window(rig, kind, which, right, top):
+    """X11 coordinates of a point given in pixels at scale 1 from the right and the upper end of a region."""
+    region, scale = rig.region(kind, which), bpy.context.preferences.system.ui_scale
+    x = region.x + region.width - right * scale
+    y = rig.size[1] - (region.y + region.height - top * scale)
+    return round(x), round(y)
+
+
+def click(rig, x, y):
+    """Press and release the left button there; Blender handles both in the steps after."""
+    rig.xdo("mousemove", x, y)
+    yield CLICK_SECONDS
+    rig.xdo("click", 1)
+    yield CLICK_SECONDS
+
+
+def drag(rig, start, end):
+    """Drag with the left button from `start` to `end`."""
+    rig.xdo("mousemove", *start)
+    yield CLICK_SECONDS
+    rig.xdo("mousedown", 1)
+    yield CLICK_SECONDS
+    middle = (start[0] + end[0]) // 2, (start[1] + end[1]) // 2
+    for point in (middle, end):
+        rig.xdo("mousemove", *point)
+        yield CLICK_SECONDS
+    rig.xdo("mouseup", 1)
+    yield CLICK_SECONDS
+
+
+def wait_for_job(rig, seconds, shots=()):
+    """Until the job has ended; `shots` are names of pictures taken on the way, one in four seconds."""
+    end, names = time.monotonic() + seconds, list(shots)
+    while job() is not None and time.monotonic() < end:
+        if names:
+            rig.shot(names.pop(0))
+        yield 4.0 if names else 0.5
+    rig.check(job() is None, "the job ends in time")
+
+
+class Pulse:
+    """How long the window did not answer, by a timer of Blender's own event loop.
+
+    `longest` is the longest time between two calls; `longest_work` the most that Blender's main thread itself worked
+    in between, which does not depend on what else the machine does.
+    """
+
+    def __init__(self):
+        self.longest = self.longest_work = 0.0
+        self._on, self._last, self._worked = True, time.monotonic(), time.thread_time()
+        bpy.app.timers.register(self._tick, first_interval=0.0)
+
+    def _tick(self):
+        now, worked = time.monotonic(), time.thread_time()
+        self.longest, self._last = max(self.longest, now - self._last), now
+        self.longest_work, self._worked = max(self.longest_work, worked - self._worked), worked
+        return 0.01 if self._on else None
+
+    def stop(self, rig, what):
+        """Note both as facts."""
+        self._on = False
+        rig.fact(f"{what}: longest pause, s", round(self.longest, 3))
+        rig.fact(f"{what}: longest work of the main thread, s", round(self.longest_work, 3))

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ltsh_addon"
-BLENDER_MODULES = {"bpy", "bmesh", "bpy_extras", "gpu", "gpu_extras", "mathutils", "aud", "imbuf", "idprop", "blf"}
+BLENDER_MODULES = {"bpy", "bmesh", "bl_operators", "bl_ui", "bpy_extras", "gpu", "gpu_extras", "mathutils", "aud", "imbuf", "idprop", "blf"}
 CORE_PARTS = {"scene", "shading", "imaging"}
 
 # part -> parts of the package it may use besides itself, and distributions it may use besides the standard library.

@@ -10,7 +10,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ltsh_addon"
-BLENDER_MODULES = {"bpy", "bmesh", "bl_operators", "bl_ui", "bpy_extras", "gpu", "gpu_extras", "mathutils", "aud", "imbuf", "idprop", "blf"}
+BLENDER_MODULES = frozenset(
+    "aud bl_operators bl_ui blf bmesh bpy bpy_extras gpu gpu_extras idprop imbuf mathutils".split()
+)
 CORE_PARTS = {"scene", "shading", "imaging"}
 
 # part -> parts of the package it may use besides itself, and distributions it may use besides the standard library.

@@ -10,17 +10,19 @@ PYTEST_OPTIONS ?=
 # Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
 STRICT ?=
 
-.PHONY: help demo test lint tables lock clean bench soak extension test-blender test-3.13 test-3.11
+.PHONY: help demo test lint tables lock clean bench soak extension test-blender test-gui test-farm test-3.13 test-3.11
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    build the example scene, shade it, compare it with Cycles: out/demo/compare.png, report.json'
 	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
 	@echo 'make test-blender BLENDER=path  the tests of tests/blender inside that Blender'
+	@echo 'make test-gui RUNNER=command  clicks through the extension in a Blender with a window, see tests/gui/README.md'
+	@echo 'make test-farm   the Slurm scripts in farm/ on a Slurm of one machine (installs it where root on Debian)'
 	@echo 'make lint    ruff only'
 	@echo 'make extension  the zips that Blender installs, one per platform: build/ltsh-*.zip'
-	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (5 minutes)'
-	@echo 'make soak    1e8 random integrals, 1e5 random polygons of each kind against quadrature (hours)'
+	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (6 minutes)'
+	@echo 'make soak    commands killed at random moments, 10,000 lights, 240 frames, 1e8 random integrals and 1e5 polygons of each kind (hours)'
 	@echo 'make tables  fit the lookup tables in tables/ again (long)'
 	@echo 'make lock    resolve requirements/*.in into the lock files; LOCK_OPTIONS=--upgrade takes newer versions'
 	@echo 'make clean   remove out/, build/ and caches (the environments in .venv stay)'
@@ -63,6 +65,13 @@ test-blender:
 		--python tests/run_in_blender.py -- $(or $(PYTEST_OPTIONS),tests/blender) && \
 	$(if $(PYTEST_OPTIONS),true,LTSH_BLENDER="$(BLENDER)" $(LIMIT) "$$python" -m pytest tests/installed)
 
+test-gui:
+	@python=$$($(SETUP) python newest) && "$$python" tests/gui/run_drivers.py --runner "$(RUNNER)" $(DRIVERS)
+
+test-farm:
+	@$(SETUP) slurm && python=$$($(SETUP) python newest) && \
+	LTSH_TEST_SLURM=1 $(LIMIT) "$$python" -m pytest -s $(or $(PYTEST_OPTIONS),tests/farm)
+
 extension:
 	@python=$$($(SETUP) python newest) && "$$python" -m requirements.build_extension $(EXTENSION_OPTIONS)
 
@@ -70,7 +79,10 @@ bench:
 	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)
 
 soak:
-	@python=$$($(SETUP) python newest) && "$$python" tests/soak/soak.py $(SOAK_OPTIONS)
+	@python=$$($(SETUP) python newest) && "$$python" tests/soak/kill_soak.py $(KILL_OPTIONS) && \
+	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/test_hostile_scenes.py -k many_lights && \
+	"$$python" tests/benchmarks/animation.py $(ANIMATION_OPTIONS) && \
+	"$$python" tests/soak/soak.py $(SOAK_OPTIONS)
 
 tables:
 	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon tables fit

@@ -8,9 +8,11 @@ highlights. Either way the integral has a closed form, so the picture has no noi
     scene      AreaLight, SurfaceSamples, Film: the shared vocabulary
     shading    the paper: warp, polygon, moments, lookup table, reference quadrature (numpy only)
     imaging    EXR, metrics, false color, comparison sheet, report
-    blender    .blend to lights and samples, Cycles ground truth (the only place that knows bpy)
-    compare    the whole way: techniques beside Cycles
-    cli        the command line
+    blender    .blend to lights and samples, Cycles ground truth, panels, render engine (the only place that knows bpy)
+    comparison the whole way from a .blend: techniques beside Cycles
+    baking     the same per texel
+    jobs       many pictures and bakes: tasks, shards, records of what is done
+    commands   the command line's commands; cli calls them
 """
 
 __version__ = "0.1.0"

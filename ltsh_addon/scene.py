@@ -16,6 +16,8 @@ class Cancelled(Exception):
     """A long computation was stopped on request."""
 
 
+# In m. Squares of what is much farther away, or larger, do not fit into single precision.
+FARTHEST = 1e15
 AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # of Blender's area lights
 LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, "POLYGON")
 

@@ -4,6 +4,7 @@
 #   setup.sh find VERSION     print the interpreter of that version; exit code 3 when there is none
 #   setup.sh python VERSION   make the environment if it is missing or outdated, print its interpreter
 #   setup.sh blender PROGRAM  install what tests need in that Blender beside its own Python, print the folder
+#   setup.sh slurm            install Slurm, which the tests of the farm scripts start on this machine
 #   setup.sh lock [OPTION..]  rewrite the lock files (options go to `uv pip compile`, for example --upgrade)
 #
 # VERSION is 3.13, 3.11 or newest. LTSH_PYTHON_313 and LTSH_PYTHON_311 name an interpreter, or say "none": that
@@ -135,6 +136,13 @@ install_packages() {
     } >/dev/null </dev/null || fail "apt-get could not install: $*; see its messages above"
 }
 
+# Slurm's programs; its services stay off, the tests start them themselves.
+install_slurm() {
+    PATH=$PATH:/usr/sbin
+    if command -v munged && command -v slurmctld && command -v slurmd && command -v sbatch; then return; fi >/dev/null
+    RUNLEVEL=1 install_packages "Slurm is not there" munge slurmctld slurmd slurm-client
+}
+
 # Changes whenever the environment has to be made again: other pins, other interpreter, other place.
 stamp_of() {
     "$1" - "$here/$2.txt" "$environments/$2" <<'PYTHON'
@@ -246,8 +254,9 @@ main() {
         if [ "$1" = find ]; then find_python "$version"; else make_environment "$version"; fi
         ;;
     blender) make_blender_packages "${2:-blender}" ;;
+    slurm) install_slurm ;;
     lock) shift && write_locks "$@" ;;
-    *) fail "usage: setup.sh find VERSION | python VERSION | blender PROGRAM | lock [OPTION..]" ;;
+    *) fail "usage: setup.sh find VERSION | python VERSION | blender PROGRAM | slurm | lock [OPTION..]" ;;
     esac
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltsh_addon import shading
-from ltsh_addon.blender import child
+from ltsh_addon.blender.processes import child
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2

@@ -6,9 +6,10 @@ import json
 import fake_scene
 import pytest
 
-from ltsh_addon import argument_values, cli
-from ltsh_addon.baseline import Baseline, Tolerance
-from ltsh_addon.compare import Options, compare_scene, shade_scene
+from ltsh_addon import cli
+from ltsh_addon.commands import argument_values
+from ltsh_addon.comparison.baseline import Baseline, Tolerance
+from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
 
 
 @pytest.fixture

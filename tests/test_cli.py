@@ -12,8 +12,9 @@ import fake_scene
 import numpy as np
 import pytest
 
-from ltsh_addon import __version__, argument_values, cli, cli_tables, shading
-from ltsh_addon.blender.child import SceneError
+from ltsh_addon import __version__, cli, shading
+from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.commands import argument_values, tables_command
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -49,10 +50,10 @@ def run_python(code):
 
 
 def assert_misuse(result, complaint):
-    """Code 2, usage and one line that holds `complaint` on stderr, nothing on stdout."""
+    """Code 2, one line that holds `complaint` on stderr, nothing on stdout."""
     code, stdout, stderr = result
-    assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1]
-    assert stderr.splitlines()[-1].startswith("ltsh") and "Traceback" not in stderr
+    assert (code, stdout) == (2, "") and len(stderr.splitlines()) == 1
+    assert stderr.startswith("ltsh") and complaint in stderr
 
 
 def assert_failure(result, complaint):
@@ -110,6 +111,21 @@ def test_wrong_calls_are_misuse(capsys, child, tmp_path, monkeypatch, arguments,
     assert child.asked == [] and list(tmp_path.iterdir()) == []
 
 
+def test_with_json_a_mistake_is_a_document_too(capsys, child, room, out, tmp_path):
+    cases = [
+        (2, "--aa", ["shade", room, "-o", out, "--aa", "x"]),
+        (2, "is missing", ["shade", "-o", out]),
+        (1, "no such file", ["shade", tmp_path / "none.blend", "-o", out]),
+        (1, "none.toml", ["run", tmp_path / "none.toml"]),
+        (1, "cannot be written", ["shade", room, "-o", out, "--log", tmp_path / "no" / "log"]),
+        (1, "no task has finished", ["merge", out]),
+    ]
+    for code, complaint, arguments in cases:
+        found = run(capsys, *arguments, "--json", "--quiet")
+        (line,) = json.loads(found[1])["errors"]
+        assert found[0] == code and found[2] == f"{line}\n" and complaint in line and line.startswith("ltsh")
+
+
 @pytest.mark.parametrize("command", ["compare", "shade"])
 def test_a_scene_beside_an_open_file_is_misuse(capsys, child, room, out, command):
     result = run(capsys, command, room, "-o", out, open_file="/scenes/open.blend")
@@ -128,7 +144,9 @@ def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
 
 
 def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(cli_tables, "__file__", str(tmp_path / "site" / "ltsh_addon" / "cli.py"))
+    monkeypatch.setattr(
+        tables_command, "__file__", str(tmp_path / "site" / "ltsh_addon" / "commands" / "tables_command.py")
+    )
     assert_misuse(run(capsys, "tables", "fit"), "needs the source checkout")
 
 

@@ -11,8 +11,9 @@ import fake_scene
 import numpy as np
 import pytest
 
-from ltsh_addon import compare, imaging, shading
-from ltsh_addon.compare import Options, compare_scene, shade_scene
+from ltsh_addon import imaging, shading
+from ltsh_addon.comparison import compare
+from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TECHNIQUES = ("ltc", "ltsh4", "reference")

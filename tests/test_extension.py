@@ -40,10 +40,11 @@ def test_blender_accepts_the_manifest():
 def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
     """On a copy with one file of every kind, so that the answer does not hang on what lies in this clone."""
     source = tmp_path / "source"
-    kept = ["__init__.py", "LICENSE", "README.md", "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py", "tables/a.npz"]
+    kept = ["__init__.py", "LICENSE", "README.md", "docs/manual.md", "ltsh_addon/__init__.py",
+            "ltsh_addon/blender/x.py", "tables/a.npz"]  # fmt: skip
     left = ["Makefile", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py", "tables/README.md",
             "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run", "ltsh.zip",
-            "build/wheels/a.whl", "farm/README.md", "docs/manual.md", "ltsh_addon/__pycache__/x.pyc",
+            "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
             "ltsh_addon/.hidden"]  # fmt: skip
     for name in kept + left:
         (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -100,7 +101,7 @@ def test_each_platform_gets_a_zip_with_its_own_wheels(stand_ins, zips):
     hidden = re.compile(r"(^|/)(\.|__pycache__/)")
     code = [path.relative_to(ROOT).as_posix() for path in ROOT.glob("ltsh_addon/**/*") if path.is_file()]
     tables = [f"tables/{path.name}" for path in ROOT.glob("tables/*.npz")]
-    common = {"blender_manifest.toml", "__init__.py", "README.md", "LICENSE", *tables}
+    common = {"blender_manifest.toml", "__init__.py", "README.md", "LICENSE", "docs/manual.md", *tables}
     common |= {name for name in code if not hidden.search(name)}
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
     names = [f"ltsh-{version}-{name.replace('-', '_')}.zip" for name in sorted(PLATFORMS)]

@@ -27,7 +27,7 @@ MAY_USE_PARTS = {
 MAY_USE_DISTRIBUTIONS = {
     "scene": {"numpy"},
     "shading": {"numpy"},
-    "imaging": {"numpy", "OpenEXR"},
+    "imaging": {"numpy", "OpenEXR", "Imath"},  # one distribution
     "blender": {"numpy", "OpenEXR"} | BLENDER_MODULES,
     "top": {"numpy", "OpenEXR"},
 }
@@ -174,7 +174,8 @@ def test_table_scripts_use_the_core_scipy_and_matplotlib_only():
 
 
 @pytest.mark.parametrize(
-    "module", ["scene", "shading", "imaging", "cli", "compare", "__main__", "blender.child", "blender"]
+    "module",
+    ["scene", "shading", "imaging", "cli", "comparison.compare", "__main__", "blender.processes.child", "blender"],
 )
 def test_importing_loads_neither_blender_nor_scipy(module):
     forbidden = sorted(BLENDER_MODULES | {"scipy"})

@@ -7,7 +7,7 @@ import fake_scene
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.toml_lines import key_lines
+from ltsh_addon.jobs.toml_lines import key_lines
 
 
 @pytest.fixture

@@ -8,11 +8,13 @@ from pathlib import Path
 import fake_scene
 import pytest
 
-from ltsh_addon import argument_values, batch, cli, output_names, task_records
-from ltsh_addon.blender.child import SceneError
-from ltsh_addon.compare import Options
-from ltsh_addon.merge import merge
-from ltsh_addon.tasks import Job, shard_of, tasks_of
+from ltsh_addon import cli
+from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.commands import argument_values
+from ltsh_addon.comparison.compare import Options
+from ltsh_addon.jobs import batch, output_names, task_records
+from ltsh_addon.jobs.merge import merge
+from ltsh_addon.jobs.tasks import Job, shard_of, tasks_of
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
@@ -120,9 +122,10 @@ def test_tasks_that_would_write_the_same_file_are_misuse(capsys, child, room, tm
 
 
 def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatch, capsys, child, room, tmp_path):
-    from ltsh_addon.blender import scene_facts
+    from ltsh_addon.blender.processes import scene_facts
 
-    monkeypatch.setattr(scene_facts, "ask", lambda *a, **k: [{"frame": 12, "camera": "Main/1", "objects": []}])
+    found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}}
+    monkeypatch.setattr(scene_facts, "ask", lambda *arguments, **options: [found])
     name = "{camera}_{frame:03d}"
     assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0
     assert (tmp_path / "out" / "Main_1_012.exr").is_file() and child.asked[0].frame is None
@@ -207,6 +210,40 @@ def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
     assert batch.run_tasks(wanted).kept == 0
 
 
+def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
+    records = task_records.Records(tmp_path, "tiles")
+    names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
+    for name in names:
+        records.write(name, "key", {"name": name}, ())
+    read = []
+    read_one = task_records._read
+    monkeypatch.setattr(task_records, "_read", lambda path: read.append(path) or read_one(path))
+
+    def found(*stems):
+        return {record["task"]["name"] for record in records.all_whole("key", stems or None)}
+
+    assert found() == set(names) and found("Floor") == {"Floor.1001", "Floor.1002"} and len(read) == len(names) + 2
+    assert found("a[b]") == {"a[b].1001"} and found("y") == set()
+    assert found("x/Floor", "ab") == {"x/Floor.1001", "ab.1001"}
+
+
+def test_a_changed_file_has_another_digest(room, tmp_path):
+    options = job(room, tmp_path).options
+    first = task_records.contents_digest(options)
+    assert task_records.contents_digest(options) == first
+    room.write_bytes(b"BLENDER, other")
+    assert task_records.contents_digest(options) != first
+
+
+def test_what_was_kept_is_told(capsys, child, room, tmp_path):
+    arguments = ["shade", room, "-o", tmp_path / "out", "--frames", "1-3", *SMALL[:-1]]
+    assert "already" not in run(capsys, *arguments)[2]
+    (tmp_path / "out" / "shade_0002.exr").unlink()
+    code, stdout, stderr = run(capsys, *arguments, "--resume")
+    assert code == 0 and "2 of 3 tasks were there already\n" in stderr and "already" not in stdout
+    assert "already" not in run(capsys, *arguments, "--resume", "--quiet")[2]
+
+
 @pytest.mark.parametrize("existing", [batch.RESUME, batch.SKIP])
 @pytest.mark.parametrize("damage", ["cut", "changed", "record", "foreign record", "empty record"])
 def test_what_is_not_whole_is_done_again(child, room, tmp_path, existing, damage):
@@ -237,12 +274,14 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
             raise SceneError("room.blend: no area light\nat this frame")
         return extract(options, progress=progress)
 
-    from ltsh_addon.blender import child as child_module
+    from ltsh_addon.blender.processes import child as child_module
 
     monkeypatch.setattr(child_module, "extract", fail_at_two)
     arguments = ["shade", room, "--frames", "1-3", *SMALL]
     code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one")
     assert code == 1 and "failed: shade_0002: room.blend: no area light at this frame" in stderr.splitlines()
+    stderr = run(capsys, *arguments[:-1], "-o", tmp_path / "told")[2]
+    assert "2 of 3: shade_0002 failed in " in stderr and "3 of 3: shade_0003 in " in stderr
     codes = [run(capsys, *arguments, "-o", tmp_path / "two", "--shard", shard)[0] for shard in ("1/2", "2/2")]
     assert codes == [0, 1] and run(capsys, "merge", tmp_path / "two")[0] == 1
     assert contents(tmp_path / "one") == contents(tmp_path / "two")

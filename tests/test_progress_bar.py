@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from ltsh_addon import progress_bar
-from ltsh_addon.progress_bar import ProgressBar, duration
+from ltsh_addon.commands import progress_bar
+from ltsh_addon.commands.progress_bar import ProgressBar, duration
 
 
 class Stream(io.StringIO):

@@ -182,13 +182,13 @@ def _full_disk(*arguments, **options):
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _openexr_failure(self, name):
-    raise RuntimeError("Cannot write image file")
+def _openexr_failure(name, header):
+    raise OSError("Cannot write image file")
 
 
 @pytest.mark.parametrize(
     ("owner", "attribute", "failure", "named"),
-    [(Path, "write_text", _full_disk, "ltc.h"), (OpenEXR.File, "write", _openexr_failure, "ltc.exr")],
+    [(Path, "write_text", _full_disk, "ltc.h"), (OpenEXR, "OutputFile", _openexr_failure, "ltc.exr")],
 )
 def test_nothing_is_left_behind_when_writing_fails(capsys, out, monkeypatch, owner, attribute, failure, named):
     monkeypatch.setattr(owner, attribute, failure)

@@ -9,27 +9,27 @@ from contextlib import ExitStack
 
 import bpy
 
-from . import standard_output
+from .processes import standard_output
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
 PARTS = (
-    "preferences",
-    "view_properties",
-    "engine",
-    "engine_panels",
-    "engine_preview",
-    "split_gizmo",
-    "properties",
-    "operators",
-    "operators_fix",
-    "operators_view",
-    "overview",
-    "viewer",
-    "probe",
-    "wipe",
-    "settings_presets",
-    "panels",
-    "image_panels",
+    "interface.preferences",
+    "engine.view_properties",
+    "engine.render_engine",
+    "engine.engine_panels",
+    "engine.engine_preview",
+    "engine.split_gizmo",
+    "interface.properties",
+    "interface.operators",
+    "interface.operators_fix",
+    "interface.operators_view",
+    "interface.overview",
+    "interface.viewer",
+    "interface.probe",
+    "interface.wipe",
+    "interface.settings_presets",
+    "interface.panels",
+    "interface.image_panels",
 )
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
@@ -57,7 +57,7 @@ def register(command_line: Callable[..., int]) -> None:
 
 def unregister() -> None:
     """Remove what `register` added."""
-    from . import availability
+    from .interface import availability
 
     atexit.unregister(unregister)
     availability.missing_libraries.cache_clear()

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .atomic import replacing
-
 _DEFAULT_CHANNELS = {1: "V", 3: "RGB", 4: "RGBA"}
 _CHANNEL_ORDERS = ("RGBA", "XYZW", "UVW")
+_BLOCK_VALUES = 1 << 22
+_ZIP_ROWS = 16  # are compressed together
 _LONGEST_NAME = 255  # bytes, OpenEXR's limit for channel and attribute names
 
 
@@ -72,24 +72,21 @@ def write_channels(
     pixel_aspect: float = 1.0,
 ) -> None:
     """Write `channels` (H, W) by full name, which need not end in a single letter; else as `write_layers`."""
-    planes = {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
+    from .exr_rows import writing_rows
+
+    planes = {name: np.asarray(plane) for name, plane in channels.items()}
     _check_planes(planes)
-    OpenEXR = _openexr()
-    header = check_metadata(metadata)
-    header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    if pixel_aspect != 1.0:
-        header["pixelAspectRatio"] = float(pixel_aspect)
-    if chromaticities is not None:
-        if np.shape(chromaticities) != (8,) or not np.isfinite(chromaticities).all():
-            raise ValueError(f"chromaticities {chromaticities!r}: expected xy of red, green, blue and white, 8 numbers")
-        header["chromaticities"] = tuple(float(value) for value in chromaticities)
-    with replacing(path) as temporary:
-        try:
-            with OpenEXR.File(header, planes) as file:
-                file.write(str(temporary))
-        except RuntimeError as error:
-            # "Cannot open image file "NAME". Reason." names the temporary file; only the reason is of use.
-            raise OSError(str(error).replace(f'"{temporary}"', "").strip()) from error
+    height, width = next(iter(planes.values())).shape
+    # A block at a time, so that a signal need not wait for a large file.
+    rows = max(1, _BLOCK_VALUES // (width * len(planes)) // _ZIP_ROWS) * _ZIP_ROWS
+    with writing_rows(path, list(planes), width, height, metadata, chromaticities, pixel_aspect) as writer:
+        for first in range(0, height, rows):
+            writer.write({name: plane[first : first + rows] for name, plane in planes.items()})
+
+
+def reason(error: Exception, temporary: os.PathLike) -> str:
+    """Why OpenEXR could not write: of "Cannot open image file "NAME". Reason." the part without the file's name."""
+    return str(error).rpartition(f'"{temporary}". ')[2].strip().rstrip(".")
 
 
 def check_metadata(metadata: Mapping[str, str] | None) -> dict[str, str]:

@@ -9,14 +9,17 @@ from contextlib import contextmanager
 import numpy as np
 
 from .atomic import replacing
-from .exr import _openexr, check_metadata
+from .exr import _openexr, check_metadata, reason
+
+# More than the header of a file with thousands of channels has.
+_HEADER_BYTES = 1 << 22
 
 
 class RowWriter:
     """Takes the rows of an EXR from top to bottom; made by `writing_rows`."""
 
-    def __init__(self, file, names: Sequence[str], width: int, height: int):
-        self._file, self._names, self._shape, self._done = file, tuple(names), (height, width), 0
+    def __init__(self, file, path: os.PathLike, names: Sequence[str], width: int, height: int):
+        self._file, self._path, self._names, self._shape, self._done = file, path, tuple(names), (height, width), 0
 
     def write(self, planes: Mapping[str, np.ndarray]) -> None:
         """The next rows, (R, W) for every channel; raises ValueError for other channels or shapes."""
@@ -34,8 +37,8 @@ class RowWriter:
             data[name] = np.ascontiguousarray(plane, dtype=np.float32).tobytes()
         try:
             self._file.writePixels(data, rows)
-        except RuntimeError as error:
-            raise OSError(str(error)) from error
+        except (RuntimeError, OSError) as error:
+            raise OSError(reason(error, self._path)) from error
         self._done += rows
 
     def close(self) -> None:
@@ -51,13 +54,20 @@ def writing_rows(
     width: int,
     height: int,
     metadata: Mapping[str, str] | None = None,
+    chromaticities: Sequence[float] | None = None,
+    pixel_aspect: float = 1.0,
 ):
-    """Meanwhile a RowWriter for a float32 EXR with ZIP compression and the channels `names`.
+    """Meanwhile a RowWriter for a float32 EXR with ZIP compression and the channels `names`; else as `write_layers`.
 
-    The file appears complete at the end of the block, or not at all where an exception leaves it. Raises OSError.
+    The file appears complete at the end of the block, or not at all where an exception leaves it. Raises OSError,
+    ValueError for metadata and chromaticities that are none.
     """
     OpenEXR = _openexr()
     header = OpenEXR.Header(width, height)
+    header["pixelAspectRatio"] = float(pixel_aspect)
+    if chromaticities is not None:
+        chromaticities = _chromaticities(chromaticities)
+        header["chromaticities"] = _no_chromaticities()
     kind = header["channels"]["R"]
     header["channels"] = dict.fromkeys(names, kind)
     header["type"] = b"scanlineimage"
@@ -66,11 +76,35 @@ def writing_rows(
         try:
             file = OpenEXR.OutputFile(str(temporary), header)
         except OSError as error:
-            raise OSError(f"{path}: cannot be written ({error})") from error
-        writer = RowWriter(file, names, width, height)
+            raise OSError(reason(error, temporary)) from error
+        writer = RowWriter(file, temporary, names, width, height)
         try:
             yield writer
         except BaseException:
             file.close()
             raise
         writer.close()
+        if chromaticities is not None:
+            _put_chromaticities(temporary, chromaticities)
+
+
+def _chromaticities(values) -> bytes:
+    """As they stand in a file."""
+    if np.shape(values) != (8,) or not np.isfinite(values).all():
+        raise ValueError(f"chromaticities {values!r}: expected xy of red, green, blue and white, 8 numbers")
+    return np.asarray(values, dtype="<f4").tobytes()
+
+
+def _no_chromaticities():
+    import Imath
+
+    return Imath.Chromaticities(*[Imath.chromaticity(0.0, 0.0)] * 4)
+
+
+def _put_chromaticities(path, values: bytes) -> None:
+    """Put them into the header of a file: OutputFile writes zeros, whatever it is given (OpenEXR 3.5)."""
+    attribute = b"\0chromaticities\0chromaticities\0" + len(values).to_bytes(4, "little")
+    with open(path, "r+b") as file:
+        start = file.read(_HEADER_BYTES).index(attribute) + len(attribute)
+        file.seek(start)
+        file.write(values)

@@ -20,7 +20,7 @@ import numpy as np
 
 # Half angle in rad below which Cycles takes the series of tan h - h.
 _SERIES = 0.05
-_WIDTH_RANGE = (1e-4, 1e3)
+WIDTH_RANGE = (1e-4, 1e3)
 
 
 def cone(spread: float) -> tuple[float, float]:
@@ -52,17 +52,17 @@ class Effort:
 
 # Well inside the cone the factor hardly varies over a light. Sharp lobes see the difference of chords from a circle.
 EFFORTS = (Effort(5, 2), Effort(8, 2), Effort(8, 4), Effort(8, 12))
-_WELL_INSIDE = 0.25
-_WIDE_LOBE, _SHARP_LOBE = 0.09, 0.01
+WELL_INSIDE = 0.25
+WIDE_LOBE, SHARP_LOBE = 0.09, 0.01
 
 
 def efforts(light, position, width):
     """Yield (effort, chosen (Q',)) that keep the error of the spread below 0.3 % for points with x, y, z in `position`
     (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
     extent, reach, beside = _place_in_cone(light, position)
-    inside = extent < _WELL_INSIDE * (reach - beside)
-    number = np.where(width >= _WIDE_LOBE, np.where(inside, 0, 1), np.where(inside, 0, 2))
-    number = np.where(width < _SHARP_LOBE, 3, number)
+    inside = extent < WELL_INSIDE * (reach - beside)
+    number = np.where(width >= WIDE_LOBE, np.where(inside, 0, 1), np.where(inside, 0, 2))
+    number = np.where(width < SHARP_LOBE, 3, number)
     for chosen in np.unique(number):
         yield EFFORTS[chosen], np.nonzero(number == chosen)[0]
 
@@ -179,17 +179,23 @@ class DiskParts:
         nearest = flat + np.clip(self.middle / self.squared, 0.0, 1.0) * self.along
         square = _dot(nearest, nearest)
         closest = square.argmin(axis=0)
-        self.encloses = (self.side >= 0.0).all(axis=0) | (self.side <= 0.0).all(axis=0)
-        length = np.sqrt(np.take_along_axis(square, closest[None], axis=0)[0])
-        self.least = np.where(self.encloses, 0.0, length)
         self.size = np.sqrt(_dot(flat, flat))
         self.largest = self.size.max(axis=0)
+        self.encloses = self._encloses(squared)
+        length = np.sqrt(np.take_along_axis(square, closest[None], axis=0)[0])
+        self.least = np.where(self.encloses, 0.0, length)
         # Seen from a foot outside, all lies within a quarter turn of the nearest point.
         forward = np.take_along_axis(nearest, closest[None, None], axis=1)[:, 0]
         forward = forward / np.where(length > 0.0, length, 1.0)
         forward[0] += length == 0.0
         self.forward = forward
         self.angle = self._angle(flat)
+
+    def _encloses(self, squared):
+        """Mask (P,): is the foot inside? Edges between corners that rounding alone tells apart have no sides."""
+        short = squared <= np.finfo(self.flat.dtype).eps * self.largest**2
+        left, right = (((way * self.side >= 0.0) | short).all(axis=0) for way in (1.0, -1.0))
+        return (left | right) & ~short.all(axis=0)
 
     def _angle(self, points):
         return np.arctan2(_cross(self.forward, points), _dot(self.forward, points))
@@ -246,10 +252,10 @@ class DiskParts:
 
 def _graded_nodes(low, high, center, width, count):
     """Nodes and weights (count, P) of an integral over [low, high], dense within `width` of `center`; all (P,)."""
-    nodes, weights = (values.astype(low.dtype)[:, None] for values in _gauss_legendre(count))
+    nodes, weights = (values.astype(low.dtype)[:, None] for values in gauss_legendre(count))
     span = high - low
     center = np.clip(center, low, high)
-    width = np.clip(width, _WIDTH_RANGE[0] * span, _WIDTH_RANGE[1] * span)
+    width = np.clip(width, WIDTH_RANGE[0] * span, WIDTH_RANGE[1] * span)
     safe = np.where(width > 0.0, width, 1.0)
     first, last = (np.arcsinh((end - center) / safe) for end in (low, high))
     half = 0.5 * (last - first)
@@ -258,7 +264,8 @@ def _graded_nodes(low, high, center, width, count):
 
 
 @cache
-def _gauss_legendre(count):
+def gauss_legendre(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights (count,) on [-1, 1]."""
     return np.polynomial.legendre.leggauss(count)
 
 

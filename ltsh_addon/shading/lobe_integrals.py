@@ -12,14 +12,7 @@ import numpy as np
 
 from . import edge_integrals, edge_loop, single_polygons, spherical_harmonics
 from .lookup_table import Lobe, LookupTable
-from .polygon import (
-    edge_sums,
-    one_plus_cosine,
-    project_to_sphere,
-    solid_angle,
-    split_at_horizon,
-    split_long_edges,
-)
+from .polygon import edge_sums, one_plus_cosine, project_to_sphere, solid_angle, split_at_horizon, split_long_edges
 
 # Edges with a smaller 1 + cos(theta), 11 degrees short of a half circle, get a corner in between.
 LONG_EDGE = 0.02

@@ -1,10 +1,14 @@
 """What a bake takes: seconds and memory by size, and its time at equal error beside Cycles' bake; needs bpy.
 
-python tests/benchmarks/bake_cost.py [memory | time | cycles]
+python tests/benchmarks/bake_cost.py [time | memory | cycles]
+
+time: 1024^2 and 4096^2 under four lights, ltsh4, constant materials. memory: the peak by size. cycles: part of `make
+bench`; how long Cycles' bake takes to come as near to the truth as ltsh4, which the quadrature of `reference` tells.
 """
 
 import argparse
 import json
+import math
 import os
 import subprocess
 import sys
@@ -13,12 +17,17 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-SIZE = 256
+sys.path.insert(0, str(ROOT))
 GROWTH_LIMIT = 0.1
+# Size -> seconds of our own work and MiB that a bake may take.
+LIMITS = {1024: (3.0, 4096.0), 4096: (60.0, 4096.0)}
+# One block of rows: a bake of several blocks starts Cycles for each of them.
+EQUAL_SIZE = 512
+FACTOR = 30.0
 
 
-def build_scene(path, rotation=(0.3, 0.0, 0.2)):
-    """A glossy plane of 6 m under four rectangles."""
+def build_scene(path, textured=False, rotation=(0.3, 0.0, 0.2)):
+    """A glossy plane of 6 m under four rectangles; `textured`: its color and roughness are procedural textures."""
     import bpy
     import numpy as np
 
@@ -37,30 +46,44 @@ def build_scene(path, rotation=(0.3, 0.0, 0.2)):
     mesh = bpy.data.meshes.new("Floor")
     mesh.from_pydata([(-3, -3, 0), (3, -3, 0), (3, 3, 0), (-3, 3, 0)], [], [(0, 1, 2, 3)])
     mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 1, 0, 1, 1, 0, 1]))
-    material = bpy.data.materials.new("Glossy")
-    if bpy.app.version < (5, 0, 0):
-        material.use_nodes = True
-    node = material.node_tree.nodes["Principled BSDF"]
-    node.inputs["Base Color"].default_value = (0.4, 0.3, 0.2, 1.0)
-    node.inputs["Roughness"].default_value = 0.35
-    mesh.materials.append(material)
+    mesh.materials.append(_material(textured))
     scene.collection.objects.link(bpy.data.objects.new("Floor", mesh))
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
 
 
+def _material(textured):
+    import bpy
+
+    material = bpy.data.materials.new("Glossy")
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    tree = material.node_tree
+    node = tree.nodes["Principled BSDF"]
+    node.inputs["Base Color"].default_value = (0.4, 0.3, 0.2, 1.0)
+    node.inputs["Roughness"].default_value = 0.35
+    if textured:
+        noise, places = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeTexCoord")
+        tree.links.new(places.outputs["Object"], noise.inputs["Vector"])
+        tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
+        tree.links.new(noise.outputs[0], node.inputs["Roughness"])
+    return material
+
+
 def bake(scene, output, *options):
-    """Run the command; its report, and the peak resident size in MiB of it and of the Blender it starts."""
+    """Run the command; its seconds, as "processor" those of the processor for our own process, and the peak resident
+    sizes in MiB of it and of the Blender it starts."""
     command = [sys.executable, "-m", "ltsh_addon", "bake", str(scene), "-o", str(output), "--json", "--quiet", *options]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    peaks = {}
+    peaks, processor = {}, 0.0
     while process.poll() is None:
+        processor = _processor_seconds(process.pid) or processor
         for kind, pid in [("own", process.pid), *(("Blender", child) for child in _children(process.pid))]:
             peaks[kind] = max(peaks.get(kind, 0.0), _peak(pid))
         time.sleep(0.02)
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
     json.loads(process.stdout.read())
-    return json.loads((output / "timing.json").read_text())["seconds"], peaks
+    return {**json.loads((output / "timing.json").read_text())["seconds"], "processor": processor}, peaks
 
 
 def _children(pid):
@@ -68,6 +91,15 @@ def _children(pid):
         return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except OSError:
         return []
+
+
+def _processor_seconds(pid):
+    """User and system time of a process so far, its children left out; 0 where it has ended."""
+    try:
+        user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    except OSError:
+        return 0.0
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def _peak(pid):
@@ -84,9 +116,9 @@ def memory(sizes, *options):
     own = []
     with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
         folder = Path(name)
-        subprocess.run([sys.executable, __file__, "scene", str(folder / "scene.blend")], check=True, timeout=120)
+        scene = _scene(folder, "constant")
         for size in sizes:
-            seconds, peaks = bake(folder / "scene.blend", folder / str(size), "--size", str(size), *options)
+            seconds, peaks = bake(scene, folder / str(size), "--size", str(size), *options)
             own.append(peaks["own"])
             text = ", ".join(f"{kind} {peak:.0f} MiB" for kind, peak in peaks.items())
             print(f"  {size:>5}^2: peak {text}; {seconds['total']:.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
@@ -95,15 +127,104 @@ def memory(sizes, *options):
     return growth
 
 
+def times():
+    """Print seconds of our own work and the peak for every size of LIMITS; True where all are within them."""
+    good = True
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
+        scene = _scene(Path(name), "constant")
+        for size, (limit, most) in LIMITS.items():
+            # Twice the smaller one, of which the second counts: a busy machine disturbs it most.
+            for _ in range(2 if size < 2048 else 1):
+                seconds, peaks = bake(scene, Path(name) / str(size), "--size", str(size))
+            own = seconds["Floor.exr"]
+            good &= own <= limit and max(peaks.values()) <= most
+            text = ", ".join(f"{kind} {peak:.0f} MiB" for kind, peak in peaks.items())
+            print(
+                f"  {size:>5}^2: {own:.1f} s (target {limit:.0f} s), processor {seconds['processor']:.1f} s, "
+                f"with Blender's part {seconds['total']:.1f} s; "
+                f"peak {text} (target {most:.0f} MiB); load {os.getloadavg()[0]:.1f}",
+                flush=True,
+            )
+    return good
+
+
+def equal_error(quick=False):
+    """Print what ltsh4 takes and what Cycles' bake would take for its error; the smaller of the factors."""
+    factors = []
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
+        for kind in ("constant", "textured"):
+            folder = Path(name) / kind
+            folder.mkdir()
+            factors.append(_equal_error(_scene(folder, kind), folder, kind, (8, 32) if quick else (16, 64)))
+    return min(factors)
+
+
+def _equal_error(scene, folder, kind, counts):
+    small, size = ("--size", str(EQUAL_SIZE // 4)), ("--size", str(EQUAL_SIZE))
+    common = ("--passes", "specular", "--margin", "0")
+    bake(scene, folder / "truth", *small, *common, "--techniques", "ltsh4,reference")
+    error = _relative(*_layers(folder / "truth", "ltsh4.specular", "reference.specular"))
+    # The second time, so that what the first one read is in memory.
+    for _ in range(2):
+        seconds, _ = bake(scene, folder / "ours", *size, *common)
+    ours = seconds["blender"] + seconds["Floor.exr"]
+    noises, costs = [], []
+    for count in counts:
+        more, _ = bake(scene, folder / str(count), *size, *common, "--error", "--cycles-samples", str(2 * count))
+        a, b = _layers(folder / str(count), "cycles_A.specular", "cycles_B.specular")
+        noises.append(((a - b) ** 2).sum() / 2.0 / (a * b).sum())
+        # Of one of two halves, beyond the extraction.
+        costs.append(0.5 * (more["blender"] - seconds["blender"]))
+    power = math.log(noises[0] / noises[1]) / math.log(counts[1] / counts[0])
+    needed = counts[1] * (noises[1] / error**2) ** (1.0 / power)
+    slope = (costs[1] - costs[0]) / (counts[1] - counts[0])
+    cycles = costs[1] + slope * (needed - counts[1])
+    measured = ", ".join(f"{n} samples {c:.1f} s {e**0.5:.2%}" for n, c, e in zip(counts, costs, noises, strict=True))
+    print(f"  {kind} materials, {EQUAL_SIZE}^2, 4 lights, specular; load {os.getloadavg()[0]:.1f}")
+    parts = f"extraction {seconds['blender']:.2f} s, shading and file {seconds['Floor.exr']:.2f} s"
+    print(f"    ltsh4: error {error:.2%}, {parts}")
+    print(f"    Cycles: {measured}: noise falls with power {power / 2.0:.2f}")
+    factor = f"{cycles / ours:.0f} x our time (target {FACTOR:.0f} x)"
+    print(f"    as near as ltsh4: {needed:.0f} samples, {cycles:.0f} s: {factor}", flush=True)
+    return cycles / ours
+
+
+def _layers(folder, *names):
+    import numpy as np
+
+    from ltsh_addon import imaging
+
+    layers = imaging.read_layers(folder / "Floor.exr")
+    return [layers[name].astype(np.float64) for name in names]
+
+
+def _relative(found, expected):
+    """Relative L2 error."""
+    return math.sqrt(((found - expected) ** 2).sum() / (expected**2).sum())
+
+
+def _scene(folder, kind):
+    """The file of a scene, built by a process of its own."""
+    path = folder / "scene.blend"
+    command = [sys.executable, __file__, "scene", str(path), "--kind", kind]
+    subprocess.run(command, check=True, timeout=120, stdout=subprocess.DEVNULL)
+    return path
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("memory", "scene"))
+    parser.add_argument("what", choices=("time", "memory", "cycles", "scene"))
     parser.add_argument("path", nargs="?", type=Path)
+    parser.add_argument("--kind", default="constant", choices=("constant", "textured"))
     parser.add_argument("--sizes", default="4096,8192")
     options, more = parser.parse_known_args()
     if options.what == "scene":
-        build_scene(options.path)
-    elif memory([int(size) for size in options.sizes.split(",")], *more) > GROWTH_LIMIT:
+        build_scene(options.path, options.kind == "textured")
+    elif options.what == "time" and not times():
+        raise SystemExit("a bake takes too much")
+    elif options.what == "cycles" and equal_error() < FACTOR:
+        raise SystemExit("Cycles is not so much slower")
+    elif options.what == "memory" and memory([int(size) for size in options.sizes.split(",")], *more) > GROWTH_LIMIT:
         raise SystemExit("the peak grows with the size")
 
 

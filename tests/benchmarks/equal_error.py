@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon import shading
-from ltsh_addon.blender import child
+from ltsh_addon.blender.processes import child
 
 SIZE = (480, 270)
 

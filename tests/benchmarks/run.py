@@ -17,6 +17,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
+import bake_cost  # noqa: E402
 import measure  # noqa: E402
 from bench_scenes import floor_scene, random_polygons  # noqa: E402
 from textbook_ltc import TextbookLtc  # noqa: E402
@@ -213,7 +214,7 @@ def processes(options):
     sizes = (500_000, 2_000_000, *((8_294_400,) if options.large else ()))
     heading("peak memory beyond the samples: ltsh4, both passes, 8 lights, 1 and 2 processes")
     for size in sizes[: 1 if options.quick else None]:
-        code = f"import run; run.peak_memory({size})"
+        code = f"import peak_memory; peak_memory.print_peak({size})"
         subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True, timeout=600)
 
 
@@ -223,45 +224,33 @@ def cpu_seconds():
     return times.user + times.system + times.children_user + times.children_system
 
 
-def peak_memory(count):
-    """Print the peak of this process beyond what it has once the samples are there, and that of its child."""
-    samples, lights = floor_scene(count, 8, "schlick")
-    bytes_of_samples = sum(getattr(samples, name).nbytes for name in samples.__dataclass_fields__)
-    before = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    # What making the samples took for a while must not count.
-    Path("/proc/self/clear_refs").write_text("5")
-    children, start = [], workers.subprocess.Popen
-
-    def popen(*arguments, **options):
-        children.append(start(*arguments, **options))
-        return children[-1]
-
-    workers.subprocess.Popen = popen
-    peaks = {}
-
-    def look(_):
-        peaks.update({child.pid: peak_of(child.pid) for child in children})
-
-    text = []
-    for number in (1, 2):
-        shading.shade(samples, lights, "ltsh4", workers=number, progress=look)
-        text.append(f"{(peak_of('self') - before) / 2**20:.0f} MiB")
-    text[1] += f" and {max(peaks.values(), default=0) / 2**20:.0f} MiB in the child"
-    print(f"  {count} samples ({bytes_of_samples / 2**20:.0f} MiB): " + "; ".join(text), flush=True)
-
-
-def peak_of(pid):
-    """Largest resident size of a process in bytes."""
-    status = Path(f"/proc/{pid}/status").read_text().splitlines()
-    return 1024 * int(next(line for line in status if "VmHWM" in line).split()[1])
-
-
 def cycles(options):
     """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
     from equal_error import report
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
     report(64 if options.quick else 128)
+    heading("time at equal error of a bake, ltsh4 against Cycles' bake")
+    bake_cost.equal_error(options.quick)
+
+
+def animation(options):
+    """Frames of an animation beside a single one."""
+    from animation import report
+
+    frames = 16 if options.quick else 48
+    heading(f"{frames} frames of the demo scene, 64 x 36 pixels, ltsh4 (240 of them: make soak)")
+    report(frames)
+
+
+def viewport(options):
+    """Frames of the viewport by technique, and keeping it in step with a large scene."""
+    import viewport_report
+
+    heading("viewport: frames of the example scene")
+    viewport_report.frames(2 if options.quick else 5, "1920x1080" if options.large else "960x540")
+    heading("viewport: keeping in step; targets: first sync 2000 ms, object moved 50 ms")
+    viewport_report.sync(100_000 if options.quick else 1_000_000)
 
 
 SECTIONS = {
@@ -272,24 +261,28 @@ SECTIONS = {
     "growth": growth,
     "processes": processes,
     "cycles": cycles,
+    "animation": animation,
+    "viewport": viewport,
 }
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"default: all of {', '.join(SECTIONS)}")
-    parser.add_argument("--large", action="store_true", help="also 1e7 samples, and the memory of 3840 x 2160")
+    parser.add_argument("--large", action="store_true", help="also 1e7 samples, memory of 3840 x 2160, frames of 1080p")
     parser.add_argument("--quick", action="store_true", help="fewer samples and rounds")
     parser.add_argument("--no-cycles", action="store_true", help="leave out what needs bpy")
     options = parser.parse_args()
     unknown = set(options.sections) - set(SECTIONS)
     if unknown:
         parser.error(f"unknown sections {', '.join(sorted(unknown))}; expected some of {', '.join(SECTIONS)}")
+    # Children print too, each in its turn.
+    sys.stdout.reconfigure(line_buffering=True)
     start = time.perf_counter()
     print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
           f"load {os.getloadavg()[0]:.1f}, children run on {workers.interpreter()}")  # fmt: skip
     for name in options.sections or SECTIONS:
-        if not (name == "cycles" and options.no_cycles):
+        if not (name in ("cycles", "animation", "viewport") and options.no_cycles):
             SECTIONS[name](options)
     print(f"\n{time.perf_counter() - start:.0f} s")
 

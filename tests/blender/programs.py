@@ -3,6 +3,7 @@
 In a real Blender this file is what runs, between Blender's arguments and ours.
 """
 
+import json
 import os
 import sys
 import traceback
@@ -19,6 +20,20 @@ def command_line(*arguments) -> list[str]:
 def python(code: str) -> list[str]:
     """The command that runs `code`, to be run in the root of the tree."""
     return _in_blender("code", code) or [sys.executable, "-c", code]
+
+
+def document(stdout: str) -> dict:
+    """The JSON document on the stdout of `command_line`, where only a real Blender may say something before."""
+    import bpy
+
+    return json.loads(stdout[stdout.index("{\n") :] if bpy.app.binary_path else stdout)
+
+
+def said_nothing(stdout: str) -> bool:
+    """True for an empty stdout of `command_line`; what a real Blender says before it comes to us does not count."""
+    import bpy
+
+    return stdout == "" or bool(bpy.app.binary_path)
 
 
 def _in_blender(*arguments) -> list[str] | None:

@@ -7,7 +7,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ltsh_addon.blender import cameras, child, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
+from ltsh_addon.blender.pixels import cameras, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
+from ltsh_addon.blender.processes import child
 from ltsh_addon.imaging.exr import read_channels
 
 SIZE = (24, 16)
@@ -159,3 +160,15 @@ def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
         "height": scene.render.resolution_y,
     }
     return child.read_reference(manifest, folder)
+
+
+def group_with_principled(name="Group"):
+    """A node group of one Principled BSDF whose roughness is an input; the group's tree."""
+    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
+    tree.interface.new_socket("Roughness", in_out="INPUT", socket_type="NodeSocketFloat")
+    tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
+    shader = tree.nodes.new("ShaderNodeBsdfPrincipled")
+    shader.distribution = "GGX"
+    tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], shader.inputs["Roughness"])
+    tree.links.new(shader.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
+    return tree

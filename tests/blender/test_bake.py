@@ -10,8 +10,9 @@ import scene_parts
 from bake_scenes import SIZE, baked, save, start, textured_scene
 from scene_parts import add_plane, principled
 
-from ltsh_addon import bake_object, imaging
-from ltsh_addon.blender import gbuffer, render_settings
+from ltsh_addon import imaging
+from ltsh_addon.baking import bake_object
+from ltsh_addon.blender.pixels import gbuffer, render_settings
 from ltsh_addon.imaging.exr import read_metadata
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 

@@ -8,10 +8,10 @@ from bake_scenes import baked, save, start
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.bake_planes import Planes
-from ltsh_addon.blender import texel_bake
-from ltsh_addon.blender.uv_raster import UvTriangles
-from ltsh_addon.blender.uv_seams import UvSeams
+from ltsh_addon.baking.bake_planes import Planes
+from ltsh_addon.blender.texels import texel_bake
+from ltsh_addon.blender.texels.uv_raster import UvTriangles
+from ltsh_addon.blender.texels.uv_seams import UvSeams
 
 SIZE, MARGIN = 128, 6
 

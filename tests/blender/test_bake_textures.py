@@ -8,11 +8,11 @@ import pytest
 from bake_scenes import SIZE, save, start
 from scene_parts import add_plane, principled
 
-from ltsh_addon import bake
-from ltsh_addon.bake import BakeOptions
-from ltsh_addon.blender import bake_child, texel_samples
-from ltsh_addon.blender.image_textures import ImageTexture
-from ltsh_addon.blender.uv_raster import UvTriangles
+from ltsh_addon.baking import bake
+from ltsh_addon.baking.bake import BakeOptions
+from ltsh_addon.blender.materials.image_textures import ImageTexture
+from ltsh_addon.blender.texels import bake_child, texel_samples
+from ltsh_addon.blender.texels.uv_raster import UvTriangles
 from ltsh_addon.scene import AreaLight
 
 # Cycles bakes 0.001 and 0.002 of a texel beside the center, where these textures change by 0.3 per texel at most.
@@ -164,9 +164,9 @@ def altered(kind, folder):
     "kind", ["alpha", "mapping node", "cubic", "box", "own mapping", "no such map", "color space", "math"]
 )
 def test_anything_more_is_left_to_cycles(tmp_path, kind):
-    from ltsh_addon.blender.bsdf_lobes import lobe_of
-    from ltsh_addon.blender.material_maps import MaterialPlan
-    from ltsh_addon.blender.plain_textures import SavedImages
+    from ltsh_addon.blender.materials.bsdf_lobes import lobe_of
+    from ltsh_addon.blender.materials.material_maps import MaterialPlan
+    from ltsh_addon.blender.materials.plain_textures import SavedImages
 
     altered(kind, tmp_path)
     material = bpy.data.materials["More"]

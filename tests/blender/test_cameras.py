@@ -8,10 +8,10 @@ import pytest
 import scene_parts
 
 from ltsh_addon import imaging
-from ltsh_addon.blender import cameras
-from ltsh_addon.blender.child import ExtractOptions, SceneError, extract
-from ltsh_addon.blender.render_settings import enable_passes, render_exr
-from ltsh_addon.compare import Options, shade_scene
+from ltsh_addon.blender.pixels import cameras
+from ltsh_addon.blender.pixels.render_settings import enable_passes, render_exr
+from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
+from ltsh_addon.comparison.compare import Options, shade_scene
 
 
 def room(width=26, height=15):

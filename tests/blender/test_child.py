@@ -16,8 +16,8 @@ import programs
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.blender_process import child_command
-from ltsh_addon.blender.child import ExtractOptions, SceneError, extract
+from ltsh_addon.blender.processes.blender_process import child_command
+from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -113,7 +113,7 @@ def test_a_camera_that_sees_nothing_is_a_warning(tmp_path):
     [
         (None, "no such file"),
         (b"", "is empty"),
-        (b"not a blend file at all\n" * 20, "cannot open it"),
+        (b"not a blend file at all\n" * 20, "is no .blend"),
         ("folder", "cannot be read"),
         ("cut", "cannot open it"),
     ],
@@ -175,7 +175,7 @@ def test_cancelling_ends_the_child(tmp_path, temporary_root):
 def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary_root):
     path = saved_scene(tmp_path / "scene.blend")
     code = (
-        "import sys\nfrom ltsh_addon.blender.child import *\n"
+        "import sys\nfrom ltsh_addon.blender.processes.child import *\n"
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )
@@ -201,7 +201,7 @@ def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary
 def test_a_killed_parent_takes_its_child_along(tmp_path):
     path = saved_scene(tmp_path / "scene.blend")
     code = (
-        "from ltsh_addon.blender.child import *\n"
+        "from ltsh_addon.blender.processes.child import *\n"
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )

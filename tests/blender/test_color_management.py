@@ -11,9 +11,9 @@ import pytest
 import scene_parts
 
 from ltsh_addon import imaging
-from ltsh_addon.blender import color_management
-from ltsh_addon.blender.child import ExtractOptions, extract
-from ltsh_addon.compare import Options, compare_scene
+from ltsh_addon.blender.pixels import color_management
+from ltsh_addon.blender.processes.child import ExtractOptions, extract
+from ltsh_addon.comparison.compare import Options, compare_scene
 from ltsh_addon.imaging.color_space import CHROMATICITIES, identified
 
 CHOOSES_SPACES = bpy.app.version >= (5, 0, 0)

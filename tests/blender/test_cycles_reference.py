@@ -5,7 +5,7 @@ import numpy as np
 import scene_parts
 from scene_parts import add_plane, add_sphere, principled
 
-from ltsh_addon.blender import cycles_reference, gbuffer
+from ltsh_addon.blender.pixels import cycles_reference, gbuffer
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.shading import shade
 

@@ -8,7 +8,9 @@ import bpy
 import numpy as np
 import pytest
 
-from ltsh_addon.blender import child, demo_objects, demo_scene
+from ltsh_addon.blender.demo import demo_objects, demo_scene
+from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.processes.blend_saving import check_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
@@ -25,6 +27,29 @@ def demo_file(tmp_path_factory):
 def demo(demo_file):
     bpy.ops.wm.open_mainfile(filepath=str(demo_file), load_ui=False, use_scripts=False)
     return bpy.context.scene
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.999])
+def test_a_file_that_was_cut_while_it_was_saved_is_refused(demo_file, tmp_path, share):
+    check_whole(demo_file)
+    content, cut = demo_file.read_bytes(), tmp_path / "cut.blend"
+    cut.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(child.SceneError, match="is the disk full"):
+        check_whole(cut)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
+@pytest.mark.skipif(bool(bpy.app.binary_path), reason="starts this Python")
+def test_a_demo_that_does_not_fit_leaves_no_file(tmp_path):
+    code = (
+        "import resource, sys\nresource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
+        "from ltsh_addon import cli\nsys.exit(cli.main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", code, "demo", "-o", str(tmp_path / "out"), "--quiet"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 1 and done.stderr.startswith(f"ltsh: {tmp_path / 'out'}: Blender c"), done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not list((tmp_path / "out").glob("*.blend")) and not list((tmp_path / "out").glob(".*.blend"))
 
 
 def surface_shader(material):
@@ -139,7 +164,7 @@ def fingerprint_in_fresh_interpreter():
     code = (
         "import hashlib\n"
         "import numpy as np\n"
-        "from ltsh_addon.blender import demo_objects, demo_textures as t\n"
+        "from ltsh_addon.blender.demo import demo_objects, demo_textures as t\n"
         "digest = hashlib.sha256()\n"
         "for part in demo_objects.everything():\n"
         "    shape = part.shape\n"

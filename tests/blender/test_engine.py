@@ -7,7 +7,10 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import shading
-from ltsh_addon.blender import child, engine_final, engine_panels, engine_snapshot
+from ltsh_addon.blender.engine import engine_final, engine_panels, engine_preview, engine_snapshot, engine_view
+from ltsh_addon.blender.materials import surface_looks
+from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.viewport.view_lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.scene import Border
 
@@ -78,7 +81,13 @@ def test_unregister_leaves_nothing_behind():
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):
-    for name in ("CYCLES_MATERIAL_PT_surface", "CYCLES_LIGHT_PT_light", "DATA_PT_lens", "OBJECT_PT_transform"):
+    shown = (
+        *("CYCLES_MATERIAL_PT_surface", "CYCLES_LIGHT_PT_light", "CYCLES_WORLD_PT_surface", "WORLD_PT_context_world"),
+        *("DATA_PT_lens", "DATA_PT_camera", "OBJECT_PT_transform", "OBJECT_PT_display", "MATERIAL_PT_viewport"),
+        *("CYCLES_PT_context_material", "CYCLES_OBJECT_PT_visibility", "CYCLES_LIGHT_PT_beam_shape"),
+        *("RENDER_PT_color_management", "RENDER_PT_format", "VIEWLAYER_PT_layer", "DATA_PT_uv_texture"),
+    )
+    for name in shown:
         panel = getattr(bpy.types, name)
         assert "LTSH" in getattr(panel, "COMPAT_ENGINES", {"LTSH"}), name
     for name in ("CYCLES_RENDER_PT_sampling", "CYCLES_RENDER_PT_light_paths", "CYCLES_RENDER_PT_performance"):
@@ -139,6 +148,19 @@ def test_the_world_is_seen_behind_surfaces_alone(addon, tmp_path):
     assert seen.any() and not np.isclose(combined[seen][:, 2], 0.8, rtol=1e-3).any()
 
 
+def test_what_surfaces_emit_is_in_the_picture_and_has_a_pass(addon, tmp_path):
+    plane, _ = add_content(addon)
+    addon.cycles.film_exposure = 2.0
+    inputs = plane.data.materials[0].node_tree.nodes["Principled BSDF"].inputs
+    inputs["Emission Color"].default_value, inputs["Emission Strength"].default_value = (0.1, 0.2, 0.3, 1.0), 0.5
+    channels = render(addon, tmp_path / "glow.exr")
+    passes = {name: picture(channels, "ViewLayer", f"LTSH {name}") for name in ("Specular", "Diffuse", "Emission")}
+    shining = passes["Emission"].any(axis=-1)
+    assert 0.1 < shining.mean() < 0.9
+    np.testing.assert_allclose(passes["Emission"][shining], np.tile((0.1, 0.2, 0.3), (shining.sum(), 1)), rtol=1e-5)
+    np.testing.assert_allclose(picture(channels, "ViewLayer", "Combined"), sum(passes.values()), rtol=1e-5, atol=1e-6)
+
+
 def test_a_scene_without_lights_fails_with_its_reason(addon, tmp_path):
     parts.add_plane()
     parts.add_camera()
@@ -179,3 +201,40 @@ def test_an_engine_chosen_by_hand_is_not_taken_for_a_preview(addon, tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     bpy.ops.wm.open_mainfile(filepath=str(path))
     assert bpy.context.scene.render.engine == "LTSH"
+
+
+def test_another_engine_chosen_by_hand_ends_the_preview(addon):
+    addon.render.engine = "BLENDER_WORKBENCH"
+    bpy.ops.ltsh.preview()
+    engine_preview._engine_changed()
+    assert addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
+    addon.render.engine = "CYCLES"
+    # Blender calls it between two events, of which there are none here.
+    engine_preview._engine_changed()
+    addon.render.engine = "LTSH"
+    assert not engine_preview.is_previewing(addon)
+
+
+@pytest.fixture
+def without_cycles():
+    """Cycles' add-on is off."""
+    parts.empty_scene(*SIZE)
+    bpy.ops.preferences.addon_disable(module="cycles")
+    yield bpy.context.scene
+    bpy.ops.preferences.addon_enable(module="cycles")
+
+
+def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(without_cycles, tmp_path):
+    assert not hasattr(without_cycles, "cycles")
+    ltsh_addon.register()
+    try:
+        plane, _ = add_content(without_cycles)
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        lights, notes = view_lights(depsgraph, lambda instance: True)
+        assert len(lights) == 1 and not notes
+        assert surface_looks.look_of(plane.active_material).corrected
+        assert engine_view._shown(without_cycles, "single", None, 1.0).exposure == 1.0
+        channels = render(without_cycles, tmp_path / "final.exr")
+        assert picture(channels, "ViewLayer", "LTSH Specular").max() > 0.01
+    finally:
+        ltsh_addon.unregister()

@@ -6,8 +6,8 @@ import pytest
 import scene_parts
 
 from ltsh_addon import cli
-from ltsh_addon.blender import child
-from ltsh_addon.compare import Options, compare_scene, shade_scene
+from ltsh_addon.blender.processes import child
+from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
 

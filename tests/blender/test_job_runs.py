@@ -7,15 +7,17 @@ import sys
 from pathlib import Path
 
 import bpy
+import numpy as np
+import programs
 import pytest
 import scene_parts
 
-from ltsh_addon import batch
-from ltsh_addon.bake import BakeOptions
-from ltsh_addon.blender import blender_process, child, scene_facts
-from ltsh_addon.compare import Options, make_picture
-from ltsh_addon.merge import merge
-from ltsh_addon.tasks import Job, tasks_of
+from ltsh_addon.baking.bake import BakeOptions
+from ltsh_addon.blender.processes import blender_process, child, scene_facts
+from ltsh_addon.comparison.compare import Options, make_picture
+from ltsh_addon.jobs import batch
+from ltsh_addon.jobs.merge import merge
+from ltsh_addon.jobs.tasks import Job, tasks_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -49,13 +51,16 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def run_python(*arguments):
-    command = [sys.executable, *map(str, arguments)]
+def run(command):
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
 
 
-def job(room, output, **changes):
-    options = Options(room, output, techniques=("ltsh4",), cycles_samples=4)
+def run_python(*arguments):
+    return run([sys.executable, *map(str, arguments)])
+
+
+def job(room, output, cycles_samples=4, **changes):
+    options = Options(room, output, techniques=("ltsh4",), cycles_samples=cycles_samples)
     return Job("compare", options, **{"scenes": (room,), **changes})
 
 
@@ -98,7 +103,8 @@ def test_a_killed_blender_is_one_failed_task(room, tmp_path):
         if state.seconds is not None:
             done.append(state.problem)
 
-    wanted = job(room, tmp_path / "out", frames=(1, 2, 3))
+    # Many samples, so that Blender is still at work when it is killed.
+    wanted = job(room, tmp_path / "out", cycles_samples=4096, frames=(1, 2, 3))
     (problem,) = batch.run_tasks(wanted, progress=progress, tell=tell).problems
     assert "compare_0002: Blender ended with code -9" in problem and done == [None, problem, None]
     assert batch.run_tasks(wanted, existing=batch.RESUME).kept == 2 and merge(tmp_path / "out").problems == ()
@@ -113,22 +119,75 @@ def test_facts_are_those_of_the_frame_and_of_the_file(room):
         scene_facts.ask(room, (None,), ("Roof",))
 
 
+def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path):
+    """Four shards of an animation, and the first of them twice, all at once."""
+    common = ["shade", room, "--frames", "1-5", "--camera", "Side", "--camera", "Camera", "--techniques", "ltsh4"]
+    common += ["--quiet", "-o"]
+
+    def start(*arguments):
+        command = programs.command_line(*arguments)
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+    single = start(*common, tmp_path / "one")
+    assert (single.communicate(timeout=240)[1], single.returncode) == (b"", 0)
+    shards = [start(*common, tmp_path / "four", "--shard", f"{number}/4") for number in (1, 2, 3, 4, 1)]
+    assert [shard.communicate(timeout=240)[1] for shard in shards] == [b""] * 5
+    assert [shard.returncode for shard in shards] == [0] * 5
+    assert merge(tmp_path / "four").missing == ()
+    assert contents(tmp_path / "four") == contents(tmp_path / "one") and len(contents(tmp_path / "one")) == 22
+
+
+def add_tiles_and_group():
+    """A plane over two UDIM tiles, and one of the same material, whose color comes from within a group."""
+    material, node = scene_parts.principled("Grouped")
+    group = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
+    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    wave = group.nodes.new("ShaderNodeTexWave")
+    group.links.new(wave.outputs["Color"], group.nodes.new("NodeGroupOutput").inputs[0])
+    outer = material.node_tree.nodes.new("ShaderNodeGroup")
+    outer.node_tree = group
+    material.node_tree.links.new(outer.outputs[0], node.inputs["Base Color"])
+    corners = [(x, y, 0.5) for y in (0.0, 1.0) for x in (-1.0, 0.0, 1.0)]
+    tiles = scene_parts.add_mesh("Tiles", corners, [(0, 1, 4, 3), (1, 2, 5, 4)])
+    square = np.array([(0.1, 0.1), (0.9, 0.1), (0.9, 0.9), (0.1, 0.9)])
+    uv = np.concatenate([square, square + (1.0, 0.0)]).astype(np.float32)
+    tiles.data.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.ravel())
+    tiles.data.materials.append(material)
+    scene_parts.add_plane(material, size=0.5, location=(0, 0, 0.7), name="Other")
+
+
 def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
-    """Two frames of three objects, of which one cannot be baked."""
+    """Two frames of five objects, of which one cannot be baked and one has two UDIM tiles, each a task of its own."""
+    bpy.ops.wm.open_mainfile(filepath=str(room))
+    add_tiles_and_group()
+    bpy.ops.wm.save_as_mainfile(filepath=str(room))
+    loads = []
+
+    def progress(stage, fraction):
+        loads.extend([stage] if stage == "open scene" else [])
 
     def bake(output, **shard):
         options = BakeOptions(room, output, width=64, height=64, margin=2, techniques=("ltsh4",), cycles_samples=2)
-        return batch.run_tasks(Job("bake", options, (room,), frames=(1, 5)), **shard)
+        return batch.run_tasks(Job("bake", options, (room,), frames=(1, 5)), progress=progress, **shard)
 
     assert len(bake(tmp_path / "one").problems) == 2
-    merge(tmp_path / "one")
-    problems = [bake(tmp_path / "four", shard=(number, 4)).problems for number in (4, 2, 3, 1)]
-    assert len(sum(problems, ())) == 2
+    # Once for the list of objects, and once for all objects of each frame.
+    assert len(loads) == 3
+    report = merge(tmp_path / "one").report
+    shards = [bake(tmp_path / "four", shard=(number, 4)) for number in (4, 2, 3, 1)]
+    assert [shard.tasks for shard in shards] == [3, 3, 3, 3]
+    assert len(sum((shard.problems for shard in shards), ())) == 2
     merged = merge(tmp_path / "four")
     assert contents(tmp_path / "four") == contents(tmp_path / "one")
     assert merged.missing == () and "'Bare' has no UV map" in merged.problems[0]
+    stems = ("Floor", "Slab", "Other", "Tiles")
+    for frame, entry in zip((1, 5), report["reports"], strict=True):
+        assert sorted(item["name"] for item in entry["objects"]) == sorted(stems)
+        (item,) = [item for item in entry["objects"] if item["name"] == "Tiles"]
+        files = {number: tile["file"] for number, tile in item["tiles"].items()}
+        assert files == {str(tile): f"Tiles_000{frame}.{tile}.exr" for tile in (1001, 1002)}
     names = {path.name for path in (tmp_path / "one").glob("*.exr")}
-    assert names == {f"{name}_000{frame}.exr" for name in ("Floor", "Slab") for frame in (1, 5)}
+    assert names == {tile["file"] for e in report["reports"] for o in e["objects"] for tile in o["tiles"].values()}
 
 
 def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
@@ -164,7 +223,7 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path):
 
 def test_json_is_alone_on_stdout_whatever_blender_prints():
     code = (
-        "import os, sys\nfrom ltsh_addon.blender import standard_output\n"
+        "import os, sys\nfrom ltsh_addon.blender.processes import standard_output\n"
         "print('before', flush=True)\nstandard_output.reserve()\n"
         "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
     )
@@ -187,10 +246,10 @@ os.write(1, b"Blender quit\\n")
 sys.stdout.flush()
 os._exit(code)
 """
-    done = run_python("-c", code)
+    done = run(programs.python(code))
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout[done.stdout.index("{\n") :])
     arguments = ("shade", room, "-o", tmp_path / "b", "--techniques", "ltc", "--json", "--quiet")
-    other = run_python("-m", "ltsh_addon", *arguments)
-    assert found == json.loads(other.stdout) and "Blender quit" in done.stderr
+    other = run(programs.command_line(*arguments))
+    assert found == programs.document(other.stdout) and "Blender quit" in done.stderr
     assert (tmp_path / "a" / "shade.exr").read_bytes() == (tmp_path / "b" / "shade.exr").read_bytes()

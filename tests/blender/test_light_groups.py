@@ -6,7 +6,7 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, into_collection, start
 
-from ltsh_addon.blender import gbuffer
+from ltsh_addon.blender.pixels import gbuffer
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.shading import shade
 

@@ -8,7 +8,7 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, assert_agrees, into_collection, start
 
-from ltsh_addon.blender.child import ExtractOptions, SceneError, extract
+from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
 
 
 def names_of_lights():

@@ -8,7 +8,7 @@ import pytest
 import scene_parts
 from lit_plane import add_image, add_instancer, assert_agrees, into_collection, light_tree, start
 
-from ltsh_addon.blender import light_textures
+from ltsh_addon.blender.lights import light_textures
 
 PLACEMENTS = {
     "rectangle": {},

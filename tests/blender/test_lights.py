@@ -9,8 +9,8 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.blender import extraction
-from ltsh_addon.blender.child import SceneError
+from ltsh_addon.blender.pixels import extraction
+from ltsh_addon.blender.processes.child import SceneError
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 LAMBERT = "ShaderNodeBsdfDiffuse"

@@ -7,8 +7,8 @@ import quadrature
 import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
-from ltsh_addon.blender import gbuffer, render_settings
-from ltsh_addon.blender.materials import MaterialReport, inject_aovs
+from ltsh_addon.blender.materials.material_outputs import MaterialReport, inject_aovs
+from ltsh_addon.blender.pixels import gbuffer, render_settings
 
 # Texture coordinates and colors pass through float32 a few times.
 EXACT = 2e-6
@@ -16,7 +16,7 @@ EXACT = 2e-6
 
 @pytest.fixture
 def plane_scene():
-    """A plane of 6 m seen from above, one light; call with its material, get (surface samples, warnings)."""
+    """A plane of 6 m seen from above, one light; call with its material for (surface samples, warnings)."""
 
     def make(folder, *materials):
         scene_parts.add_area_light()
@@ -44,18 +44,6 @@ def feed_uv(tree, color_socket, value_socket):
     tree.links.new(coordinates.outputs["UV"], separate.inputs[0])
     tree.links.new(coordinates.outputs["UV"], color_socket)
     tree.links.new(separate.outputs[0], value_socket)
-
-
-def group_with_principled(name="Group"):
-    """A node group of one Principled BSDF whose roughness is an input; the group's tree."""
-    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
-    tree.interface.new_socket("Roughness", in_out="INPUT", socket_type="NodeSocketFloat")
-    tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
-    shader = tree.nodes.new("ShaderNodeBsdfPrincipled")
-    shader.distribution = "GGX"
-    tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], shader.inputs["Roughness"])
-    tree.links.new(shader.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
-    return tree
 
 
 def test_textures_on_principled(tmp_path, plane_scene):
@@ -118,7 +106,7 @@ def test_principled_weights_reproduce_cycles(tmp_path):
 
 
 def test_a_group_is_followed_for_each_of_its_users(tmp_path, plane_scene):
-    tree = group_with_principled()
+    tree = scene_parts.group_with_principled()
     materials = []
     for value, x in ((0.77, -1.5), (0.33, 1.5)):
         material, nodes, output = new_material(f"Uses group {value}")

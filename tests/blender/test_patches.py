@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.patches import (
+from ltsh_addon.blender.lights.patches import (
     ERROR,
     GRID,
     clip_to_cell,

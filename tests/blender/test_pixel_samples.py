@@ -9,8 +9,8 @@ import quadrature
 import scene_parts
 from scene_parts import add_bump, add_plane, add_sphere, bsdf_material, principled
 
-from ltsh_addon.blender import gbuffer, pixel_filter
-from ltsh_addon.blender.specular_horizon import end_at_horizons_of_cycles
+from ltsh_addon.blender.materials.specular_horizon import end_at_horizons_of_cycles
+from ltsh_addon.blender.pixels import gbuffer, pixel_filter
 from ltsh_addon.shading import shade
 
 

@@ -10,9 +10,9 @@ import bpy
 import pytest
 
 import ltsh_addon
-from ltsh_addon.blender import availability
-from ltsh_addon.blender import preferences as module
-from ltsh_addon.blender.preferences import CORES_VARIABLE, MEMORY_VARIABLE, Preferences, preferences
+from ltsh_addon.blender.interface import availability
+from ltsh_addon.blender.interface import preferences as module
+from ltsh_addon.blender.interface.preferences import CORES_VARIABLE, MEMORY_VARIABLE, Preferences, preferences
 from ltsh_addon.shading import workers
 
 

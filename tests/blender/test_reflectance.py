@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import quadrature
 
-from ltsh_addon.blender import lobe_samples, reflectance
-from ltsh_addon.blender.aovs import LOBE_KINDS
-from ltsh_addon.blender.glass_albedos import glass_albedos
-from ltsh_addon.blender.lobe_slots import Hits
+from ltsh_addon.blender.materials import lobe_samples, reflectance
+from ltsh_addon.blender.materials.aovs import LOBE_KINDS
+from ltsh_addon.blender.materials.glass_albedos import glass_albedos
+from ltsh_addon.blender.materials.lobe_slots import Hits
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 COSINES, COSINE_WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS

@@ -7,16 +7,16 @@ import pytest
 import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
 
-from ltsh_addon.blender.specular_horizon import end_at_horizons_of_cycles
+from ltsh_addon.blender.materials.specular_horizon import end_at_horizons_of_cycles
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading import shade
 
 
-def samples_near_the_horizon(roughness, count=4):
+def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
     """Points at the origin, seen obliquely, whose geometric and smooth normals differ."""
     tilted, up = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
-    view = np.array([-0.96, 0.0, 0.28])
+    view = np.array(view)
     vectors = {"view": view, "normal": up, "diffuse_normal": up, "smooth_normal": up, "geometric_normal": tilted}
     zero = np.zeros((count, 3))
     return SurfaceSamples(
@@ -37,9 +37,16 @@ def light_at(distance, half):
     return AreaLight("Light", "SQUARE", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
 
 
-@pytest.mark.parametrize("roughness, light, smooth", [(0.6, (3.0, 0.3), True), (0.15, (0.5, 3.0), False)])
-def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, light, smooth):
-    samples = samples_near_the_horizon(roughness)
+@pytest.mark.parametrize(
+    "roughness, view, light, smooth",
+    [
+        (0.6, (-0.96, 0.0, 0.28), (3.0, 0.3), True),
+        # The mirror direction is 3 degrees above the horizon: 45 per sr for the lobe's choice, 0.2 for the light's.
+        (0.15, (-0.9987, 0.0, 0.05), (0.5, 3.0), False),
+    ],
+)
+def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, view, light, smooth):
+    samples = samples_near_the_horizon(roughness, view)
     found = end_at_horizons_of_cycles(samples, (light_at(*light),)).geometric_normal
     assert np.array_equal(found, samples.smooth_normal if smooth else samples.geometric_normal)
 
@@ -51,12 +58,21 @@ def test_without_lights_or_differences_nothing_changes():
     assert end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),)) is flat
 
 
-@pytest.mark.parametrize("mesh, roughness, size", [("bumps", 0.6, 1.0), ("bumps", 0.2, 4.0), ("coarse", 0.9, 1.0)])
-def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, size):
+@pytest.mark.parametrize(
+    "mesh, roughness, sides, turn",
+    [
+        ("bumps", 0.6, (1.0, 0.75), 0.0),
+        ("bumps", 0.2, (4.0, 3.0), 0.0),
+        ("bumps", 0.15, (6.0, 0.2), 1.57),  # a strip that is nowhere near a disk of its area
+        ("coarse", 0.9, (1.0, 0.75), 0.0),
+    ],
+)
+def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, sides, turn):
     scene_parts.empty_scene()
     scene_parts.add_camera()
-    height = 1.0 if size < 2.0 else 0.5
-    scene_parts.add_area_light(location=(2.5, 0.0, height), rotation=(0.0, 1.2, 0.0), size=size, size_y=0.75 * size)
+    height = 1.0 if sides[0] < 2.0 else 0.5
+    place = {"location": (2.5, 0.0, height), "rotation": (0.0, 1.2, turn)}
+    scene_parts.add_area_light(**place, size=sides[0], size_y=sides[1])
     material, node = bsdf_material("ShaderNodeBsdfAnisotropic", Color=(1.0, 1.0, 1.0, 1.0), Roughness=roughness)
     if mesh == "bumps":
         add_bump(material.node_tree, node, scale=4.0, distance=0.15)
@@ -72,6 +88,6 @@ def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, size):
         return unbiased_relative_error(image, *halves)[0]
 
     chosen = error(end_at_horizons_of_cycles(samples, lights).geometric_normal)
-    # Measured: 0.1 to 0.5 %, noise included; the other horizon is wrong by 2 to 7 %.
+    # Measured: up to 0.7 %, noise included; the other horizon is wrong by 3 to 47 %.
     assert chosen < 8e-3
     assert 1.5e-2 < max(error(samples.geometric_normal), error(samples.smooth_normal))

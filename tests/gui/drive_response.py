@@ -3,6 +3,7 @@
 import bpy
 from hands import Pulse, job, settings, wait_for_job
 
+SECONDS = 900
 LONGEST_WORK = 0.2  # seconds
 
 
@@ -21,7 +22,7 @@ def main(rig):
     start = Pulse()
     with rig.override():
         bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield 0.5
+    yield 2
     start.stop(rig, "start of the job")
     pulse = Pulse()
     yield from wait_for_job(rig, 500)

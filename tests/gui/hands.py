@@ -6,8 +6,9 @@ import time
 import bpy
 
 ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
-# Height of a row of buttons and the gap around it at interface scale 1, as Blender's widgets have them.
 CLICK_SECONDS = 0.6
+# Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
+MANUAL, SHADE, COMPARE, PREVIEW, CANCEL = (60, 15), (142, 257), (142, 290), (142, 322), (94, 94)
 
 
 def module(name):
@@ -17,7 +18,7 @@ def module(name):
 
 def job():
     """The job that runs, or None."""
-    return module("operators").running_job()
+    return module("interface.operators").running_job()
 
 
 def settings():
@@ -40,6 +41,11 @@ def click(rig, x, y):
     yield CLICK_SECONDS
 
 
+def click_button(rig, place):
+    """Click a button of the sidebar at one of the places above."""
+    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *place))
+
+
 def drag(rig, start, end):
     """Drag with the left button from `start` to `end`."""
     rig.xdo("mousemove", *start)
@@ -52,6 +58,33 @@ def drag(rig, start, end):
         yield CLICK_SECONDS
     rig.xdo("mouseup", 1)
     yield CLICK_SECONDS
+
+
+def keys(rig, *names):
+    """Press keys or shortcuts such as ctrl+z one after another; the mouse must be over the area that they are for."""
+    for name in names:
+        rig.xdo("key", name)
+        yield CLICK_SECONDS
+
+
+def over(rig, kind="VIEW_3D", which="WINDOW", x=0.3, y=0.5):
+    """Put the mouse at a share of a region."""
+    region = rig.region(kind, which)
+    rig.xdo("mousemove", round(region.x + x * region.width), round(rig.size[1] - region.y - y * region.height))
+    yield CLICK_SECONDS
+
+
+def image_pixels(name):
+    """Pixels of an image of Blender, a flat tuple; empty where it is not there."""
+    image = bpy.data.images.get(name)
+    return tuple(image.pixels) if image is not None else ()
+
+
+def until(condition, seconds=15.0):
+    """Wait for `condition()`, on a busy machine too; what follows checks it."""
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        yield 0.02
 
 
 def wait_for_job(rig, seconds, shots=()):

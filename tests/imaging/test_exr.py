@@ -1,5 +1,7 @@
 """EXR layers: bit for bit, by name, complete or not at all."""
 
+from pathlib import Path
+
 import numpy as np
 import OpenEXR
 import pytest
@@ -121,10 +123,17 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(tmp_path, m
     path = tmp_path / "a.exr"
     path.write_bytes(b"old")
 
-    def fail(self, name):
-        raise RuntimeError("no space left")
+    class Failing:
+        def __init__(self, name, header):
+            Path(name).write_bytes(b"half")
 
-    monkeypatch.setattr(OpenEXR.File, "write", fail)
+        def writePixels(self, data, rows):
+            raise RuntimeError("no space left")
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(OpenEXR, "OutputFile", Failing)
     with pytest.raises(OSError, match="a.exr"):
         write_layers(path, layers())
     assert [item.name for item in tmp_path.iterdir()] == ["a.exr"]

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import imaging
+from ltsh_addon.imaging.exr import read_channels
 from requirements import build_extension
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,6 +25,15 @@ BLENDER = os.environ.get("LTSH_BLENDER", "")
 SECONDS = 300
 NO_SCENE_NEEDED = ["--help"], ["--version"], ["shade", "--help"]
 pytestmark = pytest.mark.skipif(not BLENDER, reason="needs a real Blender: LTSH_BLENDER names its program")
+
+# What Blender runs before it renders a frame.
+SMALL_FRAMES = """
+import bpy
+scene = bpy.context.scene
+scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 36, 100
+scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+scene.ltsh_view.render_samples = 2
+"""
 
 
 class InstalledBlender:
@@ -132,6 +142,33 @@ def test_bake_works(blender, demo, tmp_path):
     done = blender.ltsh("bake", demo[0] / "demo.blend", "-o", tmp_path, *options)
     assert done.returncode == 0, done.stdout + done.stderr
     assert list(tmp_path.glob("*.exr"))
+
+
+def test_blender_renders_frames_with_the_engine(blender, demo, tmp_path):
+    scene = demo[0] / "demo.blend"
+    frame = tmp_path / "frame_"
+    done = blender.run("-b", scene, "--python-expr", SMALL_FRAMES, "-E", "LTSH", "-o", frame, "-f", "1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    channels = read_channels(tmp_path / "frame_0001.exr")
+    found = np.stack([channels[letter] for letter in "RGB"], axis=-1)
+    options = ("--techniques", "ltsh4", "--resolution", "64x36", "--aa", "2", "--quiet")
+    shaded = blender.ltsh("shade", scene, "-o", tmp_path / "shaded", *options)
+    assert shaded.returncode == 0, shaded.stderr
+    layers = imaging.read_layers(tmp_path / "shaded" / "shade.exr")
+    expected = layers["ltsh4.specular"] + layers["ltsh4.diffuse"]
+    # Both take the same samples, and the world of the scene is black.
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert expected.max() > 0.1
+
+
+def test_a_frame_that_cannot_be_rendered_is_an_error(blender, demo, tmp_path):
+    no_lights = "import bpy\nfor light in list(bpy.data.lights): bpy.data.lights.remove(light)"
+    done = blender.run(
+        *("-b", demo[0] / "demo.blend", "--python-expr", no_lights, "-E", "LTSH", "-o", tmp_path / "dark_", "-f", "1")
+    )
+    assert done.returncode == 1
+    assert "LTSH: scene 'Scene': no area light that renders" in done.stdout + done.stderr
+    assert not list(tmp_path.glob("dark_*"))
 
 
 def test_exit_codes(blender, demo, tmp_path):

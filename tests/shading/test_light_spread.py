@@ -189,3 +189,39 @@ def test_polygons_have_no_spread():
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     with pytest.raises(ValueError, match="spread is 1.0 rad, expected pi for shape POLYGON"):
         area_light(shape="POLYGON", corners=corners, spread=1.0)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_horizon_beyond_the_cone_changes_nothing(dtype):
+    """Of a light that the horizon cuts the point sees what the part in its cone alone, a light of its own, shows it."""
+    random = np.random.default_rng(5)
+    reach, checked = np.tan(np.radians(2.0)), 0
+    white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": 0.6}
+    for _ in range(100):
+        # Turned, so that no coordinate is exact.
+        axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        axes[2] *= np.linalg.det(axes)
+        normal = unit(np.array([*random.uniform(-1.0, 1.0, 2), 0.6]) @ axes)
+        view = unit(normal + 0.9 * unit(random.normal(size=3)))
+        center = np.array([*random.uniform(-0.95, 0.95, 2), 1.0])
+        whole, part = (
+            area_light(
+                center=place @ axes,
+                half_u=size * axes[0],
+                half_v=-size * axes[1],
+                direction=-axes[2],
+                radiance=(1, 1, 1),
+                spread=np.radians(4.0),
+            )
+            for place, size in ((center, 1.0), (np.array([0.0, 0.0, 1.0]), 1.1 * reach))
+        )
+        is_cut = (whole.polygon() @ normal).min() < 0.0 and (part.polygon() @ normal).min() > 0.1
+        if is_cut and view @ normal > 0.1:
+            sample = single_sample(normal=normal, view=view, **white)
+            found, expected = (
+                shading.shade(sample, [light], "ltsh2", workers=1, dtype=dtype).specular[0, 0]
+                for light in (whole, part)
+            )
+            np.testing.assert_allclose(found, expected, rtol=CLOSED)
+            checked += 1
+    assert checked > 15

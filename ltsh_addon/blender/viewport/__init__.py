@@ -5,8 +5,13 @@
     table_texture      lookup tables as an array texture
     lighting_source    the GLSL text of the lighting pass
     polygon_source     the part of it that integrates over lights
+    spread_source      the same over lights with a spread, by disk_parts_source
     lighting           the pass itself: compiles, uploads, draws
-    composite          split view and false-color difference of two pictures
+    surface_source     the GLSL text that draws surfaces; surface_inputs and surface_lobes are parts of it
+    surface_pass       the pass that draws them into a G-buffer
+    scene_mirror       meshes, materials and lights, kept in step with the scene
+    picture_pass       split view and false-color difference of two pictures
+    view_renderer      all of it for one view
 
 Shaders are given as create infos, with explicit types and no storage buffers, for OpenGL, Vulkan and Metal alike.
 """

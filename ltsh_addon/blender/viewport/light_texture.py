@@ -1,7 +1,7 @@
 """Area lights as one texture of RGBA32F texels, for any number of lights of any shape.
 
-A corner of a light is center + s * half_u + t * half_v. First come lists of corners s, t that lights share, then
-`HEADER` texels per light, then corners and receivers of single lights. The header:
+A corner of a light is center + s * half_u + t * half_v. First come lists of corners s, t that lights share, nodes and
+weights of quadratures over cones, then `HEADER` texels per light, then corners and receivers of single lights. Headers:
 
     0   center; texel of the first corner
     1   half_u; number of corners, 0: chosen per pixel from the circles
@@ -40,11 +40,24 @@ def _circle(count):
 # see more than these, of lights that no horizon cuts, are as exact as with those of `light_polygons`: within 3e-5.
 _FEW_CORNERS, _FEW_LIMITS = (8, 16), (0.3, 1.5)
 _CIRCLES = (*_FEW_CORNERS, *ROUND_CORNERS)
-_SHARED = [_QUAD, *(_circle(count) for count in _CIRCLES)]
-QUAD_FIRST, *_CIRCLE_FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
+_NODES = tuple(sorted({effort.layers for effort in light_cone.EFFORTS}))
+_SHARED = [
+    _QUAD,
+    *(_circle(count) for count in _CIRCLES),
+    *(np.stack(light_cone.gauss_legendre(count), axis=1) for count in _NODES),
+]
+_FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
+QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
+# Texel of the first node by the number of nodes.
+NODES_FIRST = dict(zip(_NODES, _FIRST[1 + len(_CIRCLES) :], strict=True))
 FIRST_LIGHT = sum(len(part) for part in _SHARED)
 # Texel of the first corner, number of corners, and up to which reach in units of the lobe's width they are taken.
 ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, (*_FEW_LIMITS, *ROUND_LIMITS, np.inf), strict=True))
+
+
+def circle_first(count: int) -> int:
+    """Texel of the first of `count` corners of a circle."""
+    return _CIRCLE_FIRST[_CIRCLES.index(count)]
 
 
 def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:

@@ -20,6 +20,7 @@ from .lighting_source import VERTEX, Features, fragment_source
 from .table_texture import dielectric_texels, table_texels
 
 PASSES = ("specular", "diffuse", "combined")
+MOST_LOOPS = 40000
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _GBUFFER_SAMPLERS = {
     "positions": "position",
@@ -71,7 +72,8 @@ class LightingPass:
         texels = light_texels(lights)
         if self._light_values is None or not np.array_equal(texels, self._light_values):
             self._light_values, self._lights = texels, float_texture(texels)
-        self._light_count = len(lights)
+        self._shares = _shares([_loops(light) for light in lights])
+        self._has_focused = any(light.is_focused for light in lights)
 
     def draw(
         self,
@@ -101,6 +103,7 @@ class LightingPass:
             diffuse=passes != "specular",
             geometric=passes != "diffuse" and gbuffer.geometric_normal is not None,
             bumped=passes != "specular" and gbuffer.diffuse_normal is not None,
+            focused=self._has_focused,
         )
         if target is None:
             self._draw(features, gbuffer, view, (x, y, width, height), add)
@@ -120,8 +123,10 @@ class LightingPass:
                 shader.uniform_sampler(name, self._texture(name, gbuffer))
             if features.specular:
                 shader.uniform_float("view", view)
-            shader.uniform_int("place", (x, y, self._light_count, 0))
-            batch.draw(shader)
+            for first, end in self._shares:
+                shader.uniform_int("place", (x, y, first, end))
+                batch.draw(shader)
+                gpu.state.blend_set("ADDITIVE")
         finally:
             gpu.state.viewport_set(*previous[0])
             gpu.state.blend_set(previous[1])
@@ -139,6 +144,21 @@ class LightingPass:
             batch = batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
             found = self._shaders[features] = shader, batch, samplers
         return found
+
+
+def _loops(light: AreaLight) -> int:
+    """About how many times the loops over a light's corners go round at the most."""
+    if light.is_focused:
+        return 16000 if light.is_round else 2000
+    return 2500 if light.is_round else 10 * len(light.polygon())
+
+
+def _shares(loops: Sequence[int]) -> list[tuple[int, int]]:
+    """The lights (first, end) of each draw call: llvmpipe breaks off the loops of a pixel that go round more than
+    65535 times, and other cards do not like long ones. The first call is there without lights, too."""
+    number = np.cumsum([0, *loops[:-1]]) // MOST_LOOPS if len(loops) else np.zeros(0)
+    starts = [0, *(np.nonzero(np.diff(number))[0] + 1).tolist(), len(loops)]
+    return list(zip(starts[:-1], starts[1:], strict=True))
 
 
 def _create_info(table, features):

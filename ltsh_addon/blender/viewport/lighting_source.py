@@ -6,6 +6,7 @@ Formulas and their sources stand in `shading`.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,9 @@ from ...shading.table_header import moment_lines, shared_text
 from ...shading.table_header.literals import float_literal
 from . import light_texture, specular_text
 from . import lighting_text as text
+from .disk_parts_source import spread_text
 from .polygon_source import integral_function
+from .spread_source import spread_function
 from .table_texture import IOR_STEPS
 
 VERTEX = """\
@@ -36,6 +39,7 @@ class Features:
     diffuse: bool
     geometric: bool  # a horizon of its own for the specular lobe
     bumped: bool  # diffuse and smooth normals of their own
+    focused: bool = False  # lights with a spread
 
 
 def fragment_source(table: LookupTable, features: Features) -> str:
@@ -46,17 +50,36 @@ def fragment_source(table: LookupTable, features: Features) -> str:
         )
     lights = text.LIGHTS.replace("@ROUND_LEVELS@", _round_levels())
     parts = ["#define LTSH_GLSL 1", shared_text(), _constants(table), lights]
+    if features.focused:
+        parts.append(spread_text())
     if features.specular:
-        is_cosine = table.family == "ltc"
-        parts += [specular_text.COSINE_SUM if is_cosine else _moment_sum(table), specular_text.SPECULAR_LOBE]
-        parts += [_heights("specular", "warped.z", is_cosine + features.geometric)]
-        parts += [integral_function("specular", 1 + is_cosine + features.geometric)]
-        parts += [_lookup(table), _specular_setup(is_cosine, features.geometric), specular_text.SPECULAR]
+        parts += _specular_parts(table, features)
     if features.diffuse:
-        parts += [text.DIFFUSE_LOBE, _heights("diffuse", "dot(lobe.plane_0, v)", int(features.bumped))]
-        parts += [integral_function("diffuse", 1 + features.bumped)]
-        parts += [text.BUMPED if features.bumped else text.PLAIN]
+        parts += _diffuse_parts(features)
     return "\n".join([*parts, _main(features)])
+
+
+def _specular_parts(table, features) -> list[str]:
+    is_cosine = table.family == "ltc"
+    horizons = 1 + is_cosine + features.geometric
+    # A tilt turns around the second axis of the frame, and so does the horizon.
+    seam = "lobe.row_y" if is_cosine else None
+    parts = [specular_text.COSINE_SUM if is_cosine else _moment_sum(table), specular_text.SPECULAR_LOBE]
+    parts += [_heights("specular", "warped.z", horizons - 1), integral_function("specular", horizons, seam)]
+    parts += [_lookup(table), _specular_setup(is_cosine, features.geometric), specular_text.SPECULAR]
+    if features.focused:
+        values = "specular_values(weights, sum)"
+        parts.append(spread_function("specular", "specular_weights weights, ", values, "mat3(1.0)"))
+    return parts
+
+
+def _diffuse_parts(features) -> list[str]:
+    parts = [text.DIFFUSE_LOBE, _heights("diffuse", "dot(lobe.plane_0, v)", int(features.bumped))]
+    parts += [integral_function("diffuse", 1 + features.bumped), text.BUMPED if features.bumped else text.PLAIN]
+    if features.focused:
+        value = "vec4(diffuse_form_factor(lobe, sum), 0.0, 0.0, 0.0)"
+        parts += [text.DIFFUSE_FRAME, spread_function("diffuse", "", value, "diffuse_frame(lobe)")]
+    return parts
 
 
 def _constants(table) -> str:
@@ -92,7 +115,8 @@ def _heights(name, first, more) -> str:
 
 def _moment_sum(table) -> str:
     lines = "\n".join(line[4:] for line in moment_lines(table.degree))
-    return specular_text.MOMENT_SUM.replace("@MOMENT_LINES@", lines)
+    spots = re.sub(r"ltsh_edge_moment\(edge, (.*)\);", r"solid_angle * ltsh_spot_moment(direction, \1);", lines)
+    return specular_text.MOMENT_SUM.replace("@MOMENT_LINES@", lines).replace("@SPOT_LINES@", spots)
 
 
 def _lookup(table) -> str:
@@ -141,6 +165,7 @@ def _specular_setup(is_cosine, geometric) -> str:
 def _main(features) -> str:
     source = text.MAIN
     pieces = {
+        "IS_FOCUSED": "ltsh_light_texel(header + 5).x > 0.0" if features.focused else "false",
         "READ_FRESNEL": text.READ_FRESNEL if features.specular else "",
         "READ_GEOMETRIC": "texelFetch(geometric_normals, texel, 0).xyz" if features.geometric else "point.normal",
         "SPECULAR_SETUP": text.SETUP_SPECULAR if features.specular else "",
@@ -148,6 +173,8 @@ def _main(features) -> str:
         "SPECULAR": text.ADD_SPECULAR if features.specular else "",
         "DIFFUSE": text.ADD_DIFFUSE if features.diffuse else "",
     }
+    pieces["SPECULAR_FOCUSED"] = text.SPECULAR_FOCUSED if features.focused else ""
+    pieces["DIFFUSE_FOCUSED"] = text.DIFFUSE_FOCUSED if features.focused else ""
     for name, piece in pieces.items():
         source = source.replace(f"@{name}@", piece)
     return source

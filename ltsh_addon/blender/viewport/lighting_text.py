@@ -8,7 +8,7 @@ LIGHTS = """\
    where no horizon cuts it. */
 struct ltsh_light {
     vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; int whole_first; int whole_count;
-    float bound;
+    float bound; bool is_round;
 };
 /* What is read of the surface point of a pixel. */
 struct ltsh_point {
@@ -42,7 +42,8 @@ ltsh_light ltsh_seen_light(int header, vec3 position, float width)
     float wide = reach / (max(max(abs(dot(light.offset, light.direction)), beyond), 1e-12 * reach) * width);
     light.first = int(center.w);
     light.count = int(half_u.w);
-    bool round = light.count == 0;
+    light.is_round = light.count == 0;
+    bool round = light.is_round;
 @ROUND_LEVELS@
     return light;
 }
@@ -79,6 +80,12 @@ diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 {
     ltsh_edge edge = ltsh_edge_between(start, end);
     sum.total += edge.phi * edge.normal;
+    return sum;
+}
+
+diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle)
+{
+    sum.total += 2.0 * solid_angle * direction;
     return sum;
 }
 """
@@ -142,11 +149,12 @@ void main()
     vec3 radiance = vec3(0.0);
 @SPECULAR_SETUP@
 @DIFFUSE_SETUP@
-    int count = here ? place.z : 0;
-    for (int i = 0; i < count; ++i) {
+    int end = here ? place.w : 0;
+    for (int i = place.z; i < end; ++i) {
         int header = LTSH_FIRST_LIGHT + i * LTSH_LIGHT_HEADER;
         int flags = int(ltsh_light_texel(header + 2).w);
         bool received = ltsh_receives(header, point);
+        bool focused = @IS_FOCUSED@;
         vec3 reflected = vec3(0.0);
 @SPECULAR@
 @DIFFUSE@
@@ -166,17 +174,40 @@ SETUP_SPECULAR = """\
 ADD_SPECULAR = """\
         ltsh_light shining = ltsh_seen_light(header, point.position, weights.width);
         bool shines = received && glossy && (flags & LTSH_SPECULAR_FLAG) != 0;
-        shining.count = shines ? shining.count : 0;
-        shining.whole_count = shines ? shining.whole_count : 0;
-        reflected += ltsh_reflected(point, weights, specular_integral(shine, shining));
+        shining.count = shines && !focused ? shining.count : 0;
+        shining.whole_count = shines && !focused ? shining.whole_count : 0;
+        vec4 values = specular_values(weights, specular_integral(shine, shining));
+@SPECULAR_FOCUSED@
+        reflected += ltsh_reflected(point, values);
+"""
+
+SPECULAR_FOCUSED = """\
+        shining = ltsh_seen_light(header, point.position, weights.width);
+        values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
 """
 
 ADD_DIFFUSE = """\
         ltsh_light lighting = ltsh_seen_light(header, point.position, 1.0);
         bool lights_up = received && (flags & LTSH_DIFFUSE_FLAG) != 0;
-        lighting.count = lights_up ? lighting.count : 0;
-        lighting.whole_count = lights_up ? lighting.whole_count : 0;
-        reflected += base.xyz * diffuse_form_factor(matte, diffuse_integral(matte, lighting));
+        lighting.count = lights_up && !focused ? lighting.count : 0;
+        lighting.whole_count = lights_up && !focused ? lighting.whole_count : 0;
+        float form_factor = diffuse_form_factor(matte, diffuse_integral(matte, lighting));
+@DIFFUSE_FOCUSED@
+        reflected += form_factor * base.xyz;
+"""
+
+DIFFUSE_FOCUSED = """\
+        lighting = ltsh_seen_light(header, point.position, 1.0);
+        form_factor += diffuse_focused(matte, lighting, header, 1.0, lights_up && focused).x;
+"""
+
+# Coordinates around the diffuse normal.
+DIFFUSE_FRAME = """\
+mat3 diffuse_frame(diffuse_lobe lobe)
+{
+    ltsh_frame frame = ltsh_make_frame(lobe.plane_0, lobe.plane_0);
+    return transpose(mat3(frame.tangent, frame.bitangent, frame.normal));
+}
 """
 
 READ_FRESNEL = """\

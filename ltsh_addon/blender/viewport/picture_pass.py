@@ -26,6 +26,7 @@ void main()
   ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
   vec4 first = texelFetch(first_picture, texel, 0);
   vec4 second = texelFetch(second_picture, texel, 0);
+  second.a = min(first.a, second.a);
   color = over_background(first);
   if (place.z == 1) {
     float beyond = float(texel.x) + 0.5 - scales.z;
@@ -36,7 +37,7 @@ void main()
     float difference = dot(first.rgb - second.rgb, vec3(1.0 / 3.0)) * scales.x / scales.y;
     float strength = clamp(abs(difference), 0.0, 1.0);
     vec3 side = difference > 0.0 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 0.0, 1.0);
-    color = first.a > 0.0 ? vec4(mix(vec3(1.0), side, strength), 1.0) : vec4(vec3(0.2), 1.0);
+    color = vec4((second.a > 0.0 ? mix(vec3(1.0), side, strength) : vec3(0.2)) * white, 1.0);
   }
 }
 """
@@ -52,6 +53,7 @@ class PicturePass:
         info.push_constant("IVEC4", "place")
         info.push_constant("VEC4", "scales")
         info.push_constant("VEC4", "background")
+        info.push_constant("FLOAT", "white")
         info.sampler(0, "FLOAT_2D", "first_picture")
         info.sampler(1, "FLOAT_2D", "second_picture")
         info.vertex_source(_VERTEX)
@@ -72,9 +74,11 @@ class PicturePass:
         split: float = 0.5,
         difference_scale: float = 1.0,
         line_width: float = 1.0,
+        white: float = 1.0,
     ) -> None:
         """Fill `rect` (x, y, width, height) of what is bound, scene-linear, from pictures RGBA with alpha 1 where they
-        show a surface. `mode` is one of MODES; `split` is the place of the line between 0 and 1."""
+        show a surface. `mode` is one of MODES; `split` is the place of the line between 0 and 1, `white` the
+        brightness of no difference."""
         x, y, width, height = rect
         gpu.state.viewport_set(x, y, width, height)
         gpu.state.blend_set("NONE")
@@ -88,4 +92,5 @@ class PicturePass:
         shader.uniform_float("scales", (exposure, difference_scale, split * width, 0.5 * line_width))
         behind = (0.0, 0.0, 0.0) if transparent else [exposure * float(value) for value in background]
         shader.uniform_float("background", (*behind, 0.0 if transparent else 1.0))
+        shader.uniform_float("white", white)
         self._batch.draw(shader)

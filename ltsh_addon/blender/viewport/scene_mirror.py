@@ -9,10 +9,10 @@ import numpy as np
 from mathutils import Matrix
 
 from ...scene import AreaLight
-from ..inventory import SURFACE_TYPES
-from ..light_linking import Receivers
-from ..surface_looks import Look, look_of
-from ..world_look import world_radiance
+from ..lights.light_linking import Receivers
+from ..materials.surface_looks import Look, look_of
+from ..materials.world_look import world_radiance
+from ..pixels.inventory import SURFACE_TYPES
 from .mesh_batches import MeshBatches, mesh_batches
 from .surface_uniforms import look_values, uniform_buffer
 from .view_lights import view_lights

@@ -18,6 +18,12 @@ specular_sum specular_with_edge(specular_sum sum, vec3 start, vec3 end)
     return sum;
 }
 
+specular_sum specular_with_spot(specular_sum sum, vec3 direction, float solid_angle)
+{
+    sum.values[0] += 2.0 * solid_angle * direction.z;
+    return sum;
+}
+
 specular_sum specular_finished(specular_sum sum)
 {
     sum.values[0] *= 0.5 * LTSH_ONE_OVER_PI;
@@ -26,7 +32,7 @@ specular_sum specular_finished(specular_sum sum)
 """
 
 MOMENT_SUM = """\
-/* Moments of a polygon; the first, the solid angle, is twice the argument of the complex number `turn`. */
+/* Moments of a polygon; to the first, the solid angle, comes twice the argument of the complex number `turn`. */
 struct specular_sum { float values[LTSH_COEFFICIENTS]; vec2 turn; };
 
 specular_sum specular_empty()
@@ -51,9 +57,26 @@ specular_sum specular_with_edge(specular_sum moments, vec3 start, vec3 end)
     return moments;
 }
 
+/* What moments integrate: where an edge adds K_{n-1} of `edge_integrals`, (n + 1) x^n - (n - 1) |u|^2 x^(n-2). */
+float ltsh_spot_moment(vec3 direction, float u_x, float u_z, int k)
+{
+    float x = u_x * direction.x + u_z * direction.z;
+    float squared = u_x * u_x + u_z * u_z;
+    return k == 0 ? 2.0 * x
+        : (k == 1 ? 3.0 * x * x - squared
+                  : (k == 2 ? 2.0 * x * (2.0 * x * x - squared) : x * x * (5.0 * x * x - 3.0 * squared)));
+}
+
+specular_sum specular_with_spot(specular_sum moments, vec3 direction, float solid_angle)
+{
+    moments.values[0] += solid_angle;
+@SPOT_LINES@
+    return moments;
+}
+
 specular_sum specular_finished(specular_sum sum)
 {
-    sum.values[0] = 2.0 * atan(sum.turn.y, sum.turn.x);
+    sum.values[0] += 2.0 * atan(sum.turn.y, sum.turn.x);
     return sum;
 }
 """
@@ -155,7 +178,7 @@ ltsh_cell specular_cell(ltsh_point point)
 {
     ltsh_frame frame = ltsh_make_frame(point.normal, point.view);
     float cosine = ltsh_clamped(dot(point.normal, point.view), 1.0);
-    float sine = ltsh_clamped(dot(frame.tangent, point.view), 1.0);
+    float sine = ltsh_clamped(dot(frame.tangent, point.view - point.normal), 1.0);
     return ltsh_make_cell_at(cosine, sine, point.roughness, LTSH_ROWS, LTSH_COLUMNS);
 }
 
@@ -187,13 +210,23 @@ float ltsh_product(float weights[LTSH_COEFFICIENTS], specular_sum sum)
     return max(-product, 0.0);
 }
 
-vec3 ltsh_reflected(ltsh_point point, specular_weights weights, specular_sum sum)
+/* Integrals of the plain, the Schlick, the dip and the dielectric term. */
+vec4 specular_values(specular_weights weights, specular_sum sum)
 {
     sum = specular_finished(sum);
-    vec3 reflected = point.f0.xyz * ltsh_product(weights.plain, sum);
-    reflected += (point.f90.xyz - point.f0.xyz) * ltsh_product(weights.schlick, sum);
-    reflected -= vec3(point.f0.w, point.f90.w, point.dielectric.w) * ltsh_product(weights.dip, sum);
-    reflected += point.dielectric.xyz * ltsh_product(weights.dielectric, sum);
+    return vec4(
+        ltsh_product(weights.plain, sum),
+        ltsh_product(weights.schlick, sum),
+        ltsh_product(weights.dip, sum),
+        ltsh_product(weights.dielectric, sum)
+    );
+}
+
+vec3 ltsh_reflected(ltsh_point point, vec4 values)
+{
+    vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;
+    reflected -= vec3(point.f0.w, point.f90.w, point.dielectric.w) * values.z;
+    reflected += point.dielectric.xyz * values.w;
     return max(reflected, vec3(0.0));
 }
 """

@@ -8,7 +8,8 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from ..surface_looks import IMAGE_SLOTS
+from ..materials.surface_looks import IMAGE_SLOTS
+from . import surface_inputs, surface_lobes
 from . import surface_source as source
 from .gbuffer_textures import GBufferTextures, float_texture
 from .scene_mirror import ShownInstance, ShownLook
@@ -178,4 +179,4 @@ def _fragment_source(outputs) -> str:
     if outputs == EMISSION:
         return source.EMISSION_FRAGMENT
     end = source.FRAGMENT_OF_SURFACES if outputs == SURFACES else source.FRAGMENT_OF_NORMALS
-    return source.IMAGES + source.REFLECTANCE + source.NORMALS + source.FRAGMENT + end
+    return surface_inputs.IMAGES + surface_lobes.REFLECTANCE + surface_inputs.NORMALS + source.FRAGMENT + end

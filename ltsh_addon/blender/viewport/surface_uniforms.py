@@ -5,10 +5,10 @@ from __future__ import annotations
 import gpu
 import numpy as np
 
-from .. import reflectance
-from ..aovs import LOBE_KINDS
-from ..linear_values import EXTENSIONS, Value
-from ..surface_looks import IMAGE_SLOTS, Look
+from ..materials import reflectance
+from ..materials.aovs import LOBE_KINDS
+from ..materials.linear_values import EXTENSIONS, Value
+from ..materials.surface_looks import IMAGE_SLOTS, Look
 
 # In units of vec4: where slots start, the size of one, where the terms of conductors start, the size of all.
 FIRST_SLOT, SLOT_SIZE = 3, 6

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 
 from ...scene import AreaLight
-from ..emission_nodes import Emission, emission_behind
-from ..inventory import SURFACE_TYPES, EmitterTraits
-from ..light_linking import Receivers
-from ..lights import area_light, reason_to_leave_out
-from ..mesh_light_faces import constant_mesh_lights
-from ..mesh_lights import collect_mesh_lights
-from ..node_sources import source_of
-from ..node_values import value_at
-from ..shader_graph import material_output
-from ..surface_looks import look_of
+from ..lights.area_lights import area_light, note_unsupported, reason_to_leave_out
+from ..lights.emission_nodes import Emission, emission_behind
+from ..lights.light_linking import Receivers
+from ..lights.mesh_light_faces import constant_mesh_lights
+from ..lights.mesh_lights import collect_mesh_lights
+from ..materials.node_sources import source_of
+from ..materials.node_values import value_at
+from ..materials.shader_graph import material_output
+from ..materials.surface_looks import look_of
+from ..pixels.inventory import SURFACE_TYPES, EmitterTraits
 
 # Where nothing says on which side of closed emissive meshes the eye is, it is outside.
 FAR_AWAY = np.full(3, 1e6)
@@ -44,6 +45,7 @@ def view_lights(depsgraph, in_view: Callable) -> tuple[tuple[AreaLight, ...], tu
         light = _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), ob.data, notes)
         if np.any(light.radiance != 0.0):
             lights.append(light)
+            note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
     if emits:
         lights.extend(_mesh_lights(depsgraph, receivers, notes))
     return tuple(lights), tuple(dict.fromkeys(notes))

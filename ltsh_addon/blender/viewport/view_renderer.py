@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import gpu
 import numpy as np
 
-from ..linear_values import Value
+from ..materials.linear_values import Value
 from .gbuffer_textures import GBufferTextures
 from .lighting import LightingPass
 from .picture_pass import PicturePass
@@ -31,6 +31,8 @@ class ShownPicture:
     exposure: float
     transparent: bool
     line_width: float = 1.0
+    second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
+    white: float = 1.0  # what the false colors' white is before the scene's own exposure
 
 
 class ViewRenderer:
@@ -47,10 +49,10 @@ class ViewRenderer:
     def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
         """Draw the scene into `frame_buffer`, which has `size` pixels."""
         self._draw_surfaces(mirror, view, size)
-        first = self._lit(0, shown.technique, mirror, view, size, shown.passes)
-        second = None
-        if shown.mode != "single":
-            second = self._lit(1, shown.second_technique, mirror, view, size, shown.passes)
+        first = self._lit(0, shown.technique, mirror, view, size, shown)
+        second = shown.second_picture
+        if shown.mode != "single" and second is None:
+            second = self._lit(1, shown.second_technique, mirror, view, size, shown)
         # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
         with frame_buffer.bind():
             self._picture.draw(
@@ -64,6 +66,7 @@ class ViewRenderer:
                 split=shown.split,
                 difference_scale=shown.difference_scale,
                 line_width=shown.line_width,
+                white=shown.white,
             )
 
     def _draw_surfaces(self, mirror, view: View, size) -> None:
@@ -73,7 +76,7 @@ class ViewRenderer:
             self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
             self._drawn = drawn
 
-    def _lit(self, number: int, technique: str, mirror, view: View, size, passes: str):
+    def _lit(self, number: int, technique: str, mirror, view: View, size, shown: ShownPicture):
         lighting = self._lighting.get(technique)
         if lighting is None:
             lighting = self._lighting[technique] = LightingPass(technique)
@@ -81,8 +84,8 @@ class ViewRenderer:
         lighting.set_lights(mirror.lights)
         texture, buffer = self._target(number, size)
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
-        lighting.draw(self._gbuffer, buffer, passes, **place)
-        if passes == "combined":
+        lighting.draw(self._gbuffer, buffer, shown.passes, **place)
+        if shown.passes == "combined" and shown.second_picture is None:
             self._surfaces.add_emission(mirror.instances, view, size, buffer)
         return texture
 

@@ -97,8 +97,10 @@ LTSH_FUNCTION ltsh_vec3 ltsh_unit(ltsh_vec3 v)
 LTSH_FUNCTION ltsh_frame ltsh_make_frame(ltsh_vec3 normal, ltsh_vec3 view)
 {
     ltsh_frame frame;
-    ltsh_vec3 across = ltsh_add_scaled(view, -ltsh_dot(normal, view), normal);
-    if (ltsh_dot(across, across) < 1e-8f) {
+    /* The difference of vectors that are close is exact, and so is what it has across the normal. */
+    ltsh_vec3 across = ltsh_add_scaled(view, -1.0f, normal);
+    across = ltsh_add_scaled(across, -ltsh_dot(normal, across), normal);
+    if (ltsh_dot(across, across) < 1e-14f) {
         /* View and normal coincide: any tangent serves. */
         across = normal.x * normal.x < 0.5f ? ltsh_make_vec3(1.0f, 0.0f, 0.0f) : ltsh_make_vec3(0.0f, 1.0f, 0.0f);
         across = ltsh_add_scaled(across, -ltsh_dot(normal, across), normal);

@@ -1,0 +1,136 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//
+// A Flamenco 3 job type: bakes, comparisons or shadings by LTSH, in as many tasks as there are shards, and a last task
+// that merges them. README.md in this folder says how to install and submit it.
+
+const JOB_TYPE = {
+    label: "LTSH Bake",
+    description: "Bake, compare or shade with LTSH: a task for each shard, then one that merges",
+    settings: [
+        {
+            key: "command", label: "What", type: "string", choices: ["bake", "compare", "shade"], default: "bake",
+            required: true,
+            description: "bake: textures of objects; compare: pictures beside Cycles; shade: pictures alone",
+        },
+        {
+            key: "output", label: "Output Folder", type: "string", subtype: "dir_path", required: true,
+            eval: "str(Path(bpy.data.filepath).with_name('ltsh') / settings.command)",
+            evalInfo: { showButton: true, description: "The folder ltsh beside the file" },
+            description: "Folder that all workers see under the same path; one job, one folder",
+        },
+        {
+            key: "shards", label: "Shards", type: "int32", default: 4, required: true, propargs: { min: 1, max: 1000 },
+            description: "In how many tasks the frames and objects are split; more than there are do no harm",
+        },
+        {
+            key: "frames", label: "Frames", type: "string", default: "",
+            eval: "str(C.scene.frame_current)",
+            evalInfo: { showButton: true, description: "The current frame" },
+            description: "Such as 12 or 1-240:2,300; empty: the frame that the file was saved at",
+        },
+        {
+            key: "techniques", label: "Techniques", type: "string", default: "ltsh4",
+            description: "Some of ltc, ltsh2, ltsh4, reference, separated by commas",
+        },
+        {
+            key: "passes", label: "Passes", type: "string", default: "specular,diffuse",
+            description: "Some of specular, diffuse and, of a bake, diffuse_light, combined",
+        },
+        {
+            key: "objects", label: "Objects", type: "string", default: "",
+            description: "Bake: names separated by semicolons; empty: all meshes that render",
+        },
+        {
+            key: "size", label: "Texture Size", type: "int32", default: 1024, propargs: { min: 64, max: 8192 },
+            description: "Bake: texels on a side",
+        },
+        {
+            key: "error", label: "Beside Cycles", type: "bool", default: false,
+            description: "Bake: also Cycles' own bake, and the signed errors",
+        },
+        {
+            key: "apply", label: "Apply", type: "bool", default: false,
+            description: "Bake: also a copy of the .blend whose materials show the textures",
+        },
+        {
+            key: "cycles_samples", label: "Cycles Samples", type: "int32", default: 512, propargs: { min: 2 },
+            description: "Of both halves of the Cycles reference together, where there is one",
+        },
+        {
+            key: "arguments", label: "Further Arguments", type: "string", default: "",
+            description: "Other options of the command, separated by spaces, such as --aa 16 --resolution 960x540",
+        },
+        {
+            key: "blendfile", label: "Scene", type: "string", required: true, visible: "web",
+            description: "The .blend",
+        },
+        { key: "blender", label: "Blender", type: "string", default: "{blender}", visible: "hidden" },
+    ],
+};
+
+// Called by Flamenco Manager.
+function compileJob(job) {
+    const settings = job.settings;
+    checkSettings(settings);
+    const mergeTask = ltshTask("merge", settings, ["merge", settings.output]);
+    const shared = sharedArguments(settings);
+    for (let number = 1; number <= settings.shards; number++) {
+        const shard = number + "/" + settings.shards;
+        // A task that is done again, on this worker or another, keeps what it had finished.
+        const task = ltshTask(settings.command + "-" + number, settings, shared.concat(["--shard", shard, "--resume"]));
+        mergeTask.addDependency(task);
+        job.addTask(task);
+    }
+    job.addTask(mergeTask);
+}
+
+function checkSettings(settings) {
+    for (const key of ["blendfile", "output"]) {
+        if (!settings[key]) {
+            throw new Error(key + " is empty, expected a path that all workers see");
+        }
+    }
+    if (!(settings.shards >= 1)) {
+        throw new Error("shards is " + settings.shards + ", expected 1 or more");
+    }
+}
+
+// `blender --command ltsh ...`: it ends with a code other than 0 where something failed, which fails the task.
+function ltshTask(name, settings, args) {
+    const task = author.Task(name, "blender");
+    task.addCommand(author.Command("exec", {
+        exe: settings.blender || "{blender}",
+        args: ["--command", "ltsh"].concat(args),
+    }));
+    return task;
+}
+
+function sharedArguments(settings) {
+    const baking = settings.command === "bake";
+    const args = [settings.command, settings.blendfile, "-o", settings.output];
+    for (const key of ["techniques", "passes", "frames"]) {
+        // With = also a first frame below 0 is a value, not an option.
+        if (settings[key]) {
+            args.push("--" + key + "=" + settings[key]);
+        }
+    }
+    if (baking) {
+        args.push("--size", String(settings.size));
+        for (const name of names(settings.objects)) {
+            args.push("--object=" + name);
+        }
+        for (const key of ["error", "apply"]) {
+            if (settings[key]) {
+                args.push("--" + key);
+            }
+        }
+    }
+    if (settings.command === "compare" || (baking && settings.error)) {
+        args.push("--cycles-samples", String(settings.cycles_samples));
+    }
+    return args.concat((settings.arguments || "").split(/\s+/).filter((word) => word !== ""));
+}
+
+function names(text) {
+    return (text || "").split(";").map((name) => name.trim()).filter((name) => name !== "");
+}

@@ -1,0 +1,1 @@
+"""Lighting baked into textures: objects, texels, errors, the files of a bake."""

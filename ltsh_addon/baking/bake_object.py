@@ -1,0 +1,274 @@
+"""One object of a bake: its texels shaded block by block on all cores, and the files written."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from .. import shading
+from ..comparison import compare
+from ..scene import Cancelled, SurfaceSamples
+from ..shading.workers import cores
+from .bake_errors import ErrorPictures, ErrorSums
+from .bake_planes import Planes
+
+# Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
+BLOCK_TEXELS = 1 << 18
+
+
+def block_rows(options) -> int:
+    return max(1, min(options.height, BLOCK_TEXELS // options.width))
+
+
+def shaded_passes(options) -> set[str]:
+    """Passes of `shading.shade` that the wanted ones are made of."""
+    wanted = set(options.passes)
+    if "combined" in wanted:
+        wanted |= {"specular", "diffuse"}
+    return wanted & {"specular", "diffuse"}
+
+
+class ObjectBaker:
+    """Bakes all tiles of one object, or only `tile`, block of rows by block of rows from the top."""
+
+    def __init__(self, options, tables, lights, manifest, record, folder, tile=None):
+        from ..blender.texels import texel_samples, uv_raster, uv_seams
+
+        self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
+        self.mesh = texel_samples.TexelMesh.load(folder / "mesh.npz")
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [
+            texel_samples.BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]
+        ]
+        self.view = texel_samples.BakeView(**manifest["view"])
+        self.manifest = manifest
+        self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
+        self.tiles, self.area = uv_raster.tiles_of(self.mesh.uv)
+        self.wanted = self.tiles if tile is None else [tile]
+        self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
+        if not options.cycles_samples:
+            self.compared = ()
+        self._sample, self._raster = texel_samples.texel_samples, uv_raster.UvTriangles
+        self._seams = uv_seams.UvSeams.of
+
+    def bake(self, stem: str, records, files: list[str], seconds: dict, progress) -> dict:
+        """Write the files of the object that are not finished according to `records` (bake.TileRecords), add all to
+        `files`; the object's record for the report."""
+        name = self.record["name"]
+        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        for tile in self.wanted:
+            file = f"{stem}{self._suffix(tile)}.exr"
+            start = time.perf_counter()
+            record = records.take(name, tile, file)
+            if record is None:
+                found, written = self._tile(tile, stem, progress)
+                record = records.write(name, tile, stem, written, found)
+            seconds[file] = time.perf_counter() - start
+            files += record["files"]
+            found = record["report"]
+            result["tiles"][str(tile)] = {"file": file, **found}
+            if self.area > 0.0:
+                baked = found["covered_times"] / (self.options.width * self.options.height)
+                result["outside"] = max(0.0, 1.0 - baked / self.area)
+        return result
+
+    def _suffix(self, tile) -> str:
+        return "" if len(self.tiles) == 1 else f".{tile}"
+
+    def _tile(self, tile, stem, progress):
+        """Write the files of one tile; its record and their names."""
+        options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
+        path = options.output / file
+        errors, written = ErrorSums(), [file]
+        with self._planes(tile) as planes:
+            record = self._shade(tile, planes, errors, progress)
+            pictures = None
+            if self.compared:
+                size = options.width, options.height
+                pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
+                named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
+                record |= {"pictures": named, "errors": errors.report()}
+                written += named
+            texture = None
+            if options.apply:
+                layer = applied_layer(options)
+                record["texture"] = f"{stem}.{layer}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], layer
+                written.append(record["texture"])
+            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+        return record, written
+
+    def _planes(self, tile) -> Planes:
+        options, seams = self.options, None
+        size = options.width, options.height
+        if options.margin_type == "adjacent" and options.margin > 0:
+            seams = self._seams(self.mesh.uv, self.mesh.vertices, *size, _place(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *size, seams)
+
+    def _shade(self, tile, planes, errors, progress) -> dict:
+        """Shade a tile block by block into `planes`; how many texels there were."""
+        options, covered, covers, overlaps = self.options, 0, 0, 0
+        rows = block_rows(options)
+        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, _place(tile))
+
+        def shaded(first):
+            texels = triangles.texels(first, min(rows, options.height - first), options.conservative)
+            return first, texels, *self._block(tile, first, texels)
+
+        firsts = range(0, options.height, rows)
+        for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
+            covered += len(texels.index)
+            covers += texels.covers
+            overlaps += texels.overlaps
+            planes.put(first, min(rows, options.height - first), texels, values)
+            self._sum_up(errors, values, halves)
+            share = (number + 1) / len(firsts)
+            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
+                raise Cancelled("the bake was stopped")
+        return {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+
+    def _threads(self) -> int:
+        """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
+        return 1 if shading.REFERENCE in self.tables.values() else cores()
+
+    def channels(self) -> list[str]:
+        """Names of the channels of the EXR but for the coverage."""
+        layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
+        if len(self.groups) > 1:
+            names = [group or "ungrouped" for group in self.groups]
+            layers += [f"{layer}@{group}" for layer in layers for group in names]
+        for pass_name in self.compared:
+            layers += [f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")]
+            layers += [f"error_{name}.{pass_name}" for name in self.tables]
+        return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
+
+    def _block(self, tile, first, texels) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Values (Q,) of the channels at the texels (Q) of a block, and Cycles' halves (2, Q, 3) by pass."""
+        maps = None
+        if self.record["maps"]:
+            maps = np.load(self.folder / f"maps_{tile}_{first}.npy")
+
+        def read_map(number):
+            return maps[number].reshape(-1, 3)[texels.index]
+
+        receiver = self.record["receiver"]
+        samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
+        values = {}
+        for name, table in self.tables.items():
+            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table).items():
+                groups = [("", radiance.sum(axis=0))]
+                if len(self.groups) > 1:
+                    groups += [
+                        (f"@{group or 'ungrouped'}", part) for group, part in zip(self.groups, radiance, strict=True)
+                    ]
+                for suffix, image in groups:
+                    _put(values, f"{name}.{pass_name}{suffix}", image)
+        return values, self._compare(tile, first, texels, values)
+
+    def _compare(self, tile, first, texels, values) -> dict[str, np.ndarray]:
+        """Add Cycles' bake of the same texels, and what the techniques have more than it; the halves."""
+        halves = {}
+        for pass_name in shaded_passes(self.options) if self.compared else ():
+            baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
+            halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
+        if "combined" in self.compared:
+            halves["combined"] = halves["specular"] + halves["diffuse"]
+        for pass_name in self.compared:
+            a, b = halves[pass_name]
+            mean = 0.5 * (a + b)
+            for image, pixels in (("cycles", mean), ("cycles_A", a), ("cycles_B", b)):
+                _put(values, f"{image}.{pass_name}", pixels)
+            for name in self.tables:
+                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
+                _put(values, f"error_{name}.{pass_name}", shaded - mean)
+
+        return halves
+
+    def _sum_up(self, errors, values, halves) -> None:
+        """Add a block to the sums that errors follow from."""
+        for pass_name in self.compared:
+            errors.add_halves(pass_name, *halves[pass_name])
+            for name in self.tables:
+                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
+                errors.add(name, pass_name, shaded, *halves[pass_name])
+
+    def _passes(self, samples: SurfaceSamples, texel, count, table) -> dict[str, np.ndarray]:
+        """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
+        found = {}
+        wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
+        workers = 1 if self._threads() > 1 else None
+        if wanted:
+            shaded = shading.shade(samples, self.lights, table, passes=wanted, workers=workers)
+            found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
+        if "diffuse_light" in self.options.passes:
+            first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+            white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
+            light = shading.shade(white, self.lights, table, passes=("diffuse",), workers=workers).diffuse
+            found["diffuse_light"] = _summed(light, texel[first], count)
+        if "combined" in self.options.passes:
+            found["combined"] = found["specular"] + found["diffuse"]
+        return {name: found[name] for name in self.options.passes}
+
+    def _metadata(self, tile) -> dict[str, str]:
+        options, view = self.options, self.view
+        vector = ", ".join(f"{value:g}" for value in view.vector)
+        seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
+        return {
+            "ltsh:scene": Path(options.scene).name,
+            "ltsh:object": self.record["name"],
+            "ltsh:uv": self.record["uv"],
+            "ltsh:tile": str(tile),
+            "ltsh:frame": str(self.manifest["frame"]),
+            "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
+            "ltsh:camera": self.manifest["camera"],
+            "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
+            "ltsh:version": compare.versions(self.manifest["blender_version"])["ltsh"],
+        }
+
+
+def _place(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
+
+
+def _in_order(function, items, threads: int):
+    """Yield function(item) in the order of `items`, of which `threads` are worked on at a time."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting, items = deque(), iter(items)
+        try:
+            for item in itertools.islice(items, threads):
+                waiting.append(pool.submit(function, item))
+            while waiting:
+                found = waiting.popleft().result()
+                for item in itertools.islice(items, 1):
+                    waiting.append(pool.submit(function, item))
+                yield found
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def applied_layer(options) -> str:
+    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
+    pass_name = "combined" if "combined" in options.passes else options.passes[0]
+    return f"{next(iter(compare.technique_names(options.techniques)))}.{pass_name}"
+
+
+def _put(values: dict, layer: str, pixels) -> None:
+    """Add the channels of a layer (Q, 3)."""
+    for channel, letter in enumerate("RGB"):
+        values[f"{layer}.{letter}"] = pixels[:, channel]
+
+
+def _summed(radiance, texel, count):
+    """Radiance (G, count, 3) of texels from that of their samples (G, S, 3)."""
+    if len(texel) == count:
+        return radiance
+    first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+    return np.add.reduceat(radiance, first, axis=1)

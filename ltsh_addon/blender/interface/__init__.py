@@ -1,0 +1,1 @@
+"""What artists see: panels, operators, results in the Image Editor, preferences."""

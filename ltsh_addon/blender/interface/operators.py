@@ -1,0 +1,270 @@
+"""Shade, compare and bake from Blender's window: a second process does the work, the window stays free."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+from pathlib import Path
+
+import bpy
+from bpy.app.translations import pgettext_iface as translated
+
+from ..processes.blender_process import SceneError
+from . import job_arguments, preflight, results, viewer
+from .job import Job, clock, new_folder
+
+TIMER_SECONDS = 0.1
+PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
+# What stages of the command line are called here; others keep their names.
+STAGES = {
+    "open scene": "Open Scene",
+    "samples": "Sample Surfaces",
+    "Cycles A": "Cycles, First Half",
+    "Cycles B": "Cycles, Second Half",
+    "write": "Write Files",
+    "images": "Make Pictures",
+}
+_running: dict = {"job": None}
+
+
+def running_job() -> Job | None:
+    """The job that runs now, None where there is none."""
+    return _running["job"]
+
+
+class _JobOperator:
+    """A job, watched by a timer; Esc ends it."""
+
+    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
+    bl_options = {"UNDO"}
+    command = ""
+
+    @classmethod
+    def poll(cls, context):
+        if running_job() is not None:
+            cls.poll_message_set("A job is running: wait for it, or cancel it")
+            return False
+        return context.scene is not None
+
+    def invoke(self, context, event):
+        if not self._begin(context):
+            return {"CANCELLED"}
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
+        manager.modal_handler_add(self)
+        self._show_progress(context)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        """Without a window, from scripts: waits for the end."""
+        self._timer = None
+        if not self._begin(context):
+            return {"CANCELLED"}
+        try:
+            self._job.wait()
+            self._show_results(context)
+            return self._finish(context)
+        except Exception as error:
+            return self._fail(context, error)
+
+    def modal(self, context, event):
+        try:
+            return self._step(context, event)
+        except Exception as error:
+            return self._fail(context, error)
+
+    def _step(self, context, event):
+        job = self._job
+        if running_job() is not job or job.cancelled:  # the button, or another file
+            return self._finish(context)
+        if event.type == "ESC" and event.value == "PRESS":
+            job.cancel()
+            return self._finish(context)
+        if event.type == "TIMER":
+            job.poll()
+            self._show_results(context)
+            if job.finished:
+                return self._finish(context)
+            self._show_progress(context)
+        return {"PASS_THROUGH"}
+
+    def cancel(self, context):
+        """Blender ends the operator: its window was closed."""
+        self._job.cancel()
+        self._finish(context)
+
+    def _fail(self, context, error: Exception):
+        """End the job with one line, whatever happened here; preferences say whether the console gets more."""
+        logging.getLogger(__name__).info("unexpected error", exc_info=error)
+        self._job.cancel()
+        self._job.error = f"{self.bl_label} failed: {' '.join(str(error).split()) or type(error).__name__}"
+        return self._finish(context)
+
+    def _begin(self, context) -> bool:
+        reason = preflight.blocking(context, self.command)
+        if reason:
+            self.report({"ERROR"}, reason)
+            return False
+        folder = new_folder()
+        job = Job(self.bl_label, job_arguments.step_count(context, self.command), folder)
+        try:
+            copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
+            bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, compress=False)
+            self._output = job_arguments.output_folder(context.scene, self.command)
+            job.start(job_arguments.runs(context, self.command, copy))
+        except (RuntimeError, OSError, SceneError) as error:
+            job.remove_folder()
+            self.report({"ERROR"}, " ".join(str(error).split()))
+            return False
+        self._job, self._scene_uid, self._shown, self._progress = job, context.scene.session_uid, 0, None
+        _running["job"] = job
+        return True
+
+    def _show_progress(self, context) -> None:
+        """Draw progress again where it has changed, at most a few times per second."""
+        text = f"{self._job.title}: {progress_text(self._job)}    {translated('Esc')}: {translated('Cancel')}"
+        shown = text, clock(self._job.seconds())
+        if shown != self._progress:
+            self._progress = shown
+            context.workspace.status_text_set(text)
+            redraw_panels()
+
+    def _show_results(self, context) -> None:
+        scene = self._scene()
+        while scene is not None and self._shown < len(self._job.results):
+            results.show(scene, self._job.results[self._shown])
+            viewer.refresh(scene)
+            viewer.put_in_editor(context, scene)
+            self._shown += 1
+
+    def _finish(self, context):
+        job = self._job
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+        if running_job() is job:
+            _running["job"] = None
+        for workspace in bpy.data.workspaces:
+            workspace.status_text_set(None)
+        redraw_panels()
+        if job.error:
+            self.report({"ERROR"}, job.error)
+        elif job.cancelled:
+            kept = self._kept()
+            self.report({"WARNING"}, f"{job.title} was cancelled; {kept}")
+        else:
+            self._report_success()
+        return {"FINISHED"} if self._shown else {"CANCELLED"}
+
+    def _kept(self) -> str:
+        scene = self._scene()
+        result = results.result_of(scene) if scene is not None and self._shown else None
+        if result is None:
+            return f"what was finished is in {self._output}" if self.command == "bake" else "nothing was finished yet"
+        names = next(iter(result.groups.values()))["labels"].values()
+        return f"kept: {', '.join(names)}"
+
+    def _scene(self):
+        """The scene of the job, also after it was renamed; None where it was removed."""
+        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
+
+    def _report_success(self) -> None:
+        result = results.result_in(str(self._job.results[-1])) if self._job.results else None
+        report = result.report if result is not None else {"warnings": ()}
+        for problem in report.get("problems", ()):
+            self.report({"WARNING"}, problem)
+        count = len(report["warnings"])
+        noted = f", {count} warning{'s' if count > 1 else ''}" if count else ""
+        self.report({"INFO"}, f"{self._job.title} took {clock(self._job.seconds())}{noted}")
+
+
+class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
+    """Shade what the active camera sees, with the chosen techniques"""
+
+    bl_idname = "ltsh.shade"
+    bl_label = "Shade Camera View"
+    command = "shade"
+
+
+class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
+    """Shade what the active camera sees, render it with Cycles too, and measure the difference.
+    Direct light without shadows on both sides"""
+
+    bl_idname = "ltsh.compare"
+    bl_label = "Compare with Cycles"
+    command = "compare"
+
+
+class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
+    """Bake the light on the selected objects into textures, one EXR for each"""
+
+    bl_idname = "ltsh.bake"
+    bl_label = "Bake Selected"
+    command = "bake"
+
+
+class LTSH_OT_cancel(bpy.types.Operator):
+    """Stop the job; pictures that are finished are kept"""
+
+    bl_idname = "ltsh.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context):
+        return running_job() is not None
+
+    def execute(self, context):
+        running_job().cancel()
+        redraw_panels()
+        return {"FINISHED"}
+
+
+def progress_text(job: Job) -> str:
+    """Stage, percent and time left in a few words."""
+    text = f"{translated(STAGES.get(job.stage, job.stage))}  {100.0 * job.fraction:.0f} %"
+    left = job.seconds_left()
+    return text if left is None else f"{text}, {clock(left)} {translated('left')}"
+
+
+def redraw_panels() -> None:
+    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            wanted = PANEL_REGIONS.get(area.type)
+            for region in area.regions:
+                if region.type == wanted:
+                    region.tag_redraw()
+
+
+@bpy.app.handlers.persistent
+def _stop(*_):
+    """Another file is about to be opened: the job's scene goes."""
+    job = running_job()
+    if job is not None:
+        _running["job"] = None
+        job.cancel()
+
+
+def _end_now() -> None:
+    job = running_job()
+    if job is not None:
+        _running["job"] = None
+        job.end_now()
+
+
+CLASSES = (LTSH_OT_shade, LTSH_OT_compare, LTSH_OT_bake, LTSH_OT_cancel)
+_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+
+
+def register():
+    _register()
+    bpy.app.handlers.load_pre.append(_stop)
+    atexit.register(_end_now)
+
+
+def unregister():
+    _end_now()
+    atexit.unregister(_end_now)
+    if _stop in bpy.app.handlers.load_pre:
+        bpy.app.handlers.load_pre.remove(_stop)
+    _unregister()

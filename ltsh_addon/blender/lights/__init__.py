@@ -1,0 +1,1 @@
+"""From Blender's lights and emissive meshes to `AreaLight`."""

@@ -1,0 +1,90 @@
+"""Area lights with node trees: what Cycles sees of them, as constants or patches of constant radiance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import bpy
+import numpy as np
+
+from ...scene import AreaLight
+from .emission_look import PIXELS, Studio
+from .patches import ERROR, cut_into_patches, split_light
+
+# Lights of one data block, with the same texture, that are looked at one by one; the others get what the first has.
+MOST_LOOKS = 100
+# Below this half angle in rad Cycles takes the first terms of a series instead of tan h - h.
+SMALL_SPREAD = 0.05
+
+
+@dataclass(frozen=True)
+class UnseenLight:
+    """An area light whose node tree has a say in its radiance."""
+
+    data: object  # the original light data block
+    matrix: np.ndarray  # (4, 4) in the world
+    varies: bool  # over the light's surface, as far as its nodes tell
+
+
+def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
+    """`lights` with those at the positions `unseen` replaced by what they look like; dark ones go."""
+    result, seen = [], {}
+    for position, light in enumerate(lights):
+        if position not in unseen:
+            result.append(light)
+            continue
+        source = unseen[position]
+        own = seen.setdefault(source.data.name_full, [])
+        if not own or (source.varies and len(own) < MOST_LOOKS):
+            own.append(_factor(light, source, studio))
+            factor, covered = own[-1]
+        else:
+            factor, covered = own[0]
+            if source.varies:
+                warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the texture of the first")
+        result.extend(_with_factor(light, factor, covered, warn))
+    return result
+
+
+def spread_peak(spread: float) -> float:
+    """By what the radiance of a light of `spread` rad exceeds, straight ahead, that of one of 180 degrees."""
+    half = 0.5 * spread
+    if spread >= np.pi - 1e-6:
+        return 1.0
+    tangent = np.tan(half)
+    return float(3.0 * tangent / half**3 if half <= SMALL_SPREAD else tangent / (tangent - half))
+
+
+def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
+    """What the node tree multiplies the radiance by (H, W, 3), and the pixels (H, W) on the light.
+
+    Columns run along half_u, row 0 is at +half_v.
+    """
+    ob = bpy.data.objects.new("Look at a light", source.data)
+    ob.visible_camera = True
+    pixels = PIXELS if source.varies else 8
+    with studio.show(ob, source.matrix):
+        image, _ = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
+    if np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0:
+        image = image[::-1]
+    plain = light.radiance * spread_peak(light.spread)
+    factor = np.divide(image, plain, out=np.zeros_like(image), where=plain != 0.0)
+    rows, columns = image.shape[:2]
+    covered = np.ones((rows, columns), bool)
+    if light.is_round:
+        # Pixels that the edge goes through are partly dark.
+        x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+        covered = np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
+    return factor, covered
+
+
+def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn) -> list[AreaLight]:
+    patches = cut_into_patches(factor * light.radiance, covered)
+    if patches.error > ERROR:
+        warn(
+            f"light {light.name!r}: its texture is shaded as {len(patches.cells)} patches of constant radiance, "
+            f"which differ from it by {100.0 * patches.error:.0f} % on average"
+        )
+    if len(patches.cells) == 1 and np.ptp(patches.cells[0][:2]) == 2.0 and np.ptp(patches.cells[0][2:]) == 2.0:
+        return [replace(light, radiance=patches.radiance[0])]
+    return split_light(light, patches)

@@ -1,0 +1,1 @@
+"""From Blender's materials to weighted lobes: in Cycles' AOVs, in maps, as constants for the viewport."""

@@ -1,0 +1,99 @@
+"""Makes sheen_albedos.npy: measures in Cycles what sheen reflects (half a minute, needs pip's bpy).
+
+python -m ltsh_addon.blender.materials.sheen_measurement
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...imaging.exr import read_channels
+from ..pixels import render_settings
+from . import sheen_albedos
+from .aovs import read_layer
+
+PIXELS = 512
+STRIPS = 20_000
+
+
+def measure(pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cosines, roughness and albedos (pixels^2,) of white sheen on black, in a file of its own that stays open.
+
+    The roughness grows from left to right, the cosine of the view upwards.
+    """
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    _add_surface(scene)
+    _add_camera(scene)
+    scene.render.resolution_x = scene.render.resolution_y = pixels
+    scene.render.engine, scene.cycles.samples = "CYCLES", 1
+    scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
+    layer.use_pass_normal = layer.use_pass_diffuse_color = True
+    with tempfile.TemporaryDirectory(prefix="ltsh-") as name:
+        path = Path(name) / "sheen.exr"
+        render_settings.render_exr(scene, path)
+        channels = read_channels(path)
+    albedo = read_layer(channels, render_settings.pass_names()["diffuse_color"], "RGB")[..., 0]
+    cosine = read_layer(channels, "Normal", "XYZ")[..., 2]
+    roughness = np.broadcast_to((np.arange(pixels) + 0.5) / pixels, (pixels, pixels))
+    seen = np.linalg.norm(read_layer(channels, "Normal", "XYZ"), axis=-1) > 0.5
+    return cosine[seen], roughness[seen], albedo[seen]
+
+
+def table_of(cosine: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    """The table (NODES, NODES), by cosine and roughness, that fits the measurements (P,) best."""
+    count = sheen_albedos.NODES**2
+    square, right = np.zeros((count, count)), np.zeros(count)
+    found = sheen_albedos.corners(cosine.astype(np.float64), roughness.astype(np.float64))
+    for index, weight in found:
+        np.add.at(right, index, weight * albedo)
+        for other, other_weight in found:
+            np.add.at(square, (index, other), weight * other_weight)
+    table = np.linalg.lstsq(square, right, rcond=1e-12)[0]
+    return np.maximum(table, 0.0).reshape(sheen_albedos.NODES, -1).astype(np.float32)
+
+
+def _add_surface(scene) -> None:
+    """A ribbed sheet over the unit square, whose normals turn from sideways to upwards along y, as the cosine grows."""
+    cosine = np.linspace(1e-4, 1.0, STRIPS + 1)
+    slope = np.sqrt(1.0 - cosine**2) / cosine
+    height = -np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(cosine))])
+    places = np.array([(x, y, z) for y, z in zip(cosine, height, strict=True) for x in (0.0, 1.0)])
+    first = 2 * np.arange(STRIPS)[:, None]
+    mesh = bpy.data.meshes.new("Sheet")
+    mesh.from_pydata(places.tolist(), [], (first + [0, 1, 3, 2]).tolist())
+    mesh.polygons.foreach_set("use_smooth", [True] * STRIPS)
+    normals = np.stack([np.zeros_like(cosine), np.sqrt(1.0 - cosine**2), cosine], axis=-1)
+    mesh.normals_split_custom_set_from_vertices(np.repeat(normals, 2, axis=0).tolist())
+    mesh.materials.append(_material())
+    scene.collection.objects.link(bpy.data.objects.new("Sheet", mesh))
+
+
+def _material():
+    material = bpy.data.materials.new("Sheen")
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    tree = material.node_tree
+    node, position = tree.nodes["Principled BSDF"], tree.nodes.new("ShaderNodeNewGeometry")
+    separate = tree.nodes.new("ShaderNodeSeparateXYZ")
+    tree.links.new(position.outputs["Position"], separate.inputs[0])
+    tree.links.new(separate.outputs["X"], node.inputs["Sheen Roughness"])
+    node.inputs["Sheen Weight"].default_value, node.inputs["Specular IOR Level"].default_value = 1.0, 0.0
+    node.inputs["Sheen Tint"].default_value = (1.0, 1.0, 1.0, 1.0)
+    node.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+    return material
+
+
+def _add_camera(scene) -> None:
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    camera.location, scene.camera = (0.5, 0.5, 1.0), camera
+    camera.data.type, camera.data.ortho_scale, camera.data.clip_end = "ORTHO", 1.0, 1e3
+
+
+if __name__ == "__main__":
+    np.save(sheen_albedos.PATH, table_of(*measure()))

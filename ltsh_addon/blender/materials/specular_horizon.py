@@ -1,0 +1,139 @@
+"""Where Cycles ends a specular lobe. Needs no bpy.
+
+Cycles estimates the light of an area light twice and weights both estimates by the power heuristic (Veach and Guibas
+1995). Directions that the lobe chose end at the horizon of the mesh, directions that the light chose end at that of
+the smooth normal, so which horizon counts depends on the probabilities of both: small lights and rough lobes have the
+smooth one, large lights and sharp lobes that of the mesh. Both are compared for directions between the two horizons.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...scene import AreaLight, SurfaceSamples
+
+SMALLEST_ALPHA = 1e-3
+# Directions at which both probabilities are compared: around the horizon, closest to each other near the highlight,
+# at heights between the two horizons.
+AROUND, CONCENTRATION = 48, 6.0
+HEIGHTS = (0.25, 0.75)
+# In rad. What lies between horizons that are closer is not worth a look.
+SMALLEST_ANGLE = 1e-4
+BLOCK = 4096
+
+
+def end_at_horizons_of_cycles(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> SurfaceSamples:
+    """The samples with the smooth normal as geometric normal where that horizon is nearer to what Cycles sums up."""
+    reflects = (samples.specular_f90 != 0.0).any(axis=1) | (samples.dielectric != 0.0).any(axis=1)
+    apart = np.abs(samples.geometric_normal - samples.smooth_normal).max(axis=1) > SMALLEST_ANGLE
+    differ = np.flatnonzero(reflects & apart)
+    if len(differ) == 0 or not lights:
+        return samples
+    normal = np.array(samples.geometric_normal)
+    for start in range(0, len(differ), BLOCK):
+        block = differ[start : start + BLOCK]
+        smooth = block[_smooth_is_nearer(samples.take(block), lights)]
+        normal[smooth] = samples.smooth_normal[smooth]
+    return replace(samples, geometric_normal=normal)
+
+
+def _smooth_is_nearer(samples, lights) -> np.ndarray:
+    """Mask (P,)."""
+    crossed = np.stack([_crosses(samples, light) for light in lights])
+    index = np.flatnonzero(crossed.any(axis=0))
+    smooth = np.zeros(len(samples), bool)
+    if len(index) == 0:
+        return smooth
+    samples, crossed = samples.take(index), crossed[:, index]
+    solid_angle = np.stack([_solid_angle(samples.position, light) for light in lights])
+    brightness = solid_angle * np.array([np.abs(light.radiance).sum() for light in lights])[:, None]
+    density = brightness / np.maximum(brightness.sum(axis=0) * solid_angle, 1e-12)
+    towards, width = _directions(samples)
+    lobe = _lobe_density(samples, towards)
+    # What only one of the horizons lets through, of directions that the light chose and of those that the lobe chose:
+    # the smooth horizon is wrong about the latter, that of the mesh about the former.
+    by_light, by_lobe = np.zeros(len(index)), np.zeros(len(index))
+    for number, light in enumerate(lights):
+        rows = np.flatnonzero(crossed[number])
+        excess = np.abs(light.radiance).sum() * lobe[rows] * width[rows]
+        excess *= _hits(light, samples.position[rows], towards[rows])
+        light2 = np.square(density[number, rows])[:, None, None]
+        weight = light2 / (light2 + np.square(lobe[rows]))
+        by_light[rows] += (excess * weight).sum(axis=(1, 2))
+        by_lobe[rows] += (excess * (1.0 - weight)).sum(axis=(1, 2))
+    # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
+    smooth[index] = np.abs(by_lobe) <= np.abs(by_light)
+    return smooth
+
+
+def _solid_angle(position, light) -> np.ndarray:
+    """Solid angle (P,) of the light in sr, 0 from behind it (Van Oosterom and Strackee 1983, eq. 8)."""
+    corners = light.polygon()[None] - position[:, None]
+    corners /= np.maximum(np.linalg.norm(corners, axis=2, keepdims=True), 1e-12)
+    first, second, third = corners[:, :1], corners[:, 1:-1], corners[:, 2:]
+    volume = (first * np.cross(second, third)).sum(axis=2)
+    below = 1.0 + (first * second).sum(axis=2) + (second * third).sum(axis=2) + (third * first).sum(axis=2)
+    whole = np.abs(2.0 * np.arctan2(volume, below).sum(axis=1))
+    return np.where((light.center - position) @ light.direction < 0.0, whole, 0.0)
+
+
+def _crosses(samples, light) -> np.ndarray:
+    """Mask (P,): from where the light is not wholly on one side of both horizons."""
+    corners, above = light.polygon(), []
+    for normal in (samples.smooth_normal, samples.geometric_normal):
+        above.append(normal @ corners.T > (normal * samples.position).sum(axis=1, keepdims=True))
+    above = np.concatenate(above, axis=1)
+    return above.any(axis=1) & ~above.all(axis=1) & ((light.center - samples.position) @ light.direction < 0.0)
+
+
+def _lobe_density(samples, towards) -> np.ndarray:
+    """Probability (P, H, N) per sr that the lobe chooses the directions, GGX's visible normals (Heitz 2018, eq. 17)."""
+    half = towards + samples.view[:, None, None]
+    half /= np.maximum(np.linalg.norm(half, axis=3, keepdims=True), 1e-12)
+    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
+    height = np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0)
+    cosine = np.maximum(np.einsum("pi,pi->p", samples.normal, samples.view), 1e-3)[:, None, None]
+    masking = 1.0 / (1.0 + 0.5 * (np.sqrt(1.0 + alpha2 * (1.0 / cosine**2 - 1.0)) - 1.0))
+    return alpha2 / (np.pi * np.square(height * height * (alpha2 - 1.0) + 1.0)) * masking / (4.0 * cosine)
+
+
+def _directions(samples):
+    """Unit directions (P, H, N, 3) between the horizons and the solid angle (P, H, N) of each, negative where the
+    horizon of the mesh is the lower one."""
+    mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
+    flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
+    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+    across = np.cross(samples.smooth_normal, flat)
+    step = (np.arange(AROUND) + 0.5) / AROUND * 2.0 - 1.0
+    angle = np.pi * np.sinh(CONCENTRATION * step) / np.sinh(CONCENTRATION)
+    span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
+    around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
+    # How high above the smooth horizon that of the mesh lies there.
+    rise = -np.arctan2(
+        np.einsum("pni,pi->pn", around, samples.geometric_normal),
+        np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
+    )
+    elevation = rise[:, None] * np.array(HEIGHTS)[:, None]
+    towards = np.cos(elevation)[..., None] * around[:, None]
+    towards += np.sin(elevation)[..., None] * samples.smooth_normal[:, None, None]
+    return towards, rise[:, None] * span * np.cos(elevation) / len(HEIGHTS)
+
+
+def _hits(light, position, towards) -> np.ndarray:
+    """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
+    corners = light.polygon() - light.center
+    first = corners[0] / max(np.linalg.norm(corners[0]), 1e-30)
+    axes = np.stack([first, np.cross(light.direction, first)])
+    outline = corners @ axes.T
+    steepness = towards @ light.direction
+    height = ((light.center - position) @ light.direction)[:, None, None]
+    distance = height / np.where(steepness < 0.0, steepness, -1e-30)
+    point = distance[..., None] * towards + (position - light.center)[:, None, None]
+    x, y = (point @ axis for axis in axes)
+    inside = np.zeros(x.shape, bool)
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside & (steepness < 0.0)

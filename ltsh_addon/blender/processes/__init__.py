@@ -1,0 +1,1 @@
+"""Blender in a second process: what is asked of it, and what it runs."""

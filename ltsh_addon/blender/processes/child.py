@@ -1,0 +1,231 @@
+"""Samples, lights and reference of a .blend through a child process. Imports no bpy.
+
+The child opens the file, edits it in memory, renders with Cycles into a temporary folder and ends; the file on disk
+and the data of a running Blender stay untouched.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...scene import REC709, AreaLight, Border, ColorSpace, Film, SurfaceSamples
+from ..materials.specular_horizon import end_at_horizons_of_cycles
+from ..pixels import gbuffer
+from .blender_process import Progress, SceneError, disk_is_full, no_room, run_child
+from .temporary_folders import locked_folder
+
+# Of a .blend as it is, or compressed by Blender since 3.0 and before.
+STARTS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
+
+
+@dataclass(frozen=True)
+class ExtractOptions:
+    """What to take from which file. `cycles_samples` 0 means no Cycles reference; None means as in the file."""
+
+    scene: Path
+    width: int | None = None
+    height: int | None = None
+    sub_samples: int = 1
+    cycles_samples: int = 0
+    frame: int | None = None
+    camera: str | None = None
+    scene_name: str | None = None
+    view_layer: str | None = None
+    scripts: bool = False  # run those of the file
+    techniques: int = 0  # so many are to be shaded afterwards: SceneError where there is too little memory for that
+    memory_mib: int = 0  # what may be used; 0: as the environment says, else what is free
+    emission: bool = False  # also what the surfaces themselves emit
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """What the child found and rendered.
+
+    `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
+    W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
+    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
+    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
+    the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
+    exposure; None where it was not asked for.
+    """
+
+    lights: tuple[AreaLight, ...]
+    samples: SurfaceSamples
+    film: Film
+    warnings: tuple[str, ...]
+    reference: dict[str, np.ndarray] | None
+    blender_version: str
+    frame: int
+    camera: str
+    seconds: dict[str, float]
+    exposure: float = 1.0
+    border: Border | None = None
+    pixel_aspect: float = 1.0
+    pixel_filter: str = "BOX"
+    color_space: ColorSpace = REC709
+    emission: np.ndarray | None = None
+
+
+def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
+    """Lights, samples and (if asked for) the Cycles reference of a .blend.
+
+    Raises SceneError when the scene or file is not fit, Cancelled when `progress(stage, fraction)` returned False.
+    """
+    if options.sub_samples < 1 or options.cycles_samples < 0:
+        raise ValueError(
+            f"sub_samples is {options.sub_samples} and cycles_samples {options.cycles_samples}, "
+            "expected at least 1 and 0"
+        )
+    scene = Path(options.scene).absolute()
+    check_readable(scene)
+    with temporary_folder() as folder:
+        manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
+        samples, film, warnings = _read_samples(manifest, folder)
+        lights = tuple(AreaLight(**record) for record in manifest["lights"])
+        return Extraction(
+            lights=lights,
+            samples=end_at_horizons_of_cycles(samples, lights),
+            film=film,
+            warnings=tuple(manifest["warnings"] + warnings),
+            reference=read_reference(manifest, folder),
+            blender_version=manifest["blender_version"],
+            frame=manifest["frame"],
+            camera=manifest["camera"],
+            seconds=manifest["seconds"],
+            exposure=manifest["exposure"],
+            border=None if manifest["border"] is None else Border(**manifest["border"]),
+            pixel_aspect=manifest["pixel_aspect"],
+            pixel_filter=manifest["pixel_filter"],
+            color_space=_color_space(manifest["color_space"]),
+            emission=_read_emission(manifest, folder) if options.emission else None,
+        )
+
+
+def build_demo(path: Path, *, progress: Progress | None = None) -> None:
+    """Build the example scene and save it as the .blend `path`, at once or not at all."""
+    path = Path(path).absolute()
+    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
+    try:
+        with temporary_folder() as folder:
+            run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
+        if not unfinished.is_file():
+            raise SceneError(f"{path}: Blender built the example scene but saved no file")
+        os.replace(unfinished, path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def check_readable(scene: Path) -> None:
+    """Raise where a look at the file says enough, so that Blender need not start."""
+    try:
+        if not scene.exists():
+            raise SceneError(f"{scene}: no such file, expected a .blend")
+        if not scene.is_file() and not scene.is_dir():  # reading a pipe or a device might never end
+            raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
+        with scene.open("rb") as file:
+            start = file.read(7)
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(f"{str(scene)[:200]!r}: cannot be read: {reason}") from None
+    if not start:
+        raise SceneError(f"{scene}: the file is empty, expected a .blend")
+    if not start.startswith(STARTS):
+        raise SceneError(f"{scene}: is no .blend, it starts with {start!r}")
+
+
+@contextlib.contextmanager
+def temporary_folder():
+    """A folder that is there meanwhile. Raises OSError, which names the folder where its disk is full."""
+    with termination_as_exception(), locked_folder() as folder:
+        try:
+            yield folder
+        except OSError as error:
+            # Errors of other files have their names in the text, and no number.
+            if disk_is_full(error) and str(error.filename or folder).startswith(str(folder)):
+                raise OSError(no_room(folder, error)) from error
+            raise
+
+
+@contextlib.contextmanager
+def termination_as_exception():
+    """Turn SIGTERM into SystemExit meanwhile, so that child and folder are cleaned up; leaves other handlers alone."""
+
+    def stop(number, frame):
+        raise SystemExit(128 + number)
+
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if ours:
+        signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        if ours:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
+    """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
+    from ...imaging.exr import read_channels  # the child imports this module too, and has no use for imaging
+
+    width, height = manifest["width"], manifest["height"]
+    renders, unusable, unnamed = [], 0, 0
+    for index, name in enumerate(manifest["samples"]):
+        channels = read_channels(folder / name)
+        gbuffer.clear_holdouts(channels)
+        samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
+        renders.append((samples, pixel))
+        unusable += bad
+        if index == 0:
+            unnamed = gbuffer.surfaces_without_sample(channels) if len(manifest["samples"]) == 1 else 0
+    samples, film = gbuffer.join(renders, width, height)
+    warnings = []
+    if unusable:
+        what = "transparent surfaces in front of others, or not finite, or too far away"
+        warnings.append(f"{unusable} samples are not shaded: {what}")
+    if unnamed:
+        warnings.append(f"{unnamed} pixels show a surface whose material could not be read: not shaded")
+    if len(samples) == 0:
+        warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
+    return samples, film, warnings
+
+
+def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
+    """What surfaces emit, the mean of all sample renders."""
+    from ...imaging.exr import read_channels
+
+    name = manifest["passes"]["emission"]
+    images = [gbuffer.read_layer(read_channels(folder / file), name, "RGB") for file in manifest["samples"]]
+    return np.mean(images, axis=0, dtype=np.float64)
+
+
+def _color_space(record: dict) -> ColorSpace:
+    from ...imaging.color_space import identified
+
+    return identified(record["to_rec709"], record["name"])
+
+
+def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
+    """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
+    from ...imaging.exr import read_channels
+
+    if manifest["reference"] is None:
+        return None
+    passes = manifest["passes"]
+    shape = (2, manifest["height"], manifest["width"], 3)
+    sums = {"specular": np.zeros(shape), "diffuse": np.zeros(shape)}
+    for half, chunks in enumerate(manifest["reference"]):
+        total = sum(count for _, count in chunks)
+        for name, count in chunks:
+            channels = read_channels(folder / name)
+            for lobe, image in sums.items():
+                light = gbuffer.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
+                image[half] += count / total * light * gbuffer.read_layer(channels, passes[f"{lobe}_color"], "RGB")
+    exposure = manifest.get("exposure", 1.0)
+    return {lobe: (exposure * image).astype(np.float32) for lobe, image in sums.items()}

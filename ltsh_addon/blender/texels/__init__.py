@@ -1,0 +1,1 @@
+"""Samples of a UV map's texels, and Cycles' bake of the same texels."""

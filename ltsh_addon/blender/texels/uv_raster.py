@@ -1,0 +1,259 @@
+"""Texels of a UV map: which triangle covers which texel, block of rows by block of rows. Needs no bpy.
+
+Texel (x, y) counts from the lower left corner of a tile; its center is at u = (x + 0.5) / W, v = (y + 0.5) / H.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Blender's bake moves its sampling points by this much, in texels, so that centers exactly on an edge belong to one
+# side. The same here, for the same texels.
+NUDGE = (0.001, 0.002)
+_NO_ROW = 1 << 40
+# How far a triangle may stick out of its tile, in tiles: rounding, and no texel.
+TILE_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Texels:
+    """Q texels of a block of rows and where they lie on the triangles."""
+
+    index: np.ndarray  # (Q,) increasing: (y - first row) * W + x
+    triangle: np.ndarray  # (Q,)
+    barycentric: np.ndarray  # (Q, 3) weights of the triangle's corners, none negative
+    covers: int  # how often texels were covered, all together
+    overlaps: int  # how many of them were covered more than once
+
+
+@dataclass(frozen=True)
+class UvTriangles:
+    """Triangles of a UV map in texels of one tile; `texels` finds those of a block of rows."""
+
+    corners: np.ndarray  # (T, 3, 2) float64, in texels
+    width: int
+    height: int
+
+    @classmethod
+    def in_tile(cls, uv: np.ndarray, width: int, height: int, tile: tuple[int, int] = (0, 0)) -> UvTriangles:
+        """Triangles uv (T, 3, 2) on a texture of width x height texels that fills the unit square at `tile`."""
+        # In single precision like Blender, so that rounding moves no texel from one side of an edge to the other.
+        size = np.array([width, height], dtype=np.float32)
+        corners = (np.asarray(uv, dtype=np.float32) - np.asarray(tile, dtype=np.float32)) * size
+        return cls(corners.astype(np.float64), width, height)
+
+    def texels(self, first_row: int, row_count: int, conservative: bool = False) -> Texels:
+        """The texels of some rows whose centers are covered; where triangles overlap the last one wins, as in Blender.
+
+        With `conservative` also those that are touched anywhere by a triangle and whose center is not covered: their
+        sample is the point of the triangle nearest to the center.
+        """
+        owner = np.full(row_count * self.width, -1, dtype=np.int64)
+        shifted = self.corners.astype(np.float32) - (np.float32(0.5) + np.array(NUDGE, np.float32))
+        spans = _center_spans(shifted, first_row, row_count, (self.width, self.height))
+        triangle, index = _expand(*spans, self.width, first_row)
+        owner[index] = triangle
+        covered = owner >= 0
+        covers, overlaps = len(index), 0
+        if covers > np.count_nonzero(covered):
+            overlaps = int(np.count_nonzero(np.bincount(index) > 1))
+        if conservative:
+            spans = _touching_spans(self.corners, first_row, row_count, self.width)
+            triangle, index = _expand(*spans, self.width, first_row)
+            free = ~covered[index]
+            owner[index[free]] = triangle[free]
+        found = np.flatnonzero(owner >= 0)
+        triangle = owner[found]
+        center = np.stack([found % self.width + 0.5, found // self.width + first_row + 0.5], axis=-1)
+        return Texels(found, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
+
+
+def _center_spans(corners, first_row, row_count, size):
+    """(triangle, row, first x, last x) of the runs of integer points in triangles (T, 3, 2), float32, of a texture of
+    `size` (width, height).
+
+    As Blender's rasterizer does it, down to the rounding: a side is followed from its upper end row by row, in single
+    precision, and a point on the left side is outside.
+    """
+    width, height = size
+    sides = [_side_rows(corners[:, k], corners[:, (k + 1) % 3], first_row, row_count, height) for k in range(3)]
+    first = np.min([side.first for side in sides], axis=0)
+    last = np.max([side.last for side in sides], axis=0)
+    triangle, step = repeated(last - first + 1)
+    row = first[triangle] + step
+    offset = np.cumsum(np.maximum(last - first + 1, 0)) - np.maximum(last - first + 1, 0)
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for side in sides:
+        of, number = repeated(side.last - side.first + 1)
+        position = offset[of] + (side.first - first)[of] + number
+        x = side.x[side.start[of] + number]
+        left[position], right[position] = np.minimum(left[position], x), np.maximum(right[position], x)
+    crossed = np.flatnonzero(np.isfinite(left))
+    left, right = left[crossed], right[crossed]
+    return triangle[crossed], row[crossed], np.floor(left) + 1.0, np.minimum(np.floor(right), width - 1.0)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Where one side of every triangle meets the rows of the block."""
+
+    first: np.ndarray  # (T,) first row, _NO_ROW where there is none
+    last: np.ndarray  # (T,) last row, -_NO_ROW where there is none
+    start: np.ndarray  # (T,) place of the first row's x in `x`
+    x: np.ndarray
+
+
+def _side_rows(start, end, first_row, row_count, height):
+    upward = (start[:, 1] < end[:, 1])[:, None]
+    low, high = np.where(upward, start, end), np.where(upward, end, start)
+    top = np.minimum(np.floor(high[:, 1]), height - 1.0)
+    first = np.maximum(np.ceil(low[:, 1]), first_row)
+    last = np.minimum(top, first_row + row_count - 1.0)
+    with np.errstate(invalid="ignore"):
+        seen = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (first <= last))
+    # The longest way down first, so that those still under way are always the first ones.
+    seen = seen[np.argsort(first[seen] - top[seen], kind="stable")]
+    low, high, top = low[seen], high[seen], top[seen].astype(np.float32)
+    rise = high[:, 1] - low[:, 1]
+    flat = rise <= np.finfo(np.float32).eps
+    slope = np.divide(low[:, 0] - high[:, 0], rise, out=np.zeros_like(rise), where=~flat)
+    x = np.where(flat, np.minimum(low[:, 0], high[:, 0]), slope * (low[:, 1] - top) + low[:, 0])
+    rows = np.zeros(len(start) + 1, np.int64)
+    rows[seen + 1] = last[seen] - first[seen] + 1.0
+    place = np.cumsum(rows)
+    values = np.empty(place[-1], np.float32)
+    steps, skipped = top - first[seen], top - last[seen]
+    target = place[seen + 1] - 1 + skipped.astype(np.int64)
+    active = len(seen)
+    for step in range(int(steps[0]) + 1 if active else 0):
+        active = np.searchsorted(-steps[:active], -step, side="right")
+        within = np.flatnonzero(skipped[:active] <= step)
+        values[target[within] - step] = x[within]
+        x[:active] += slope[:active]
+    rows_of = np.full((2, len(start)), [[_NO_ROW], [-_NO_ROW]], dtype=np.int64)
+    rows_of[:, seen] = first[seen], last[seen]
+    return _Side(*rows_of, place[:-1], values)
+
+
+def _touching_spans(corners, first_row, row_count, width):
+    """(triangle, row, first x, last x) of the runs of unit squares that triangles (T, 3, 2) touch."""
+    low, middle, high = _by_height(corners)
+    area = cross(middle - low, high - low)
+    solid = np.flatnonzero(np.isfinite(area) & (area != 0.0))
+    low, middle, high = low[solid], middle[solid], high[solid]
+    # A triangle that ends on the border between two rows does not reach into the next.
+    last = np.maximum(np.ceil(high[:, 1]) - 1.0, np.floor(low[:, 1]))
+    triangle, row = _rows_of(np.floor(low[:, 1]), last, first_row, row_count)
+    low, middle, high = low[triangle], middle[triangle], high[triangle]
+    inside = np.clip(middle[:, 1], row, row + 1.0) == middle[:, 1]
+    ends = []
+    for border in (row, row + 1.0):
+        ends += _chain_ends(low, middle, high, np.clip(border, low[:, 1], high[:, 1]))
+    ends.append(np.where(inside, middle[:, 0], ends[0]))
+    left, right = np.min(ends, axis=0), np.max(ends, axis=0)
+    last_x = np.maximum(np.ceil(right) - 1.0, np.floor(left))
+    return solid[triangle], row, np.floor(left), np.minimum(last_x, width - 1.0)
+
+
+def _by_height(corners):
+    """Corners (T, 3, 2) sorted by y: three arrays (T, 2)."""
+    order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
+    return np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
+
+
+def _rows_of(first, last, first_row, row_count):
+    """(triangle, row) for every row from `first` (T,) to `last` (T,) within the block."""
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(first) & np.isfinite(last)
+    first = np.maximum(np.where(seen, first, 0.0), first_row)
+    last = np.minimum(np.where(seen, last, -1.0), first_row + row_count - 1.0)
+    triangle, step = repeated(last - first + 1.0)
+    return triangle, first[triangle] + step
+
+
+def repeated(counts):
+    """Numbers 0 0 0 1 1 3 ... as often as counts (N,) say, and 0 1 2 0 1 0 ... within each."""
+    counts = np.where(counts > 0.0, counts, 0.0).astype(np.int64)
+    number = np.repeat(np.arange(len(counts)), counts)
+    ends = np.cumsum(counts)
+    return number, np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)
+
+
+def _chain_ends(low, middle, high, y):
+    """x where a horizontal line at y (S,) meets the long side and the two short sides of triangles."""
+    below = y <= middle[:, 1]
+    start, end = np.where(below[:, None], low, middle), np.where(below[:, None], middle, high)
+    return _x_on(low, high, y), _x_on(start, end, y)
+
+
+def _x_on(start, end, y):
+    rise = end[:, 1] - start[:, 1]
+    share = np.divide(y - start[:, 1], rise, out=np.ones_like(rise), where=rise > 0.0)
+    return start[:, 0] + share * (end[:, 0] - start[:, 0])
+
+
+def _expand(span_triangle, row, first_x, last_x, width, first_row):
+    """(triangle, index in the block) of every texel of the spans, in the order of the triangles."""
+    first_x = np.clip(first_x, 0.0, width)
+    span, step = repeated(last_x - first_x + 1.0)
+    index = ((row[span] - first_row) * width + first_x[span]).astype(np.int64) + step
+    return span_triangle[span], index
+
+
+def barycentric_of_nearest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights (Q, 3), none negative, of the point of each triangle (Q, 3, 2) that is nearest to points (Q, 2).
+
+    Of a triangle without area the nearest point of its sides.
+    """
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = cross(b - a, c - a)
+    safe = np.where(area != 0.0, area, 1.0)
+    weights = np.stack([cross(b - points, c - points), cross(c - points, a - points), cross(a - points, b - points)])
+    weights = (weights / safe).T
+    outside = np.flatnonzero((weights < 0.0).any(axis=1) | (area == 0.0))
+    if len(outside):
+        weights[outside] = _nearest_on_sides(corners[outside], points[outside])
+    return weights
+
+
+def _nearest_on_sides(corners, points):
+    best, distance = np.zeros((len(points), 3)), np.full(len(points), np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        start, side = corners[:, first], corners[:, second] - corners[:, first]
+        length2 = (side * side).sum(axis=1)
+        share = ((points - start) * side).sum(axis=1)
+        share = np.clip(np.divide(share, length2, out=np.zeros_like(share), where=length2 > 0.0), 0.0, 1.0)
+        gap = points - start - share[:, None] * side
+        found = (gap * gap).sum(axis=1)
+        nearer = np.flatnonzero(found < distance)
+        distance[nearer] = found[nearer]
+        best[nearer] = 0.0
+        best[nearer, first], best[nearer, second] = 1.0 - share[nearer], share[nearer]
+    return best
+
+
+def cross(u, v):
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+
+def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
+    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the area that they
+    have in all, 1 for a tile, where some of it may be outside of these tiles; else 0.
+
+    Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
+    """
+    uv = np.asarray(uv, dtype=np.float64)
+    area = np.abs(cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
+    solid = np.isfinite(area) & (area > 0.0)
+    uv, area = uv[solid], area[solid]
+    column, row = np.moveaxis(np.floor(uv.mean(axis=1)).astype(np.int64), -1, 0)
+    origin = np.stack([column, row], axis=-1)[:, None]
+    within = np.all((uv >= origin - TILE_TOLERANCE) & (uv <= origin + 1.0 + TILE_TOLERANCE), axis=(1, 2))
+    numbered = (column >= 0) & (column < 10) & (row >= 0)
+    if (within & numbered).all():
+        return sorted(set((1001 + column + 10 * row).tolist())), 0.0
+    touching = (uv.min(axis=1) < 1.0).all(axis=1) & (uv.max(axis=1) > 0.0).all(axis=1)
+    return ([1001] if touching.any() else []), float(0.5 * area.sum())

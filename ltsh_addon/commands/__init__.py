@@ -1,0 +1,1 @@
+"""The command line's commands: their arguments, and what is printed."""

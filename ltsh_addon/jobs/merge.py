@@ -1,0 +1,141 @@
+"""report.json and timing.json of a job from the records of its tasks, whichever shard did them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from ..baking import bake
+from ..imaging import write_json, write_overview
+from .task_records import FOLDER, FORMAT, Records
+from .tasks import Task
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The report, the seconds, the names of tasks that are not done, and what was wrong with others."""
+
+    report: dict
+    seconds: dict
+    missing: tuple[str, ...]
+    problems: tuple[str, ...]
+    command: str
+    single: bool
+
+
+def merge(output: Path, progress=None) -> Merged:
+    """Assemble report.json and timing.json of the job in the folder `output`; of comparisons of several pictures also
+    report.html, and of a bake with `apply` the .blend.
+
+    A report from which something is missing says so under "missing". Raises OSError, and ValueError where there is
+    no job in the folder or nothing of it is done.
+    """
+    output = Path(output)
+    job = _read_job(output)
+    tasks = [Task(**task) for task in job["tasks"]]
+    records = Records(output, "tasks")
+    found = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
+    missing = tuple(task.name for task in tasks if found[task.name] is None)
+    if len(missing) == len(tasks):
+        raise ValueError(f"{output}: no task of its job is done, expected {', '.join(missing[:5])}; run it first")
+    units = [
+        _unit(job, output, list(members), found, progress) for _, members in groupby(tasks, key=lambda task: task.unit)
+    ]
+    units = [unit for unit in units if unit is not None]
+    problems = [problem for _, report in units for problem in report.get("problems", ())]
+    problems += [record["problem"] for record in found.values() if record and "problem" in record]
+    problems += _different_versions(found)
+    seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}
+    if job["single"] and units:
+        report, seconds = units[0][1], _sum_of(seconds.values())
+    else:
+        reports = [{"name": name, **report} for name, report in units]
+        report = {"command": job["command"], "reports": reports, "problems": problems}
+    if missing:
+        report = {**report, "missing": list(missing)}
+    write_json(output / "report.json", report)
+    write_json(output / "timing.json", {"seconds": seconds})
+    if job["command"] == "compare" and "reports" in report:
+        write_overview(output, "report.html", report)
+    return Merged(report, seconds, missing, tuple(problems), job["command"], job["single"])
+
+
+def _read_job(output: Path) -> dict:
+    path = output / FOLDER / "job.json"
+    try:
+        job = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(
+            f"{output}: no task has finished there; expected the folder that was given to -o of shade, compare or bake"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{path}: is damaged ({error}); run the job again with --resume") from None
+    if not isinstance(job, dict) or job.get("format") != FORMAT:
+        raise ValueError(f"{path}: was written by another version of LTSH, expected format {FORMAT}; run the job again")
+    return job
+
+
+def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
+    """Name and report of one picture, or of the objects of one bake; None where nothing of it is done."""
+    records = [found[task.name] for task in tasks if found[task.name] and "report" in found[task.name]]
+    if not records:
+        return None
+    files = sorted(file for record in records for file in record["files"])
+    reports = [record["report"] for record in records]
+    if job["command"] != "bake":
+        return tasks[0].name, reports[0] if job["single"] else {"files": files, **reports[0]}
+    report = {
+        **reports[0],
+        "objects": _objects(item for part in reports for item in part["objects"]),
+        "problems": list(dict.fromkeys(line for part in reports for line in part["problems"])),
+        "warnings": list(dict.fromkeys(line for part in reports for line in part["warnings"])),
+    }
+    if job["applied_layer"] and report["objects"]:
+        report["applied"] = bake.apply_textures(
+            Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
+        )
+    name = " ".join(str(part) for part in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if part is not None)
+    return name, report if job["single"] else {"files": files, **report}
+
+
+def _objects(items) -> list[dict]:
+    """Reports of objects, each once with all of its tiles."""
+    objects: dict[str, dict] = {}
+    for item in items:
+        known = objects.setdefault(item["name"], {**item, "tiles": {}})
+        known["tiles"] |= item["tiles"]
+    return list(objects.values())
+
+
+def _different_versions(found) -> list[str]:
+    """What to say where shards ran on different versions: their results must not be mixed."""
+    names = {}
+    for name, record in found.items():
+        if record and "report" in record:
+            names.setdefault(json.dumps(record["report"]["versions"], sort_keys=True), name)
+    if len(names) < 2:
+        return []
+    (first, a), (second, b) = list(names.items())[:2]
+    return [f"{a} and {b} were made by different versions, {first} and {second}: do one of them again"]
+
+
+def _read_seconds(output, task) -> dict:
+    try:
+        return json.loads((output / FOLDER / "timing" / f"{task.name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _sum_of(seconds) -> dict:
+    """The seconds of several tasks as those of one."""
+    total: dict = {}
+    for part in seconds:
+        for name, value in part.items():
+            before = total.get(name)
+            if isinstance(value, dict):
+                total[name] = _sum_of([before or {}, value])
+            else:
+                total[name] = value + (before or 0.0)
+    return total

@@ -1,0 +1,118 @@
+"""What a frame of the viewport costs: `python tests/benchmarks/viewport_frame.py [--size 960x540] [--rounds N]`.
+
+The example scene as its camera sees it, by technique, in turn so that a busy machine disturbs all alike. A frame is
+what a moving camera asks for: surfaces, lighting, picture; without the surfaces it is what a moving light asks for.
+Needs Blender 5.2, where a script without a window may use the graphics card. Where llvmpipe stands in for one, times
+are those of the processor.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+import bpy
+import gpu
+import numpy as np
+
+from ltsh_addon.blender.demo import demo_scene
+from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
+from ltsh_addon.blender.viewport.surface_pass import View
+from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+
+TECHNIQUES = ("ltc", "ltsh2", "ltsh4")
+TARGETS = {"ltsh2": 1.3, "ltsh4": 2.0}
+PUBLISHED = {"ltsh2": 2.7, "ltsh4": 5.5}  # Allmenröder and Peters 2021, on a graphics card
+
+
+class Frames:
+    """The example scene, ready to be drawn in `size` pixels."""
+
+    def __init__(self, size):
+        with tempfile.TemporaryDirectory() as folder:
+            demo_scene.build(Path(folder) / "demo.blend")
+        scene = bpy.context.scene
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        self.mirror = SceneMirror()
+        self.mirror.sync(depsgraph)
+        camera = scene.camera
+        window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1])
+        first = View.of(camera.matrix_world.inverted(), window, camera.data.type == "ORTHO")
+        # A view that has moved: surfaces are drawn again.
+        self.views = [first, replace(first, eye=first.eye + 1e-5)]
+        self.size, self.renderer, self.moves = size, ViewRenderer(), 0
+        self.target = gpu.types.GPUTexture(size, format="RGBA16F")
+        self.buffer = gpu.types.GPUFrameBuffer(color_slots=[self.target])
+
+    def seconds(self, technique, passes="combined", moving=True):
+        """Time of one frame, to the end of what the card does for it."""
+        shown = ShownPicture(technique, passes, "single", technique, 0.5, 1.0, 1.0, False)
+        self.moves += moving
+        clock = time.process_time if is_software() else time.perf_counter
+        start = clock()
+        self.renderer.draw(self.mirror, self.views[self.moves % 2], self.size, shown, self.buffer)
+        self.buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+        return clock() - start
+
+
+def is_software():
+    """Does the processor draw? Its own time is steadier than the clock."""
+    return "llvmpipe" in gpu.platform.renderer_get()
+
+
+def measure(frames, rounds):
+    """{(passes, moving): {technique: [seconds]}}."""
+    kinds = [("combined", True), ("combined", False), ("specular", False)]
+    times = {kind: {name: [] for name in TECHNIQUES} for kind in kinds}
+    for number in range(rounds + 1):
+        for kind, by_name in times.items():
+            for name in TECHNIQUES:
+                seconds = frames.seconds(name, *kind)
+                # The first round compiles.
+                if number:
+                    by_name[name].append(seconds)
+    return times
+
+
+def report(times):
+    """Print medians, and medians of the ratios within a round."""
+    names = (*TECHNIQUES, *(f"{name} / ltc" for name in TARGETS))
+    print(f"{'':<34}" + "".join(f"{name:>12}" for name in names))
+    for (passes, moving), by_name in times.items():
+        what = f"{passes}, {'frame' if moving else 'lighting and picture'}"
+        medians = "".join(f"{1e3 * statistics.median(by_name[name]):>9.1f} ms" for name in TECHNIQUES)
+        ratios = (np.median(np.divide(by_name[name], by_name["ltc"])) for name in TARGETS)
+        print(f"{what:<34}{medians}" + "".join(f"{ratio:>10.2f} x" for ratio in ratios))
+    print(f"{'target of a frame':<70}" + "".join(f"{ratio:>10.2f} x" for ratio in TARGETS.values()))
+    print(f"{'published for the shading alone':<70}" + "".join(f"{ratio:>10.2f} x" for ratio in PUBLISHED.values()))
+
+
+def main(arguments):
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--size", default="960x540", help="width x height in pixels")
+    parser.add_argument("--rounds", type=int, default=3)
+    options = parser.parse_args(arguments)
+    size = tuple(int(number) for number in options.size.split("x"))
+    if not hasattr(gpu, "init"):
+        print("viewport_frame needs Blender 5.2 or later: no graphics card for scripts without a window before")
+        return 1
+    gpu.init()
+    frames = Frames(size)
+    lights = frames.mirror.lights
+    corners = sum(len(light.polygon()) for light in lights)
+    print(f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}; {options.size} pixels, "
+          f"{frames.mirror.triangles} triangles, {len(lights)} lights of {corners} edges in all")  # fmt: skip
+    report(measure(frames, options.rounds))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

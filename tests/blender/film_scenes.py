@@ -1,0 +1,69 @@
+"""A scene for tests of film, layers and filters, its comparison and its plain render."""
+
+import bpy
+import numpy as np
+import scene_parts
+from scene_parts import add_plane, bsdf_material
+
+from ltsh_addon import imaging
+from ltsh_addon.blender.pixels.render_settings import enable_passes, render_exr
+from ltsh_addon.comparison.compare import Options, compare_scene
+
+SIZE = (26, 16)
+
+
+def diffuse(name, color):
+    return bsdf_material("ShaderNodeBsdfDiffuse", name, Color=(*color, 1.0))[0]
+
+
+def tiles():
+    """A gray floor seen from above with a red tile in its left half, which alone is in collection "Tiles"."""
+    scene = scene_parts.empty_scene(*SIZE)
+    scene_parts.add_top_camera(6.5)
+    scene_parts.add_area_light("Key", location=(0.3, 0.2, 2.5), rotation=(0.0, 0.0, 0.0))
+    add_plane(diffuse("Floor", (0.5, 0.5, 0.5)), size=12.0, name="Floor")
+    tile = add_plane(diffuse("Tile", (0.8, 0.1, 0.1)), size=2.0, name="Tile", location=(-1.5, 0.0, 0.1))
+    collection = bpy.data.collections.new("Tiles")
+    scene.collection.children.link(collection)
+    scene.collection.objects.unlink(tile)
+    collection.objects.link(tile)
+    # A plain render has its shadow, which is left out here.
+    tile.visible_shadow = tile.visible_diffuse = tile.visible_glossy = False
+    scene.cycles.pixel_filter_type = "BOX"
+    return scene
+
+
+def layer_collection(scene):
+    return scene.view_layers[0].layer_collection.children["Tiles"]
+
+
+def plain_diffuse(folder, scene, samples=256):
+    """Direct diffuse radiance (H, W, 3) of a plain render of the open file through its own pixel filter."""
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, False
+    scene.cycles.use_adaptive_sampling = False
+    layer = next(layer for layer in scene.view_layers if layer.use)
+    enable_passes(layer, ("combined", "diffuse_direct", "diffuse_color"))
+    render_exr(scene, folder / "plain.exr")
+    layers = imaging.read_layers(folder / "plain.exr")
+    old = bpy.app.version < (5, 0, 0)
+    light, color = ("DiffDir", "DiffCol") if old else ("Diffuse Direct", "Diffuse Color")
+    return layers[f"{layer.name}.{light}"] * layers[f"{layer.name}.{color}"]
+
+
+def compared(folder, **options):
+    """Report and layers of a comparison of the open file."""
+    path = folder / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    given = {"techniques": ("ltc",), "cycles_samples": 128, "passes": ("diffuse",), **options}
+    report = compare_scene(Options(path, folder / "out", **given))
+    return report, imaging.read_layers(folder / "out" / "compare.exr")
+
+
+def check_like_plain(folder, scene, **options):
+    """All agree: technique, reference, and a plain render of the file; returns the report."""
+    report, layers = compared(folder, **options)
+    plain = plain_diffuse(folder, scene)
+    for name in ("ltc.diffuse", "cycles.diffuse"):
+        # The noise of 256 samples, and the mean over a pixel against its center; edges lie between pixels.
+        assert np.linalg.norm(layers[name] - plain) < 0.02 * np.linalg.norm(plain), name
+    return report, layers

@@ -1,0 +1,159 @@
+"""The Cycles picture beside the viewport's: where it lies, what it is averaged to, when there is none and why."""
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
+
+import ltsh_addon
+from ltsh_addon.blender.engine.cycles_picture import (
+    Reference,
+    averaged,
+    camera_frame,
+    content,
+    is_outdated,
+    reference_of,
+)
+from ltsh_addon.imaging.exr import write_channels
+from ltsh_addon.imaging.picture_index import write_index
+
+SIZE = (24, 16)
+
+
+@pytest.fixture
+def addon():
+    scene = parts.empty_scene(*SIZE)
+    ltsh_addon.register()
+    yield scene
+    ltsh_addon.unregister()
+
+
+def projection_of(camera, size):
+    """World to clip space (4, 4) of a picture of `size` through `camera`."""
+    matrix = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=size[0], y=size[1])
+    return np.array(matrix @ camera.matrix_world.inverted())
+
+
+def context_of(scene, size=SIZE, perspective="CAMERA"):
+    """What a 3D view of `size` pixels would say."""
+    return SimpleNamespace(
+        space_data=SimpleNamespace(use_local_camera=False, camera=None),
+        region_data=SimpleNamespace(view_perspective=perspective),
+        region=SimpleNamespace(width=size[0], height=size[1]),
+    )
+
+
+def write_comparison(folder, pixels, **report):
+    """Results as `compare` leaves them, with one Cycles picture (H, W, 3)."""
+    height, width = pixels.shape[:2]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_channels(folder / "cycles.combined.exr", {letter: pixels[..., i] for i, letter in enumerate("RGB")})
+    facts = {"camera": "Camera", "frame": 1, "resolution": [width, height], "pixel_aspect": 1.0, "border": None}
+    group = {"files": {"cycles.combined": "cycles.combined.exr"}, "multilayer": "compare.exr", "names": ["cycles"],
+             "labels": {"cycles": "Cycles"}, "passes": ["combined"], "scales": {"combined": 1.0}}  # fmt: skip
+    whole = {"command": "compare", "partial": "", "groups": {"": group}, "report": {**facts, "exposure": 1.0, **report}}
+    write_index(folder, whole)
+
+
+def test_a_picture_over_its_own_pixels_is_unchanged():
+    image = np.random.default_rng(1).random((5, 7, 3))
+    found = averaged(image, (0.0, 0.0, 7.0, 5.0), (7, 5))
+    np.testing.assert_allclose(found[::-1, :, :3], image, rtol=1e-12)
+    assert (found[..., 3] == 1.0).all()
+
+
+def test_smaller_pictures_are_means_over_areas_and_larger_ones_repeat():
+    image = np.random.default_rng(2).random((6, 8, 3))
+    smaller = averaged(image, (0.0, 0.0, 4.0, 3.0), (4, 3))
+    blocks = image.reshape(3, 2, 4, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(smaller[::-1, :, :3], blocks, rtol=1e-12)
+    larger = averaged(image, (0.0, 0.0, 16.0, 12.0), (16, 12))
+    np.testing.assert_allclose(larger[::-1, :, :3], image.repeat(2, axis=0).repeat(2, axis=1), rtol=1e-12)
+
+
+def test_outside_the_frame_there_is_no_picture():
+    image = np.ones((4, 4, 3))
+    found = averaged(image, (2.5, 1.0, 6.5, 5.0), (10, 8))
+    # Columns 2 and 6 are cut by the frame.
+    assert (found[1:5, 3:6] == 1.0).all()
+    found[1:5, 3:6] = 0.0
+    assert (found == 0.0).all()
+
+
+@pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
+def test_the_frame_holds_what_the_camera_renders(kind):
+    scene = parts.empty_scene(32, 20)
+    camera = parts.add_camera((0.4, -3.0, 2.0), (0.9, 0.1, 0.2))
+    camera.data.type, camera.data.shift_x, camera.data.shift_y = kind, 0.1, -0.07
+    bpy.context.view_layer.update()
+    # A region of another shape than the picture shows more than it.
+    size = (90, 90)
+    projection = projection_of(camera, size)
+    left, bottom, right, top = camera_frame(camera, scene, projection, size)
+    for point in (Vector((0.2, 0.3, 0.0)), Vector((-0.5, 0.1, 0.4))):
+        clip = projection @ np.array([*point, 1.0])
+        x, y = ((0.5 + 0.5 * clip[axis] / clip[3]) * size[axis] for axis in (0, 1))
+        expected = world_to_camera_view(scene, camera, point)
+        found = (x - left) / (right - left), (y - bottom) / (top - bottom)
+        np.testing.assert_allclose(found, expected[:2], atol=1e-5)
+
+
+def test_the_picture_of_this_camera_is_found(addon, tmp_path):
+    camera = parts.add_camera()
+    bpy.context.view_layer.update()
+    pixels = np.random.default_rng(3).random((SIZE[1], SIZE[0], 3)).astype(np.float32)
+    write_comparison(tmp_path / "images", pixels, exposure=2.0)
+    addon.ltsh.result_folder = str(tmp_path / "images")
+    found = reference_of(context_of(addon), addon, "combined", projection_of(camera, SIZE))
+    np.testing.assert_allclose(found.pixels, pixels / 2.0, rtol=1e-6)
+    np.testing.assert_allclose(found.frame, (0.0, 0.0, *SIZE), atol=1e-3)
+
+
+def lit_by(*lights):
+    """The content of a scene with nothing but lights."""
+    return content(SimpleNamespace(lights=lights, instances=[]))
+
+
+def lamp(x=0.0):
+    return SimpleNamespace(name="Lamp", center=np.array([x, 0.0, 1.0]), radiance=np.ones(3))
+
+
+def test_a_change_of_the_scene_makes_the_picture_outdated_until_it_is_undone(tmp_path):
+    reference = Reference(np.ones((2, 2, 3)), (0.0, 0.0, 2.0, 2.0), (str(tmp_path), 1))
+    assert not is_outdated(reference, lit_by(lamp()))
+    assert is_outdated(reference, lit_by(lamp(0.1)))
+    assert is_outdated(reference, lit_by())
+    assert not is_outdated(reference, lit_by(lamp()))
+    made_again = Reference(np.ones((2, 2, 3)), (0.0, 0.0, 2.0, 2.0), (str(tmp_path), 2))
+    assert not is_outdated(made_again, lit_by(lamp(0.1)))
+    assert is_outdated(made_again, lit_by(lamp()))
+
+
+@pytest.mark.parametrize(
+    ("view", "report", "passes", "reason"),
+    [
+        ("PERSP", {}, "combined", "look through the camera"),
+        ("CAMERA", {"camera": "Other"}, "combined", "of camera 'Other', this is 'Camera'"),
+        ("CAMERA", {"frame": 7}, "combined", "of frame 7, this is 1"),
+        ("CAMERA", {}, "diffuse", "has no diffuse pass"),
+        ("CAMERA", {"resolution": [SIZE[0], 2 * SIZE[1]]}, "combined", "does not fill the camera's frame"),
+    ],
+)
+def test_what_is_in_the_way_is_said(addon, tmp_path, view, report, passes, reason):
+    camera = parts.add_camera()
+    bpy.context.view_layer.update()
+    write_comparison(tmp_path / "images", np.ones((SIZE[1], SIZE[0], 3)), **report)
+    addon.ltsh.result_folder = str(tmp_path / "images")
+    found = reference_of(context_of(addon, perspective=view), addon, passes, projection_of(camera, SIZE))
+    assert isinstance(found, str) and reason in found
+
+
+def test_without_a_comparison_the_view_says_how_to_get_one(addon, tmp_path):
+    camera = parts.add_camera()
+    addon.ltsh.output_folder = str(tmp_path)
+    found = reference_of(context_of(addon), addon, "combined", projection_of(camera, SIZE))
+    assert found.endswith("press Compare with Cycles")

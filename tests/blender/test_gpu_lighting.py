@@ -1,0 +1,155 @@
+"""The lighting pass on the graphics card, or on llvmpipe in its place, against the integrator in double precision."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import random_surfaces
+from graphics_card import Canvas, with_graphics
+from random_surfaces import EYE, rounded, unit
+
+from ltsh_addon import shading
+from ltsh_addon.blender.viewport.gbuffer_textures import upload_samples
+from ltsh_addon.blender.viewport.lighting import LightingPass
+
+WIDTH, HEIGHT = 32, 16
+TECHNIQUES = ("ltc", "ltsh2", "ltsh4")
+# What the preview promises: below the differences between techniques, and nothing the eye could see.
+RELATIVE, ABSOLUTE = 1e-3, 1e-5
+# The quadrature over a cone is good to 3e-3 in both, and which one is taken may depend on rounding.
+RELATIVE_OF_CONES = 3e-3
+
+
+def drawn(lighting, samples, canvas, passes, **placement):
+    """Radiance (P, 3) of `samples` (P)."""
+    gbuffer = upload_samples(samples, WIDTH)
+    lighting.draw(gbuffer, canvas.buffer, passes, view_position=EYE, **placement)
+    return canvas.read()[..., :3].reshape(-1, 3)
+
+
+def excess(found, expected, relative):
+    """How many times too far off (P,) the worst channel is."""
+    return (np.abs(found - expected) / (ABSOLUTE + relative * np.abs(expected))).max(axis=1)
+
+
+def disagreements(surface, kinds, techniques):
+    """What is off (list of str) under lights of all `kinds`, and the largest radiance of each pass."""
+    canvas = Canvas(WIDTH, HEIGHT)
+    failures, brightest = [], {name: 0.0 for name in shading.PASSES}
+    passes = {technique: LightingPass(technique) for technique in techniques}
+    for kind in kinds:
+        # The same numbers for every kind of light and surface would leave most of the cases out.
+        random = np.random.default_rng([len(kind), *map(ord, kind + surface)])
+        samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
+        lights = [random_surfaces.light(kind, number, random) for number in range(3)]
+        for technique, lighting in passes.items():
+            lighting.set_lights(lights)
+            for name in shading.PASSES:
+                found = drawn(lighting, samples, canvas, name)
+                shaded = shading.shade(samples, lights, technique, passes=(name,), workers=1, dtype=np.float64)
+                times = excess(found, shaded.combined, RELATIVE_OF_CONES if lights[0].is_focused else RELATIVE)
+                brightest[name] = max(brightest[name], float(shaded.combined.max()))
+                if not (times <= 1.0).all():
+                    worst = int(np.argmax(np.where(np.isnan(times), np.inf, times)))
+                    failures.append(
+                        f"{kind}, {technique}, {name}: {np.sum(~(times <= 1.0))} of {len(times)} samples, worst "
+                        f"{worst}: {found[worst]}, expected {shaded.combined[worst]}, {times[worst]:.1f} x"
+                    )
+    return failures, brightest
+
+
+def check(surface, kinds, techniques=TECHNIQUES):
+    """No disagreements, and enough light that the absolute part of the tolerance is not what lets them pass."""
+    failures, brightest = with_graphics(lambda: disagreements(surface, kinds, techniques))
+    assert not failures, "\n".join(failures)
+    assert min(brightest.values()) > 1e3 * ABSOLUTE
+
+
+@pytest.mark.parametrize("surface", random_surfaces.SURFACES)
+def test_radiance_is_that_of_the_integrator(surface):
+    check(surface, random_surfaces.LIGHTS)
+
+
+@pytest.mark.parametrize("surface", ["plain", "tilted"])
+def test_lights_with_a_spread_are_those_of_the_integrator(surface):
+    # One technique where there are more horizons: llvmpipe takes seconds to compile each.
+    check(surface, random_surfaces.FOCUSED_LIGHTS, TECHNIQUES if surface == "plain" else ("ltsh2",))
+
+
+def test_no_input_gives_anything_but_finite_light():
+    """Points on the light and in its plane, lobes without width, views along the surface and from behind it, vectors
+    of no length, lights of all sizes: what a scene may hold for a moment while it is edited."""
+
+    def draw_all():
+        random = np.random.default_rng(7)
+        samples = random_surfaces.samples("tilted", WIDTH * HEIGHT, random)
+        lights = [random_surfaces.light(kind, 0, random) for kind in random_surfaces.LIGHTS]
+        flat = replace(lights[0], center=np.zeros(3), half_u=np.eye(3)[0], half_v=np.eye(3)[1], direction=-np.eye(3)[2])
+        small, far = (replace(flat, half_u=size * flat.half_u, half_v=size * flat.half_v) for size in (1e-12, 1e12))
+        lights += [flat, small, far, replace(flat, shape="DISK")]
+        corner = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
+        position = rounded(samples.position)
+        position[: len(corner)] = corner
+        position[100:120, 2] = 0.0
+        normal = samples.normal.copy()
+        normal[200:210] = 0.0
+        normal[210:260] = -samples.view[210:260]
+        normal[260:300] = samples.view[260:300]
+        normal[300:340] = unit(np.cross(samples.view[300:340], random.normal(size=(40, 3))))
+        roughness = samples.roughness.copy()
+        roughness[::3] = 0.0
+        samples = replace(samples, position=position, normal=normal, roughness=roughness)
+        canvas = Canvas(WIDTH, HEIGHT)
+        bad = []
+        for technique in TECHNIQUES:
+            lighting = LightingPass(technique)
+            for light in lights:
+                lighting.set_lights([light])
+                for name in ("specular", "diffuse", "combined"):
+                    found = drawn(lighting, samples, canvas, name)
+                    if not (np.isfinite(found).all() and (found >= 0.0).all()):
+                        bad.append(f"{technique}, {name}, {light.name}: {found[~np.isfinite(found).all(axis=1)][:3]}")
+        return bad
+
+    bad = with_graphics(draw_all)
+    assert not bad, "\n".join(bad)
+
+
+def test_a_pass_draws_where_it_is_told_and_adds_to_what_is_there():
+    def draw():
+        random = np.random.default_rng(11)
+        samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
+        lighting = LightingPass("ltsh2")
+        lighting.set_lights([random_surfaces.light("plain", 0, random)])
+        canvas, large = Canvas(WIDTH, HEIGHT), Canvas(2 * WIDTH, 2 * HEIGHT)
+        parts = [drawn(lighting, samples, canvas, name) for name in shading.PASSES]
+        large.fill(7.0)
+        gbuffer = upload_samples(samples, WIDTH)
+        rect = (5, 3, WIDTH, HEIGHT)
+        lighting.draw(gbuffer, large.buffer, "specular", view_position=EYE, rect=rect)
+        lighting.draw(gbuffer, large.buffer, "diffuse", view_position=EYE, rect=rect, add=True)
+        return parts, large.read()
+
+    parts, picture = with_graphics(draw)
+    inside = picture[3 : 3 + HEIGHT, 5 : 5 + WIDTH, :3].reshape(-1, 3)
+    np.testing.assert_allclose(inside, sum(parts), rtol=1e-6)
+    assert min(part.max() for part in parts) > 0.01
+    picture[3 : 3 + HEIGHT, 5 : 5 + WIDTH] = 7.0
+    assert (picture == 7.0).all()
+
+
+def test_pixels_without_a_surface_stay_dark():
+    def draw():
+        random = np.random.default_rng(13)
+        samples = random_surfaces.samples("tilted", 40, random)
+        lighting = LightingPass("ltsh4")
+        lighting.set_lights([random_surfaces.light("plain", 0, random)])
+        canvas = Canvas(WIDTH, HEIGHT)
+        pixel = np.arange(40) * 7
+        pixel[-1] = WIDTH * HEIGHT - 1
+        lighting.draw(upload_samples(samples, WIDTH, pixel), canvas.buffer, view_position=EYE)
+        return pixel, canvas.read().reshape(-1, 4)
+
+    pixel, picture = with_graphics(draw)
+    assert (picture[pixel, 3] == 1.0).all() and picture[pixel, :3].any(axis=1).sum() > 10
+    assert not np.delete(picture, pixel, axis=0).any()

@@ -1,0 +1,137 @@
+"""Scenes that nobody meant: what cannot be done ends with one line, what is merely odd is done, with a warning."""
+
+import contextlib
+import json
+import os
+import re
+from pathlib import Path
+
+import bpy
+import hostile_scenes
+import numpy as np
+import pytest
+
+from ltsh_addon import cli, imaging
+from ltsh_addon.blender.processes import blender_process
+
+# `make soak` takes 10,000.
+MANY = int(os.environ.get("LTSH_MANY_LIGHTS", "500"))
+
+# id: scene, command, exit code, what stderr must say ("": nothing)
+CASES = {
+    "no camera": ("no_camera", "shade", 1, "has no active camera"),
+    "no light": ("no_light", "compare", 1, "no area light that renders, found no lights at all"),
+    "no light to bake": ("no_light", "bake", 1, "no area light that renders"),
+    "nothing to bake": ("nothing_at_all", "bake", 1, "no mesh that renders"),
+    "no object": ("no_object", "shade", 0, "sees no surface"),
+    "other lights only": ("other_lights_only", "shade", 1, r"found lights 'Sun' \(SUN\)"),
+    "light of no size": ("light_of_no_size", "shade", 1, "light 'Key': its size or scale is zero"),
+    "second light of no size": ("second_light_of_no_size", "compare", 0, "light 'Dot': its size or scale is zero"),
+    "light scaled to nothing": ("light_scaled_to_nothing", "shade", 1, "its size or scale is zero"),
+    "light without power": ("light_without_power", "shade", 1, "no area light that renders"),
+    "negative light": ("light_of_negative_power", "shade", 0, "negative power -50 W subtracts light"),
+    "endless power": ("light_of_endless_power", "shade", 1, "light 'Key': its power or color is not finite"),
+    "power NaN": ("light_of_power_that_is_no_number", "bake", 1, "light 'Key': its power or color is not finite"),
+    "light nowhere": ("light_that_is_nowhere", "shade", 1, "no area light that renders"),
+    "second light nowhere": ("second_light_that_is_nowhere", "shade", 0, "light 'Lost': it is farther away"),
+    "object nowhere": ("object_that_is_nowhere", "compare", 0, ""),
+    "object nowhere, baked": ("object_that_is_nowhere", "bake", 1, "not baked: object 'Lost'"),
+    "endless object": ("object_of_endless_size", "shade", 0, ""),
+    "endless object, baked": ("object_of_endless_size", "bake", 1, "object 'Lost' is farther away, or larger, than"),
+    "object of no size": ("object_of_no_size", "bake", 1, "object 'Flat': its transform has no inverse"),
+    "camera nowhere": ("camera_that_is_nowhere", "shade", 0, "sees no surface"),
+    "vertices nowhere": ("vertices_that_are_nowhere", "shade", 0, ""),
+    "far away": ("far_away", "shade", 0, ""),
+    "empty meshes": ("empty_meshes", "shade", 0, ""),
+    "empty meshes, baked": ("empty_meshes", "bake", 1, "object 'Empty' has no faces"),
+    "one pixel": ("one_pixel", "compare", 0, ""),
+    "paths as names": ("path_as_name", "bake", 0, ""),
+    "newline in names": ("newline_in_a_name", "bake", 0, "light 'Key.nLight': its size or scale is zero"),
+    "long names": ("long_names", "shade", 0, ""),
+    "long names, baked": ("long_names", "bake", 0, ""),
+    "no UV map": ("no_uv_map", "bake", 1, "object 'Plane' has no UV map, found none"),
+    "UV NaN": ("uv_that_is_no_number", "bake", 1, "all of UV map 'UVMap' lies outside"),
+    "missing files": ("missing_files", "shade", 0, "//nowhere/lost.png is missing"),
+}
+OPTIONS = {
+    "shade": ["--techniques", "ltsh4"],
+    "compare": ["--techniques", "ltsh4", "--cycles-samples", "2"],
+    "bake": ["--techniques", "ltsh4", "--size", "64"],
+}
+
+
+@pytest.fixture(scope="module")
+def one_blender(tmp_path_factory):
+    """A Blender that goes on from one scene to the next, also after one that it could not do, to save its start."""
+    with blender_process.kept_blender(tmp_path_factory.mktemp("blender")):
+        process = blender_process._kept.get()
+        end, process.end = process.end, lambda: None
+        yield
+        process.end = end
+
+
+@pytest.fixture
+def run(one_blender, monkeypatch, capsys):
+    monkeypatch.setattr(blender_process, "kept_blender", lambda folder: contextlib.nullcontext())
+
+    def command(*arguments):
+        capsys.readouterr()  # bpy tells on stdout that it saved a scene
+        code = cli.main([str(argument) for argument in arguments])
+        return code, *capsys.readouterr()
+
+    return command
+
+
+def saved(name: str, folder: Path, *arguments) -> Path:
+    """A scene of hostile_scenes as a file."""
+    getattr(hostile_scenes, name)(*arguments)
+    path = folder / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_hostile_scene(run, tmp_path, case):
+    scene, command, expected, complaint = CASES[case]
+    path, out = saved(scene, tmp_path), tmp_path / "a" / "b"
+    before = path.read_bytes()
+    code, stdout, stderr = run(command, path, "-o", out, "--quiet", *OPTIONS[command])
+    assert code == expected and re.search(complaint, stderr) and "Traceback" not in stderr, stderr
+    assert bool(stderr) == bool(complaint) and stdout.isprintable() == ("\n" not in stdout), stderr
+    assert path.read_bytes() == before and {item.name for item in tmp_path.iterdir()} == {"scene.blend", "a"}
+    assert [item.name for item in (tmp_path / "a").iterdir()] == ["b"]
+    files = list(out.glob("*.exr"))
+    if code == 0:
+        assert files and json.loads((out / "report.json").read_text(encoding="utf-8"))
+    for file in files:
+        assert all(np.isfinite(plane).all() for plane in imaging.read_channels(file).values()), file.name
+    if command != "bake" and code == 1:
+        assert len(stderr.splitlines()) == 1 and list(out.iterdir()) == []
+
+
+def test_many_lights_add_up(run, tmp_path):
+    """The sum over small lights in closed form: each sends P / (pi d^2) (h / d)^2 to a point of the plane below, which
+    reflects 1 / pi of it. 1 % leaves room for their size, 0.02 m at 1.5 m, and for what the specular lobe takes off."""
+    path, out = saved("many_lights", tmp_path, MANY), tmp_path / "out"
+    code, _, stderr = run("shade", path, "-o", out, "--techniques", "ltsh4", "--passes", "diffuse", "--quiet")
+    assert (code, stderr) == (0, "")
+    layers = imaging.read_layers(out / "shade.exr")
+    position, albedo = layers["samples.position"], layers["samples.diffuse_albedo"]
+    places = hostile_scenes.places_of_lights(MANY)
+    across = ((position[..., None, :2] - places) ** 2).sum(axis=-1)
+    irradiance = (0.01 / np.pi * 1.5**2 / (across + 1.5**2) ** 2).sum(axis=-1)
+    assert np.allclose(layers["ltsh4.diffuse"], irradiance[..., None] * albedo / np.pi, rtol=0.01)
+
+
+@pytest.mark.parametrize("command", ["shade", "bake"])
+@pytest.mark.parametrize("allowed", [False, True])
+def test_scripts_in_a_file_run_only_when_asked_for(tmp_path, monkeypatch, command, allowed):
+    mark = tmp_path / "mark"
+    monkeypatch.setenv(hostile_scenes.MARK, str(mark))
+    path = saved("scripts", tmp_path)
+    mark.unlink(missing_ok=True)
+    options = ["--enable-autoexec"] if allowed else []
+    code = cli.main([command, str(path), "-o", str(tmp_path / "out"), "--quiet", *OPTIONS[command], *options])
+    assert code == 0 and mark.exists() == allowed
+    if allowed:
+        assert "script" in mark.read_text()

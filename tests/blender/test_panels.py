@@ -1,0 +1,247 @@
+"""What the panels show, drawn into a recorded layout; how they look is for the drivers in tests/gui."""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from recorded_layout import FUNCTIONS, Layout, buttons, drawn, texts
+
+import ltsh_addon
+from ltsh_addon.blender.interface import availability, image_panels, operators, panels, results, viewer
+from ltsh_addon.blender.interface.job import Job
+from ltsh_addon.comparison import display_layers
+from ltsh_addon.imaging.exr import write_channels
+
+MAIN_3D, MAIN_RENDER = panels.MAIN
+JOBS = ("ltsh.shade", "ltsh.compare")
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """The add-on in a saved file with a plane, a camera and an area light."""
+    scene = parts.empty_scene()
+    ltsh_addon.register()
+    parts.add_plane(parts.principled("Floor", Roughness=0.4)[0])
+    parts.add_area_light()
+    parts.add_camera()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
+    yield scene
+    operators._running["job"] = None
+    ltsh_addon.unregister()
+
+
+def all_panels():
+    """Every panel of ours that is registered."""
+    ours = [getattr(bpy.types, name) for name in dir(bpy.types) if name.startswith("LTSH_PT_")]
+    ours = [panel for panel in ours if panel.__module__.startswith("ltsh_addon") and hasattr(panel, "draw")]
+    # Blender's own code draws that of the presets, and names it after the last one that was chosen.
+    return [panel for panel in ours if panel.__name__ != "LTSH_PT_presets"]
+
+
+def classes(base):
+    """Every class of ours that is registered."""
+    return [kind for kind in base.__subclasses__() if kind.__module__.startswith("ltsh_addon") and kind.is_registered]
+
+
+def add_results(scene, tmp_path, partial="", names=("ltsh4", "cycles")):
+    """Results of a comparison as `display_layers.write` leaves them, of random pictures."""
+    output = Path(bpy.path.abspath("//ltsh")) / "compare"
+    output.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(1)
+    channels = {"coverage.hit.V": np.ones((4, 6), np.float32)}
+    for layer in [*names, "cycles_A", "cycles_B", *(f"error_{name}" for name in names if name != "cycles")]:
+        for letter in "RGB":
+            channels[f"{layer}.specular.{letter}"] = random.random((4, 6), np.float32)
+    write_channels(output / "compare.exr", channels)
+    row = {"relative_l2": 0.1234, "bias": -0.0151, "flip": 0.0321, "unbiased_squared_error": 0.01}
+    rows = {name: {"against_cycles": row} for name in names if name != "cycles"}
+    report = {"passes": {"specular": {"noise": 0.02, "techniques": rows}}, "warnings": ["Light 'Key': approximated"]}
+    results.show(scene, display_layers.write("compare", output, report, partial))
+    return results.result_of(scene)
+
+
+# ---- the recorder itself
+
+
+def test_the_recorder_refuses_what_blender_refuses(scene):
+    layout = Layout()
+    for mistake in (
+        lambda: layout.label(txt="x"),
+        lambda: layout.label(text="x", icon="NO_SUCH_ICON"),
+        lambda: layout.prop(scene, "no_such_property"),
+        lambda: layout.lable(text="x"),
+        lambda: setattr(layout, "enable", False),
+        lambda: setattr(layout.operator("ltsh.show_in_render"), "no_such_property", 1),
+        lambda: layout.operator("ltsh.no_such_operator"),
+    ):
+        with pytest.raises((AssertionError, AttributeError, KeyError)):
+            mistake()
+    assert "text" in FUNCTIONS["label"].parameters
+    row = layout.row()
+    row.enabled = False
+    row.column().operator("ltsh.shade")
+    assert buttons(layout.shown)["ltsh.shade"] is False
+
+
+# ---- names and tooltips
+
+
+def described(kind):
+    """(name, description) of the properties that a class adds itself."""
+    return [
+        (f"{kind.__name__}.{item.identifier}", item)
+        for item in kind.bl_rna.properties
+        if item.identifier in getattr(kind, "__annotations__", {}) and not item.is_hidden
+    ]
+
+
+def test_everything_that_can_be_clicked_says_what_it_does(scene):
+    operators_of_ours = classes(bpy.types.Operator)
+    assert len(operators_of_ours) >= 18
+    for kind in operators_of_ours:
+        name = kind.bl_idname.partition("_OT_")[2] or kind.bl_idname.partition(".")[2]
+        text = getattr(bpy.ops.ltsh, name).get_rna_type().description
+        assert len(text) > 15 and not text.endswith("."), (kind.__name__, text)
+        assert kind.bl_label and kind.bl_label[0].isupper(), kind.__name__
+    found = [item for base in (bpy.types.PropertyGroup, bpy.types.Operator, bpy.types.AddonPreferences)
+             for kind in classes(base) for item in described(kind)]  # fmt: skip
+    assert len(found) >= 30
+    for name, item in found:
+        if item.type == "COLLECTION":
+            continue
+        assert item.name and len(item.description) > 8, (name, item.name, item.description)
+        assert not item.description.endswith("."), (name, item.description)
+        for choice in item.enum_items if item.type == "ENUM" else ():
+            assert choice.name and choice.description and not choice.description.endswith("."), (name, choice.name)
+    for panel in all_panels():
+        assert panel.bl_label, panel
+
+
+# ---- drawing
+
+
+@pytest.mark.parametrize("width", [220, 420, 900])
+def test_every_panel_draws_in_every_state(scene, tmp_path, width):
+    """Nothing selected and no results, a job that runs, results that are partial, and those that are complete."""
+    drawn_panels = all_panels()
+    assert len(drawn_panels) >= 14
+
+    def draw_all():
+        for panel in drawn_panels:
+            for function in ("draw", "draw_header_preset"):
+                if hasattr(panel, function):
+                    drawn(panel, function, width)
+
+    draw_all()
+    operators._running["job"] = Job("Compare with Cycles", 9, tmp_path, stage="Cycles A", fraction=0.25)
+    draw_all()
+    operators._running["job"] = None
+    for partial in ("Not complete: without Cycles", ""):
+        add_results(scene, tmp_path, partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
+        draw_all()
+    bpy.ops.object.select_all(action="SELECT")
+    for mode in ("A", "WIPE", "SIDE", "ERROR"):
+        scene.ltsh.mode = mode
+        draw_all()
+
+
+@pytest.mark.parametrize("width", [220, 300, 600])
+def test_sentences_are_broken_into_lines_that_fit(scene, width):
+    """At 220 pixels too; letters of Blender's interface are 6.6 pixels wide on average."""
+    scene.camera = None
+    bpy.data.objects["Light"].hide_render = True
+    for factor in (1.0, 2.0):
+        shown = drawn(MAIN_3D, width=width * factor, scale=factor)
+        assert "The scene has no active camera" in texts(shown)
+        lines = [item.what for item in shown if item.kind == "label"]
+        assert max(len(line) for line in lines) * 6.6 < max(width, 16 * 6.6), lines
+
+
+def test_both_places_show_the_same(scene):
+    assert drawn(MAIN_3D) == drawn(MAIN_RENDER)
+    for first, second in zip(panels.PARTS[::2], panels.PARTS[1::2], strict=True):
+        assert drawn(first) == drawn(second)
+        assert (first.bl_space_type, second.bl_space_type) == ("VIEW_3D", "PROPERTIES")
+
+
+def test_buttons_can_be_clicked_in_a_scene_that_is_ready(scene):
+    shown = drawn(MAIN_3D)
+    assert buttons(shown) == dict.fromkeys((*JOBS, "ltsh.preview"), True)
+    assert "24 × 16 px" in texts(shown)
+
+
+def test_what_is_missing_is_said_and_the_buttons_are_gray(scene):
+    scene.camera = None
+    shown = drawn(MAIN_3D)
+    assert "The scene has no active camera" in texts(shown)
+    found = buttons(shown)
+    assert found == dict.fromkeys(JOBS, False) | {"ltsh.add_camera": True, "ltsh.preview": True}
+
+
+def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
+    monkeypatch.setattr(
+        "ltsh_addon.blender.interface.preflight.missing_libraries", lambda: "OpenEXR cannot be imported (x)"
+    )
+    bpy.data.objects["Plane"].select_set(True)
+    shown = drawn(MAIN_3D)
+    assert "OpenEXR cannot be imported" in texts(shown)
+    assert buttons(shown) == dict.fromkeys(JOBS, False) | {"ltsh.preview": True}
+    bake = drawn(panels.PARTS[0])
+    assert "OpenEXR cannot be imported" in texts(bake) and buttons(bake) == {"ltsh.bake": False}
+    for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
+        with pytest.raises(RuntimeError, match="OpenEXR cannot be imported"):
+            operator()
+    assert availability.missing_libraries() is None
+
+
+def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
+    operators._running["job"] = Job("Compare with Cycles", 9, tmp_path, stage="Cycles A", fraction=0.25, step=3)
+    shown = drawn(MAIN_3D)
+    assert buttons(shown) == {"ltsh.cancel": True}
+    (progress,) = [item.what for item in shown if item.kind == "progress"]
+    assert progress.startswith("Cycles, First Half  25 %")
+    assert "Compare with Cycles" in texts(shown) and "Step 3 / 9" in texts(shown)
+
+
+def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
+    parts.add_area_light("Torn")
+    bpy.data.objects["Torn"].data.type = "POINT"
+    glass, _ = parts.bsdf_material("ShaderNodeBsdfHairPrincipled", "Fur")
+    parts.add_plane(glass, name="Fur")
+    bpy.context.view_layer.update()
+    shown = drawn(panels.PARTS[2])
+    signs = {item.what: item.icon for item in shown if item.icon}
+    assert signs["Light"] == "CHECKMARK" and signs["Torn"] == "CANCEL"
+    header = drawn(panels.PARTS[2], "draw_header_preset")
+    assert [item.what for item in header] == ["2", "1"]
+    signs = {item.what: item.icon for item in drawn(panels.PARTS[4]) if item.icon}
+    assert signs["Floor"] == "CHECKMARK" and signs["Fur"] == "CANCEL"
+
+
+def test_numbers_are_those_of_the_report(scene, tmp_path):
+    add_results(scene, tmp_path)
+    shown = drawn(image_panels.CLASSES[0])
+    for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
+        assert number in texts(shown).replace("\u00a0", " "), number
+    narrow = texts(drawn(image_panels.CLASSES[0], width=220)).replace("\u00a0", " ")
+    assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
+    assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
+
+
+def test_results_that_are_partial_say_so(scene, tmp_path):
+    add_results(scene, tmp_path, "Not complete: without Cycles", ("ltc", "ltsh4"))
+    assert "Not complete: without Cycles" in texts(drawn(image_panels.CLASSES[0]))
+
+
+def test_the_image_editor_offers_the_pictures_that_are_there(scene, tmp_path):
+    add_results(scene, tmp_path, names=("ltsh4", "cycles"))
+    viewer.refresh(scene)
+    panel = image_panels.LTSH_PT_IMAGE_results
+    scene.ltsh.mode = "WIPE"
+    shown = [item.what for item in drawn(panel)]
+    assert shown.count("first") == shown.count("second") == 2 and "split" in shown and "error_scale" not in shown
+    scene.ltsh.mode = "ERROR"
+    shown = [item.what for item in drawn(panel)]
+    assert "error_scale" in shown and "split" not in shown

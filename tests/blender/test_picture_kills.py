@@ -1,0 +1,114 @@
+"""Comparisons ended at random moments, or by a full disk, and gone on with: byte for byte what one run gives."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+
+import bake_scenes
+import bpy
+import fake_scene
+import kills
+import programs
+import pytest
+
+from ltsh_addon import cli
+
+OPTIONS = "--frames 1-2 --resolution 64x48 --techniques ltc,ltsh4 --cycles-samples 4 --quiet".split()
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes as Linux tells of them")
+
+
+@pytest.fixture(scope="module")
+def trial(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trial")
+    bake_scenes.textured_scene()
+    path = bake_scenes.save(folder)
+
+    def command(output, *more):
+        return programs.command_line("compare", path, "-o", output, *OPTIONS, *more)
+
+    return kills.Trial(command, folder)
+
+
+def test_after_signals_at_random_moments_resume_gives_the_same_bytes(trial):
+    assert {"compare_0001.exr", "compare_0002.png", "report.html", "report.json"} < set(trial.expected)
+    for number, moment in zip((signal.SIGKILL, signal.SIGTERM), kills.moments(5, 2, trial.seconds), strict=True):
+        trial.end_after("random", moment, number)
+    trial.check("random")
+    assert trial.end_while_writing("writing")
+    trial.check("writing")
+
+
+@pytest.mark.skipif(bool(bpy.app.binary_path), reason="Blender does not start under a limit of files")
+def test_after_a_full_disk_resume_gives_the_same_bytes(trial):
+    """A file as large as may be is what stands for it where nobody may mount a small disk."""
+    # In KiB: the samples that Blender renders do not fit; of the pictures the last bytes do not.
+    largest = min(len(trial.expected[f"compare_000{frame}.exr"]) for frame in (1, 2)) // 1024
+    for limit, complaint in ((40, "no room for temporary files"), (largest, "exr: cannot be written")):
+        code, said = trial.end_by_limit(f"limit {limit}", limit)
+        assert code == 1 and said and all(complaint in line for line in said.splitlines()), said
+        assert trial.left(f"limit {limit}") == [] and list(trial.runs.temporary.iterdir()) == []
+        trial.check(f"limit {limit}")
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 100 KiB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=100k", "none", folder]
+    mounted = subprocess.run(command, capture_output=True, check=False)
+    if mounted.returncode:
+        pytest.skip("only root may mount a small disk")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+@pytest.fixture
+def room(tmp_path, monkeypatch):
+    fake_scene.FakeChild().install(monkeypatch)
+    path = tmp_path / "room.blend"
+    path.write_bytes(b"BLENDER")
+    return path
+
+
+@pytest.mark.parametrize("command", ["shade", "compare"])
+def test_a_full_disk_is_one_line_and_no_half_file(room, small_disk, capsys, command):
+    (small_disk / "other").write_bytes(bytes(90 << 10))
+    assert cli.main([command, str(room), "-o", str(small_disk / "out"), "--quiet", "--techniques", "ltc"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"ltsh: {small_disk}/out/") and line.endswith("cannot be written: No space left on device")
+    assert not kills.is_writing(small_disk) and not (small_disk / "out" / "report.json").exists()
+
+
+@pytest.mark.parametrize("command", ["shade", "compare"])
+def test_a_read_only_disk_is_named_before_anything_starts(room, small_disk, capsys, command):
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    assert cli.main([command, str(room), "-o", str(small_disk / "out"), "--quiet"]) == 1
+    expected = f"output folder {small_disk}/out: cannot be written (Read-only file system); choose another with -o"
+    assert capsys.readouterr().err == f"ltsh: {expected}\n"
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_folder_that_vanishes_meanwhile(room, tmp_path, capsys, monkeypatch, kept):
+    """It is made again where it may be, else named: something else has its name now."""
+    from ltsh_addon.blender.processes import child
+
+    extract, out = child.extract, tmp_path / "out"
+
+    def vanishing(*arguments, **options):
+        found = extract(*arguments, **options)
+        shutil.rmtree(out)
+        if not kept:
+            out.write_text("mine")
+        return found
+
+    monkeypatch.setattr(child, "extract", vanishing)
+    code = cli.main(["compare", str(room), "-o", str(out), "--quiet", "--techniques", "ltc"])
+    said = capsys.readouterr().err
+    if kept:
+        assert code == 0 and json.loads((out / "report.json").read_text())["lights"]
+    else:
+        assert code == 1 and len(said.splitlines()) == 1 and str(out) in said and out.read_text() == "mine"

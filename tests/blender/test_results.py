@@ -1,0 +1,268 @@
+"""Results as images: wipe, difference, probe, numbers, multi-layer files, presets, the manual."""
+
+import json
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+
+import ltsh_addon
+from ltsh_addon import imaging
+from ltsh_addon.blender.interface import operators_view, probe, results, settings_presets, viewer
+from ltsh_addon.comparison import display_layers
+from ltsh_addon.imaging.exr import write_channels
+from ltsh_addon.imaging.false_color import signed_error_colors
+
+HEIGHT, WIDTH = 6, 10
+PICTURES = ("ltc", "ltsh4", "cycles")
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """The add-on, a saved file, and results of a comparison in its folder that are shown."""
+    scene = parts.empty_scene()
+    ltsh_addon.register()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
+    write_results(tmp_path)
+    results.show(scene, tmp_path / "ltsh" / "compare" / "images")
+    assert viewer.refresh(scene)
+    yield scene
+    ltsh_addon.unregister()
+
+
+def write_results(folder, seed=1, command="compare"):
+    """Random pictures as `ltsh compare` leaves them, prepared for Blender; {layer: (H, W, 3)}."""
+    random = np.random.default_rng(seed)
+    output = folder / "ltsh" / command
+    output.mkdir(parents=True, exist_ok=True)
+    pictures = {f"{name}.{part}": random.random((HEIGHT, WIDTH, 3), np.float32) * 4.0 - 0.5
+                for name in (*PICTURES, "cycles_A", "cycles_B") for part in ("specular", "diffuse")}  # fmt: skip
+    channels = {"coverage.hit.V": np.ones((HEIGHT, WIDTH), np.float32)}
+    for layer, pixels in pictures.items():
+        channels |= {f"{layer}.{letter}": pixels[..., index] for index, letter in enumerate("RGB")}
+    write_channels(output / f"{command}.exr", channels)
+    report = {"passes": {}, "warnings": []}
+    display_layers.write(command, output, report)
+    for name in PICTURES:
+        pictures[f"{name}.combined"] = pictures[f"{name}.specular"] + pictures[f"{name}.diffuse"]
+    return pictures
+
+
+def seen():
+    """The image "LTSH Comparison", row 0 above."""
+    image = bpy.data.images["LTSH Comparison"]
+    flat = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(flat)
+    return flat.reshape(image.size[1], image.size[0], 4)[::-1, :, :3]
+
+
+def test_left_of_the_line_is_the_first_picture_and_right_the_second(scene, tmp_path):
+    pictures = write_results(tmp_path)
+    for split, columns in ((0.0, 0), (0.3, 3), (1.0, WIDTH)):
+        scene.ltsh.split = split
+        expected = pictures["cycles.combined"].copy()
+        expected[:, :columns] = pictures["ltsh4.combined"][:, :columns]
+        np.testing.assert_array_equal(seen(), expected)
+
+
+def test_changing_technique_and_pass_changes_the_picture_at_once(scene, tmp_path):
+    pictures = write_results(tmp_path)
+    scene.ltsh.mode = "A"
+    for name in PICTURES:
+        for part in ("specular", "diffuse", "combined"):
+            scene.ltsh.first, scene.ltsh.pass_name = name, part
+            np.testing.assert_array_equal(seen(), pictures[f"{name}.{part}"])
+
+
+def test_side_by_side_and_swapped(scene, tmp_path):
+    pictures = write_results(tmp_path)
+    scene.ltsh.mode = "SIDE"
+    sides = [pictures["ltsh4.combined"], pictures["cycles.combined"]]
+    np.testing.assert_array_equal(seen(), np.concatenate(sides, axis=1))
+    bpy.ops.ltsh.swap()
+    np.testing.assert_array_equal(seen(), np.concatenate(sides[::-1], axis=1))
+
+
+def test_the_difference_has_the_colors_of_the_sheet(scene, tmp_path):
+    """Blender shows linear values; through the sRGB curve they are those of imaging.false_color."""
+    pictures = write_results(tmp_path)
+    scene.ltsh.mode, scene.ltsh.error_scale = "ERROR", 2.0
+    image = bpy.data.images["LTSH Comparison"]
+    assert not image.use_view_as_render
+    weights = np.array([0.2126, 0.7152, 0.0722])
+    difference = (pictures["ltsh4.combined"] - pictures["cycles.combined"]) @ weights
+    linear = seen().astype(np.float64)
+    shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    # The colors stand in a table of 1023 steps of the whole range.
+    assert np.abs(shown - signed_error_colors(difference, 2.0)).max() < 0.01
+    red = difference > 1.0
+    assert red.any() and (linear[red][:, 0] > linear[red][:, 2]).all()
+    scene.ltsh.mode = "WIPE"
+    assert image.use_view_as_render
+
+
+def test_the_scale_of_the_difference_is_that_of_the_results_or_the_artists(scene):
+    result = results.result_of(scene)
+    choice = results.choice_of(scene.ltsh, result)
+    group = result.groups[""]
+    assert viewer.error_scale(scene.ltsh, group, choice) == group["scales"]["combined"] > 0.0
+    scene.ltsh.error_scale = 0.25
+    assert viewer.error_scale(scene.ltsh, group, choice) == 0.25
+
+
+def test_the_probe_reads_every_picture_at_the_pixel(scene, tmp_path):
+    pictures = write_results(tmp_path)
+    result = results.result_of(scene)
+    choice = results.choice_of(scene.ltsh, result)
+    for point, place in (((0.0, 0.0), (0, 0)), ((1.0, 1.0), (WIDTH - 1, HEIGHT - 1)), ((0.55, 0.2), (5, 1))):
+        pixel, rows = probe.values_at(scene, result, choice, point)
+        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4", "Cycles"]
+        for name, (_, values) in zip(PICTURES, rows, strict=True):
+            expected = pictures[f"{name}.combined"][HEIGHT - 1 - place[1], place[0]]
+            np.testing.assert_array_equal(np.float32(values), expected)
+
+
+def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path):
+    scene.ltsh.mode, scene.ltsh.first = "WIPE", "ltc"
+    before = seen().copy()
+    path = tmp_path / "room.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    np.testing.assert_array_equal(seen(), before)
+    viewer.settle()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    assert bpy.context.scene.ltsh.first == "ltc"
+    np.testing.assert_array_equal(seen(), before)
+    # Pictures are read from the folder of the results: moved with it, they are found.
+    assert bpy.context.scene.ltsh.result_folder.startswith("//")
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    path.rename(moved / "room.blend")
+    (tmp_path / "ltsh").rename(moved / "ltsh")
+    bpy.ops.wm.open_mainfile(filepath=str(moved / "room.blend"))
+    np.testing.assert_array_equal(seen(), before)
+
+
+def test_new_results_replace_the_old_pictures(scene, tmp_path):
+    pictures = write_results(tmp_path, seed=2)
+    results.show(scene, tmp_path / "ltsh" / "compare" / "images")
+    viewer.refresh(scene)
+    scene.ltsh.mode = "A"
+    np.testing.assert_array_equal(seen(), pictures["ltsh4.combined"])
+    assert len([image for image in bpy.data.images if image.name.startswith("LTSH ltsh4")]) == 1
+
+
+@pytest.mark.parametrize("damage", ["folder gone", "picture gone", "index broken"])
+def test_results_that_vanish_do_no_harm(scene, tmp_path, damage):
+    folder = tmp_path / "ltsh" / "compare" / "images"
+    if damage == "folder gone":
+        (tmp_path / "ltsh").rename(tmp_path / "gone")
+    elif damage == "picture gone":
+        (folder / "ltc.specular.exr").unlink()
+    else:
+        (folder / "index.json").write_text('{"command": ')
+    # Setting a property would print the error of its update function, which nobody can catch.
+    scene.ltsh["first"], scene.ltsh["pass_name"] = 1, 1
+    viewer.changed(scene.ltsh, bpy.context)
+    if damage != "picture gone":
+        assert results.result_of(scene) is None and not bpy.ops.ltsh.swap.poll()
+        with pytest.raises(RuntimeError, match="There are no results yet"):
+            bpy.ops.ltsh.swap()
+        with pytest.raises(RuntimeError, match="holds no results: run the command first"):
+            bpy.ops.ltsh.show_results(command="compare")
+
+
+def test_two_scenes_have_results_of_their_own(scene, tmp_path):
+    first = seen().copy()
+    other = bpy.data.scenes.new("Other")
+    pictures = write_results(tmp_path / "other", seed=3)
+    results.show(other, tmp_path / "other" / "ltsh" / "compare" / "images")
+    viewer.refresh(other)
+    np.testing.assert_array_equal(seen(), first)
+    image = viewer.viewer_image(other)
+    assert image.name == "LTSH Comparison.001"
+    assert abs(image.pixels[0] - pictures["ltsh4.combined"][-1, 0, 0]) == 0.0
+
+
+def test_the_multilayer_file_is_the_one_of_the_command(scene, tmp_path):
+    source = (tmp_path / "ltsh" / "compare" / "compare.exr").read_bytes()
+    target = tmp_path / "saved.exr"
+    assert bpy.ops.ltsh.save_exr(filepath=str(target)) == {"FINISHED"}
+    assert target.read_bytes() == source and "ltsh4.specular" in imaging.read_layers(target)
+    # Onto itself it stays.
+    assert bpy.ops.ltsh.save_exr(filepath=str(tmp_path / "ltsh" / "compare" / "compare.exr")) == {"FINISHED"}
+    assert (tmp_path / "ltsh" / "compare" / "compare.exr").read_bytes() == source
+    with pytest.raises(RuntimeError, match="Error: .*nowhere"):
+        bpy.ops.ltsh.save_exr(filepath=str(tmp_path / "nowhere" / "saved.exr"))
+
+
+def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
+    """The report here has none at all: relative L2 by its definition, from both halves of Cycles."""
+    index = json.loads((tmp_path / "ltsh" / "compare" / "images" / "index.json").read_text())
+    layers = imaging.read_layers(tmp_path / "ltsh" / "compare" / "compare.exr")
+    row = index["groups"][""]["figures"]["specular"]["techniques"]["ltsh4"]
+    halves = [layers[f"cycles_{half}.specular"].astype(np.float64) for half in "AB"]
+    technique = layers["ltsh4.specular"]
+    squared = ((technique - halves[0]) * (technique - halves[1])).sum() / (halves[0] * halves[1]).sum()
+    assert row["unbiased_squared_error"] == pytest.approx(squared, rel=1e-6)
+    assert 0.0 < row["flip"] < 1.0
+
+
+# ---- presets and the manual
+
+
+def preset_files():
+    return sorted(Path(settings_presets.FOLDER, "presets", "ltsh").glob("*.py"))
+
+
+def test_presets_of_ours_set_everything_they_name(scene):
+    assert [path.stem for path in preset_files()] == ["Draft", "Measurement", "Standard"]
+    seen_values = set()
+    for path in preset_files():
+        assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname="LTSH_PT_presets") == {"FINISHED"}
+        values = tuple(str(getattr(scene.ltsh, name)) for name in settings_presets.KEPT)
+        seen_values.add(values)
+        named = [line.split("=")[0].strip() for line in path.read_text().splitlines() if line.startswith("settings.")]
+        assert set(named) <= {f"settings.{name}" for name in settings_presets.KEPT}
+    assert len(seen_values) == 3
+
+
+def test_a_preset_of_the_artist_brings_the_settings_back(scene, tmp_path, monkeypatch):
+    def folder(kind, *, path="", create=False):
+        (tmp_path / path).mkdir(parents=True, exist_ok=True)
+        return str(tmp_path / path)
+
+    monkeypatch.setattr(bpy.utils, "user_resource", folder)
+    scene.ltsh.techniques, scene.ltsh.cycles_samples, scene.ltsh.bake_size = {"ltsh2", "reference"}, 77, "2048"
+    assert bpy.ops.ltsh.add_preset(name="Mine") == {"FINISHED"}
+    (saved,) = tmp_path.glob("presets/ltsh/*.py")
+    scene.ltsh.techniques, scene.ltsh.cycles_samples, scene.ltsh.bake_size = {"ltc"}, 4, "256"
+    bpy.ops.script.execute_preset(filepath=str(saved), menu_idname="LTSH_PT_presets")
+    assert (scene.ltsh.techniques, scene.ltsh.cycles_samples, scene.ltsh.bake_size) == (
+        {"ltsh2", "reference"}, 77, "2048")  # fmt: skip
+
+
+def test_every_setting_of_a_job_is_part_of_presets(scene):
+    about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale", "probe"}
+    of_the_file = {"output_folder", "result_folder", "bake_uv_map"}
+    settings = set(scene.ltsh.__class__.__annotations__)
+    assert settings - about_view - of_the_file == set(settings_presets.KEPT)
+
+
+def test_a_manual_that_is_missing_is_told(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(operators_view, "MANUAL", tmp_path / "manual.md")
+    with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
+        bpy.ops.ltsh.manual()
+
+
+def test_the_manual_names_what_the_panels_show(scene):
+    """Every button and every setting, by the words on it."""
+    text = operators_view.MANUAL.read_text(encoding="utf-8")
+    buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Pixel Probe", "Open in Image Editor",
+               "Cancel", "Esc")  # fmt: skip
+    names = [item.name for item in scene.ltsh.bl_rna.properties
+             if item.identifier in scene.ltsh.__class__.__annotations__ and not item.is_hidden]  # fmt: skip
+    skipped = {"A", "B", "groups", "View", "Pass", "Object"}
+    assert [word for word in (*buttons, *names) if word not in text and word not in skipped] == []
+    assert len(text.splitlines()) < 120 and max(map(len, text.splitlines())) <= 120

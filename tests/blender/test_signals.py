@@ -1,0 +1,126 @@
+"""Ctrl-C and SIGTERM in every phase of a command: the exit code, one line, no file and no process left."""
+
+import os
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import bpy
+import programs
+import pytest
+import scene_parts
+from kills import is_blenders_own
+
+ROOT = Path(__file__).resolve().parents[2]
+LINES = {signal.SIGINT: "ltsh: interrupted", signal.SIGTERM: "ltsh: terminated"}
+LARGE = "--reference-samples", "1000000"
+# A second would do; the machine may be busy with other tests.
+SECONDS = 5.0
+pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="processes as Linux tells them")
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    path = tmp_path_factory.mktemp("scene") / "room.blend"
+    scene_parts.empty_scene()
+    scene_parts.add_plane(scene_parts.principled(Metallic=1.0, Roughness=0.4)[0])
+    scene_parts.add_area_light("Key")
+    scene_parts.add_top_camera()
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
+
+
+@pytest.fixture
+def temporary_root(tmp_path, monkeypatch):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    return folder
+
+
+class Running:
+    """A command that has got to the stage whose line starts with `stage`."""
+
+    def __init__(self, stage, *arguments):
+        command = programs.command_line(*arguments)
+        self.process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            # A shell that runs the tests in the background has Ctrl-C ignored, which would be inherited.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )  # fmt: skip
+        self._watchdog = threading.Timer(90.0, self.process.kill)
+        self._watchdog.start()
+        for line in self.process.stderr:
+            if line.startswith(stage):
+                return
+        raise AssertionError(f"{stage} did not come, code {self.process.wait()}")
+
+    def processes(self) -> list[int]:
+        """Ids of the children of all its threads."""
+        tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
+        return [int(word) for task in tasks for word in (task / "children").read_text().split()]
+
+    def close(self):
+        self._watchdog.cancel()
+        self.process.kill()
+        self.process.communicate()
+
+
+def ends(process: int, seconds: float) -> bool:
+    """True where the process has ended and was reaped, within `seconds`."""
+    limit = time.monotonic() + seconds
+    while os.path.exists(f"/proc/{process}"):
+        if time.monotonic() > limit:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def left_over(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if not is_blenders_own(path)]
+
+
+def compare(room, out):
+    return "compare", room, "-o", out, "--resolution", "640x360", "--cycles-samples", "100000"
+
+
+def shade(room, out):
+    """Quadrature on all cores for longer than anybody waits."""
+    return "shade", room, "-o", out, "--resolution", "720x400", "--techniques", "reference", *LARGE
+
+
+@pytest.mark.parametrize("number", LINES)
+@pytest.mark.parametrize(("stage", "arguments"), [("Cycles A", compare), ("Reference", shade)])
+def test_signals_end_a_command_and_leave_nothing(room, tmp_path, temporary_root, number, stage, arguments):
+    out = tmp_path / "out"
+    running = Running(stage, *arguments(room, out))
+    try:
+        time.sleep(0.5)  # into the stage
+        children = running.processes()
+        running.process.send_signal(number)
+        running.process.send_signal(number)  # an impatient second one does not disturb
+        stdout, stderr = running.process.communicate(timeout=SECONDS)
+    finally:
+        running.close()
+    assert running.process.returncode == 128 + number and programs.said_nothing(stdout)
+    assert stderr.splitlines()[-1] == LINES[number]
+    assert "Traceback" not in stderr and children and all(ends(child, 0.0) for child in children)
+    assert left_over(out) == left_over(temporary_root) == []
+
+
+def test_a_killed_command_takes_all_its_processes_along(room, tmp_path, temporary_root):
+    """They see that the other end of a pipe is closed: Blender, which removes their temporary folder, and workers."""
+    running = Running("Reference", *shade(room, tmp_path / "out"))
+    try:
+        time.sleep(0.5)
+        children = running.processes()
+        running.process.kill()
+        running.process.wait(SECONDS)
+    finally:
+        running.close()
+    assert children and all(ends(child, 20.0) for child in children)
+    assert left_over(tmp_path / "out") == left_over(temporary_root) == []

@@ -1,0 +1,277 @@
+"""Materials in the viewport: its picture against that of samples which Cycles took, and what cannot be shown."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from graphics_card import Canvas, with_graphics
+
+from ltsh_addon import shading
+from ltsh_addon.blender.materials.surface_looks import look_of
+from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.viewport import view_text
+from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
+from ltsh_addon.blender.viewport.surface_pass import View
+from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+
+SIZE = (96, 72)
+COLUMNS = 4
+# Mesa's llvmpipe decodes the colors of sRGB images by a polynomial, up to 0.7 % off; without them 5e-3 would do.
+RELATIVE, ABSOLUTE = 1e-2, 1e-4
+
+
+def image(name, is_data=False, shape=(8, 8)):
+    """A packed image of random colors."""
+    made = bpy.data.images.new(name, *shape, is_data=is_data)
+    pixels = np.ones((shape[1], shape[0], 4), np.float32)
+    pixels[..., :3] = np.random.default_rng(len(name)).uniform(0.2, 0.9, (shape[1], shape[0], 3))
+    made.pixels.foreach_set(pixels.ravel())
+    made.update()
+    made.pack()
+    return made
+
+
+def textured(name, socket, is_data=False, **settings):
+    """A Principled BSDF with an image at `socket`; material, its node, and the image's."""
+    material, node = parts.principled(name, Roughness=0.35)
+    texture = material.node_tree.nodes.new("ShaderNodeTexImage")
+    texture.image = image(name, is_data)
+    for key, value in settings.items():
+        setattr(texture, key, value)
+    material.node_tree.links.new(texture.outputs["Color"], node.inputs[socket])
+    return material, node, texture
+
+
+def color_image():
+    return textured("color image", "Base Color")[0]
+
+
+def roughness_image():
+    return textured("roughness image", "Roughness", is_data=True)[0]
+
+
+def clipped_and_mapped():
+    material, _, texture = textured("mapped", "Base Color", extension="EXTEND", interpolation="Closest")
+    tree = material.node_tree
+    coordinates, mapping = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+    mapping.inputs["Location"].default_value = (0.2, -0.1, 0.0)
+    mapping.inputs["Rotation"].default_value = (0.0, 0.0, 0.5)
+    mapping.inputs["Scale"].default_value = (1.7, 0.8, 1.0)
+    tree.links.new(coordinates.outputs["UV"], mapping.inputs["Vector"])
+    tree.links.new(mapping.outputs["Vector"], texture.inputs["Vector"])
+    return material
+
+
+def one_channel():
+    """The green of an image, turned around, times a number, as roughness."""
+    material, node, texture = textured("channel", "Base Color", is_data=True)
+    tree = material.node_tree
+    separate, math = tree.nodes.new("ShaderNodeSeparateColor"), tree.nodes.new("ShaderNodeMath")
+    invert = tree.nodes.new("ShaderNodeInvert")
+    math.operation, math.inputs[1].default_value = "MULTIPLY", 0.6
+    tree.links.new(texture.outputs["Color"], invert.inputs["Color"])
+    tree.links.new(invert.outputs["Color"], separate.inputs["Color"])
+    tree.links.new(separate.outputs["Green"], math.inputs[0])
+    tree.links.new(math.outputs["Value"], node.inputs["Roughness"])
+    return material
+
+
+def mixed_colors():
+    material, node, texture = textured("mixed", "Base Color")
+    tree = material.node_tree
+    mix = tree.nodes.new("ShaderNodeMix")
+    mix.data_type, mix.blend_type = "RGBA", "MULTIPLY"
+    mix.inputs[0].default_value = 0.7
+    mix.inputs[7].default_value = (0.9, 0.5, 0.2, 1.0)
+    tree.links.new(texture.outputs["Color"], mix.inputs[6])
+    tree.links.new(mix.outputs[2], node.inputs["Base Color"])
+    return material
+
+
+def normal_map():
+    material, node, texture = textured("normal map", "Base Color", is_data=True)
+    tree = material.node_tree
+    pixels = np.array(texture.image.pixels[:]).reshape(-1, 4)
+    slopes = np.random.default_rng(4).uniform(-0.25, 0.25, (len(pixels), 2))
+    pixels[:, :2], pixels[:, 2] = 0.5 + 0.5 * slopes, 0.5 + 0.5 * np.sqrt(1.0 - (slopes**2).sum(axis=1))
+    texture.image.pixels.foreach_set(pixels.astype(np.float32).ravel())
+    texture.image.pack()
+    bump = tree.nodes.new("ShaderNodeNormalMap")
+    bump.inputs["Strength"].default_value = 0.6
+    tree.links.remove(node.inputs["Base Color"].links[0])
+    tree.links.new(texture.outputs["Color"], bump.inputs["Color"])
+    tree.links.new(bump.outputs["Normal"], node.inputs["Normal"])
+    return material
+
+
+def grouped():
+    """A BSDF in a node group, with values from outside."""
+    group = bpy.data.node_groups.new("Paint", "ShaderNodeTree")
+    group.interface.new_socket("Tint", in_out="INPUT", socket_type="NodeSocketColor")
+    group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
+    start, end = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    inner = group.nodes.new("ShaderNodeBsdfGlossy")
+    inner.distribution, inner.inputs["Roughness"].default_value = "GGX", 0.4
+    group.links.new(start.outputs["Tint"], inner.inputs["Color"])
+    group.links.new(inner.outputs[0], end.inputs[0])
+    material, tree, output = parts.new_material("grouped")
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = group
+    node.inputs["Tint"].default_value = (0.8, 0.4, 0.3, 1.0)
+    tree.links.new(node.outputs[0], output.inputs["Surface"])
+    return material
+
+
+def with_specular(name, **inputs):
+    return lambda: parts.principled(name, **inputs)[0]
+
+
+MATERIALS = (
+    with_specular("plastic", Base_Color=(0.5, 0.2, 0.1, 1.0), Roughness=0.3, IOR=1.7, Specular_IOR_Level=0.3),
+    with_specular("metal", Base_Color=(0.9, 0.6, 0.3, 1.0), Metallic=1.0, Specular_Tint=(0.6, 0.9, 1.0, 1.0)),
+    with_specular("half metal", Base_Color=(0.3, 0.6, 0.3, 1.0), Metallic=0.4, Roughness=0.6),
+    lambda: parts.bsdf_material("ShaderNodeBsdfDiffuse", "chalk", Color=(0.2, 0.5, 0.8, 1.0))[0],
+    lambda: parts.bsdf_material("ShaderNodeBsdfGlossy", "mirror", Color=(0.8, 0.7, 0.6, 1.0), Roughness=0.2)[0],
+    color_image,
+    roughness_image,
+    clipped_and_mapped,
+    one_channel,
+    mixed_colors,
+    normal_map,
+    grouped,
+)
+
+
+def patches_of(materials):
+    """One square of each material, side by side, seen from above and a light over them."""
+    scene = parts.empty_scene(*SIZE)
+    rows = -(-len(materials) // COLUMNS)
+    for number, make in enumerate(materials):
+        row, column = divmod(number, COLUMNS)
+        parts.add_plane(make(), size=1.0, location=(column + 0.5 - 0.5 * COLUMNS, row + 0.5 - 0.5 * rows, 0.0))
+    parts.add_area_light(location=(0.5, 0.6, 1.4), size=1.5, size_y=1.0)
+    camera = parts.add_camera((0.0, -2.6, 3.4), (0.6, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    return scene, camera
+
+
+def viewport_picture(camera, shown, is_parallel):
+    """(H, W, 3), row 0 on top, and the notes."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
+    mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
+    try:
+        mirror.sync(depsgraph)
+        view = View.of(camera.matrix_world.inverted(), projection, is_parallel)
+        settings = ShownPicture("ltsh4", shown, "single", "ltc", 0.5, 1.0, 1.0, True)
+        renderer.draw(mirror, view, SIZE, settings, canvas.buffer)
+        return renderer.read()[::-1, :, :3].astype(np.float64), mirror.notes
+    finally:
+        renderer.free()
+
+
+def sampled_picture(path, name):
+    """(H, W, 3) of the samples that Cycles took, and the number of the square (H, W) that each pixel sees, or -1."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    found = child.extract(child.ExtractOptions(scene=path))
+    shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=(name,), workers=1)
+    square = np.full(SIZE[0] * SIZE[1], -1)
+    rows = -(-len(MATERIALS) // COLUMNS)
+    column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)
+                   for axis, count in enumerate((COLUMNS, rows)))  # fmt: skip
+    square[found.film.pixel] = COLUMNS * row + column
+    return found.film.image(shaded.combined), square.reshape(SIZE[1], SIZE[0])
+
+
+def away_from_edges(square):
+    """Pixels (H, W) all of whose neighbors see the same square."""
+    same = square >= 0
+    for axis in (0, 1):
+        for step in (-1, 1):
+            same &= np.roll(square, step, axis) == square
+    same[0] = same[-1] = same[:, 0] = same[:, -1] = False
+    return same
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@pytest.mark.parametrize(("name", "kind"), [("specular", "PERSP"), ("diffuse", "PERSP"), ("specular", "ORTHO")])
+def test_the_viewport_shows_what_cycles_sampled(tmp_path, name, kind):
+    _, camera = patches_of(MATERIALS)
+    camera.data.type, camera.data.ortho_scale = kind, 4.2
+    found, notes = with_graphics(lambda: viewport_picture(camera, name, kind == "ORTHO"))
+    expected, square = sampled_picture(tmp_path / "patches.blend", name)
+    usable = away_from_edges(square)
+    assert notes == []
+    failures = []
+    times = np.abs(found - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))
+    for number in range(len(MATERIALS)):
+        pixels = usable & (square == number)
+        assert pixels.sum() > 50
+        if times[pixels].max() > 1.0:
+            material = bpy.data.objects[f"Plane.{number:03d}" if number else "Plane"].active_material.name
+            failures.append(f"{material}: {times[pixels].max():.1f} times as far off as it may be")
+    assert not failures, "\n".join(failures)
+    assert expected[usable].max() > 0.05
+
+
+def test_long_lines_of_the_view_are_broken():
+    text = "Marble: Base Color is not resolved, because a texture of noise feeds it"
+    lines = view_text.wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))
+    assert lines[-1] == ("short", "blue") and len(lines) > 2
+    assert all(6.0 * len(part) <= 200.0 for part, _ in lines)
+    assert " ".join(part.strip() for part, color in lines if color == "red") == text
+
+
+def test_what_is_not_resolved_has_the_viewport_color_and_is_named():
+    parts.empty_scene()
+    material, node = parts.principled("Marble", Roughness=0.25)
+    noise = material.node_tree.nodes.new("ShaderNodeTexNoise")
+    material.node_tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
+    material.diffuse_color = (0.7, 0.1, 0.4, 1.0)
+    look = look_of(material)
+    np.testing.assert_allclose(look.value("color").offset, (0.7, 0.1, 0.4), rtol=1e-6)
+    np.testing.assert_allclose(look.value("roughness").offset, 0.25, rtol=1e-6)
+    assert look.notes == ("Marble: Base Color is not resolved",)
+
+
+@pytest.mark.parametrize(
+    ("node_type", "said"),
+    [("ShaderNodeBsdfHair", "Hair"), ("ShaderNodeBsdfRefraction", "Refraction")],
+)
+def test_materials_of_other_kinds_are_shown_in_their_viewport_color(node_type, said):
+    parts.empty_scene()
+    material, tree, output = parts.new_material("Odd")
+    tree.links.new(tree.nodes.new(node_type).outputs[0], output.inputs["Surface"])
+    material.diffuse_color = (0.2, 0.4, 0.6, 1.0)
+    look = look_of(material)
+    np.testing.assert_allclose(look.value("color").offset, (0.2, 0.4, 0.6), rtol=1e-6)
+    assert any(note.startswith("Odd: ") and said in note for note in look.notes)
+
+
+def test_of_mixed_shaders_the_heavier_is_shown_and_the_rest_named():
+    parts.empty_scene()
+    material, tree, output = parts.new_material("Mixed")
+    mix = tree.nodes.new("ShaderNodeMixShader")
+    mix.inputs[0].default_value = 0.7
+    light, heavy = tree.nodes.new("ShaderNodeBsdfDiffuse"), tree.nodes.new("ShaderNodeBsdfGlossy")
+    heavy.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
+    tree.links.new(light.outputs[0], mix.inputs[1])
+    tree.links.new(heavy.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    look = look_of(material)
+    assert look.kind == "glossy"
+    np.testing.assert_allclose(look.value("color").offset, (0.1, 0.2, 0.3), rtol=1e-6)
+    assert any("of 2 BSDF nodes only" in note for note in look.notes)
+
+
+def test_nothing_of_the_file_is_changed():
+    parts.empty_scene()
+    materials = [make() for make in MATERIALS]
+    before = [[(node.name, [link.to_socket.name for link in material.node_tree.links]) for node in
+               material.node_tree.nodes] for material in materials]  # fmt: skip
+    images = {made.name: tuple(made.pixels) for made in bpy.data.images}
+    for material in materials:
+        look_of(material)
+    after = [[(node.name, [link.to_socket.name for link in material.node_tree.links]) for node in
+              material.node_tree.nodes] for material in materials]  # fmt: skip
+    assert after == before and {made.name: tuple(made.pixels) for made in bpy.data.images} == images

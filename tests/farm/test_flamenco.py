@@ -1,0 +1,116 @@
+"""The Flamenco job type, run by a JavaScript engine against a stub of Flamenco's interface; its tasks are commands that
+our command line takes and whose results are those of a single run."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import fake_scene
+import pytest
+
+from ltsh_addon import cli
+
+ROOT = Path(__file__).resolve().parents[2]
+ENGINE = shutil.which("node") or shutil.which("qjs") or shutil.which("nodejs")
+pytestmark = pytest.mark.skipif(ENGINE is None, reason="needs a JavaScript engine: apt-get install nodejs (or quickjs)")
+SCENE = "/shared/room 1.blend"
+
+
+def compiled(tmp_path, **settings):
+    """What the job type makes of `settings`."""
+    given = {"blendfile": SCENE, "output": "/shared/out", **settings}
+    script = tmp_path / "job.js"
+    texts = [(ROOT / name).read_text() for name in ("tests/farm/flamenco_stub.js", "farm/ltsh_bake.js")]
+    script.write_text("\n".join([*texts, f"report({json.dumps(given)});\n"]), encoding="utf-8")
+    done = subprocess.run([ENGINE, str(script)], capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)
+
+
+def commands(found):
+    """The arguments of `ltsh` of each task."""
+    arguments = []
+    for task in found["tasks"]:
+        (command,) = task["commands"]
+        assert (task["type"], command["name"]) == ("blender", "exec")
+        assert command["parameters"]["exe"] == "{blender}"
+        first, second, *rest = command["parameters"]["args"]
+        assert (first, second) == ("--command", "ltsh")
+        arguments.append(rest)
+    return arguments
+
+
+def test_settings_have_labels_and_descriptions(tmp_path):
+    settings = compiled(tmp_path)["settings"]
+    assert all(setting["label"] for setting in settings)
+    assert all(setting["description"] for setting in settings if setting.get("visible") != "hidden")
+    keys = [setting["key"] for setting in settings]
+    assert len(set(keys)) == len(keys) and {"blendfile", "output", "shards"} <= set(keys)
+
+
+@pytest.mark.parametrize("count", [1, 4, 17])
+def test_there_is_a_task_for_each_shard_and_a_merge_that_waits_for_all(tmp_path, count):
+    found = compiled(tmp_path, shards=count)
+    *shards, last = commands(found)
+    assert [line[line.index("--shard") + 1] for line in shards] == [f"{i}/{count}" for i in range(1, count + 1)]
+    assert all("--resume" in line for line in shards) and last == ["merge", "/shared/out"]
+    *tasks, merge = found["tasks"]
+    assert [task["dependencies"] for task in tasks] == [[]] * count and merge["dependencies"] == list(range(count))
+    assert len({task["name"] for task in found["tasks"]}) == count + 1
+
+
+BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True, "cycles_samples": 64, "frames": "-3"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({}, {"techniques": ("ltsh4",), "passes": ("specular", "diffuse"), "object": None, "frames": ()}),
+        (BAKE, {"object": ["Floor", "Big Wall"], "size": (256, 256), "error": True, "apply": True,
+                "cycles_samples": 64, "frames": (-3,)}),
+        ({"passes": "diffuse_light,combined"}, {"passes": ("diffuse_light", "combined"), "error": False}),
+        ({"command": "compare", "frames": "-2-1", "cycles_samples": 32, "arguments": " --aa 4  --camera Left"},
+         {"frames": (-2, -1, 0, 1), "cycles_samples": 32, "aa": 4, "camera": ["Left"]}),
+        ({"command": "shade", "techniques": "ltc,ltsh2", "arguments": "--resolution=96x54", "frames": ""},
+         {"techniques": ("ltc", "ltsh2"), "resolution": (96, 54), "frames": ()}),
+    ],
+)  # fmt: skip
+def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expected):
+    for number, arguments in enumerate(commands(compiled(tmp_path, shards=2, **settings))[:-1], 1):
+        parsed = vars(cli._parser("ltsh").parse_args(arguments))
+        assert parsed["command"] == settings.get("command", "bake") and parsed["scenes"] == [SCENE]
+        assert parsed["shard"] == (number, 2) and parsed["output"] == Path("/shared/out")
+        assert {name: parsed[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [({"shards": 0}, "shards is 0, expected 1 or more"), ({"output": ""}, "output is empty"),
+     ({"blendfile": ""}, "blendfile is empty")],
+)  # fmt: skip
+def test_settings_that_make_no_sense_are_refused(tmp_path, settings, complaint):
+    assert complaint in compiled(tmp_path, **settings)["error"]
+
+
+def test_all_tasks_together_are_the_single_run_byte_for_byte(tmp_path, monkeypatch, capsys):
+    """Done in the order that dependencies allow, one of them twice, without Blender."""
+    fake_scene.FakeChild().install(monkeypatch)
+    room, out = tmp_path / "room.blend", tmp_path / "out"
+    room.write_bytes(b"BLENDER")
+    found = compiled(
+        tmp_path, command="compare", blendfile=str(room), output=str(out), frames="1-5", techniques="ltc",
+        passes="diffuse", cycles_samples=4, shards=3,
+    )  # fmt: skip
+    *shards, last = commands(found)
+    for arguments in (shards[2], shards[0], shards[1], shards[0], last):
+        assert cli.main([*arguments, "--quiet"]) == 0
+    single = ["compare", str(room), "-o", str(tmp_path / "one"), "--frames", "1-5", "--techniques", "ltc"]
+    assert cli.main([*single, "--passes", "diffuse", "--cycles-samples", "4", "--quiet"]) == 0
+    assert contents(out) == contents(tmp_path / "one") and len(contents(out)) > 10
+
+
+def contents(folder):
+    """Bytes by name of all files below `folder` but for times."""
+    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}

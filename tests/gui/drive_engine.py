@@ -1,0 +1,225 @@
+"""The engine LTSH in the viewport: drag a light by the mouse, choose what is seen, drag the line, F12, back to Cycles.
+
+To be opened with the example scene. The pictures on the screen are compared with those of numpy: a final render of the
+same view, whose passes hold what every technique makes of it.
+"""
+
+import time
+
+import bpy
+import numpy as np
+from eyes import (
+    F12,
+    bare_view,
+    camera_like_view,
+    free_view,
+    inside,
+    linear,
+    passes_of,
+    plain_colors,
+    relative_l2,
+    settled,
+    unclipped,
+    without_edges,
+)
+from hands import CLICK_SECONDS, drag
+
+SECONDS = 900
+# Dark enough that next to nothing is clipped.
+EXPOSURE = -1.5
+LABELS = {"ltc": "LTC", "ltsh2": "LTSH 2", "ltsh4": "LTSH 4"}
+# Of this the 256 steps of the screen take 0.004.
+AGREEMENT = 0.01
+RENDER_SECONDS = 240
+
+
+def main(rig):
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    rig.camera_view()
+    yield 1
+    yield from previewed(rig)
+    yield from with_panel(rig)
+    bare_view(rig)
+    free_view(rig, scene.camera)
+    plain_colors(scene, EXPOSURE)
+    yield from light_dragged(rig)
+    seen = yield from techniques(rig)
+    yield from passes(rig, seen["ltsh4"])
+    yield from split(rig, seen)
+    yield from difference(rig, seen)
+    yield from rendered(rig, seen)
+    yield from back_to_cycles(rig)
+
+
+def view():
+    return bpy.context.scene.ltsh_view
+
+
+def previewed(rig):
+    with rig.override():
+        bpy.ops.ltsh.preview()
+    rig.check(bpy.context.scene.render.engine == "LTSH", "the preview has our engine")
+    rig.check(rig.space.shading.type == "RENDERED", "the preview has Rendered shading")
+    pixels = yield from settled(rig, "engine_1_preview.png")
+    rig.check(0.02 < pixels.mean() < 0.9 and pixels.std() > 0.05, "the view shows a picture")
+
+
+def with_panel(rig):
+    """The split view as the artist has it: by the panel in the sidebar, with overlays and gizmos."""
+    rig.panel()
+    yield 1
+    rig.tab("LTSH")
+    view().mode, view().technique, view().second_technique = "split", "ltc", "ltsh4"
+    rig.space.region_3d.view_camera_zoom = 14.0
+    yield 2
+    rig.shot("engine_1_panel.png", area="VIEW_3D")
+    view().mode, view().technique = "single", "ltsh4"
+    rig.space.region_3d.view_camera_zoom = 0.0
+
+
+def light_dragged(rig):
+    before = yield from settled(rig, "engine_2_before.png")
+    light = bpy.data.objects["Porthole"]
+    place = light.location.copy()
+    with rig.override():
+        bpy.ops.object.select_all(action="DESELECT")
+    light.select_set(True)
+    bpy.context.view_layer.objects.active = light
+    region = rig.region()
+    x, y = region.x + region.width // 2, rig.size[1] - region.y - region.height // 2
+    rig.xdo("mousemove", x, y)
+    yield CLICK_SECONDS
+    rig.xdo("key", "g")
+    yield CLICK_SECONDS
+    for step in range(1, 5):
+        rig.xdo("mousemove", x + 30 * step, y + 6 * step)
+        yield CLICK_SECONDS
+    rig.shot("engine_2_dragging.png")
+    rig.xdo("click", 1)
+    yield CLICK_SECONDS
+    after = yield from settled(rig, "engine_2_after.png")
+    rig.check((light.location - place).length > 0.2, "the mouse has moved the light")
+    rig.check(np.abs(after - before).mean() > 0.005, "the picture follows the light")
+
+
+def techniques(rig):
+    """What the screen shows for each technique."""
+    seen = {}
+    for name in LABELS:
+        view().technique = name
+        seen[name] = yield from settled(rig, f"engine_3_{name}.png")
+    for name in ("ltc", "ltsh2"):
+        rig.check(np.abs(seen[name] - seen["ltsh4"]).max() > 0.02, f"{name} does not look like ltsh4")
+    return seen
+
+
+def passes(rig, both):
+    """`both` is the sum of what the specular and the diffuse pass show."""
+    total = np.zeros_like(both)
+    for name in ("specular", "diffuse"):
+        view().shown = name
+        pixels = yield from settled(rig, f"engine_4_{name}.png")
+        total += linear(pixels, EXPOSURE)
+    view().shown = "combined"
+    error = relative_l2(total, linear(both, EXPOSURE), unclipped(both))
+    rig.fact("specular + diffuse against both", error)
+    rig.check(error < AGREEMENT, "specular and diffuse add up")
+
+
+def split(rig, seen):
+    settings = view()
+    settings.mode, settings.technique, settings.second_technique, settings.split_position = "split", "ltc", "ltsh4", 0.5
+    rig.space.show_gizmo = True
+    yield from settled(rig, "engine_5_split.png")
+    region = rig.region()
+    y = rig.size[1] - region.y - region.height // 4
+    start, end = ((region.x + round(share * region.width), y) for share in (0.5, 0.3))
+    yield from drag(rig, start, end)
+    rig.check(abs(settings.split_position - 0.3) < 0.02, f"the line follows the mouse: {settings.split_position:.3f}")
+    rig.space.show_gizmo = False
+    pixels = yield from settled(rig, "engine_5_dragged.png")
+    line = round(settings.split_position * region.width) - (region.width - pixels.shape[1]) // 2
+    # The line and the captions at the upper end are no part of the pictures.
+    rows = slice(60, None)
+    for name, columns in (("ltc", slice(0, line - 4)), ("ltsh4", slice(line + 4, None))):
+        same = np.array_equal(pixels[rows, columns], seen[name][rows, columns])
+        rig.check(same, f"{name} on its side of the line is the whole picture's")
+
+
+def difference(rig, seen):
+    settings = view()
+    settings.mode, settings.technique, settings.second_technique = "difference", "ltsh4", "ltc"
+    settings.difference_scale = 0.25
+    pixels = yield from settled(rig, "engine_6_difference.png")
+    truth = (linear(seen["ltsh4"], EXPOSURE) - linear(seen["ltc"], EXPOSURE)).mean(axis=-1)
+    certain = unclipped(seen["ltsh4"]) & unclipped(seen["ltc"]) & (np.abs(truth) > 0.03)
+    rig.fact("pixels that differ", int(certain.sum()))
+    reddish = pixels[..., 0] > pixels[..., 2]
+    rig.check(certain.any() and np.array_equal(reddish[certain], truth[certain] > 0.0), "red is brighter, blue darker")
+    settings.second_technique = "ltsh4"
+    pixels = yield from settled(rig, "engine_6_nothing.png")
+    rig.check(np.ptp(pixels[100:], axis=-1).max() < 0.02, "a technique does not differ from itself")
+    settings.mode, settings.second_technique = "single", "ltc"
+
+
+def rendered(rig, seen):
+    """F12 through a camera that sees what the view shows."""
+    scene, ended = bpy.context.scene, []
+    camera, resolution = scene.camera, (scene.render.resolution_x, scene.render.resolution_y)
+    scene.camera = camera_like_view(rig, "Like the view")
+    view().render_samples, view().technique_passes, view().technique = 1, True, "ltsh4"
+    bpy.context.preferences.view.render_display_type = "SCREEN"
+    bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
+    bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancel"))
+    region = rig.region()
+    rig.xdo("mousemove", region.x + region.width // 2, rig.size[1] - region.y - region.height // 2)
+    yield CLICK_SECONDS
+    start = time.monotonic()
+    rig.xdo("key", F12)
+    while not ended and time.monotonic() < start + RENDER_SECONDS:
+        yield 0.5
+    rig.fact("F12, s", round(time.monotonic() - start, 1))
+    rig.check(ended == ["complete"], f"F12 ends well: {ended}")
+    yield 2
+    rig.shot("engine_7_f12.png")
+    compare_with_numpy(rig, seen, saved_passes(rig))
+    rig.xdo("key", "Escape")
+    yield 2
+    scene.camera, (scene.render.resolution_x, scene.render.resolution_y) = camera, resolution
+
+
+def saved_passes(rig):
+    """The passes of the last render."""
+    scene, path = bpy.context.scene, rig.out / "engine_f12.exr"
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
+    found = passes_of(path)
+    path.unlink()
+    return found
+
+
+def compare_with_numpy(rig, seen, found):
+    for name, label in LABELS.items():
+        expected = inside(found[f"{label} Specular"] + found[f"{label} Diffuse"])
+        shown = linear(seen[name], EXPOSURE)
+        usable = unclipped(seen[name]) & (expected < linear(254.0 / 255.0, EXPOSURE)).all(axis=-1)
+        rig.fact(f"{name}: share of clipped pixels", round(1.0 - float(usable.mean()), 4))
+        rig.fact(f"{name}: relative L2 with edges", round(relative_l2(shown, expected, usable), 5))
+        error = relative_l2(shown, expected, without_edges(shown, expected, usable))
+        rig.fact(f"{name}: relative L2 of the screen against numpy", round(error, 5))
+        rig.check(error < AGREEMENT and usable.mean() > 0.97, f"the view shows the {name} of numpy within {AGREEMENT}")
+
+
+def back_to_cycles(rig):
+    with rig.override():
+        bpy.ops.ltsh.preview()
+    rig.check(bpy.context.scene.render.engine == "CYCLES", "the artist's engine is back")
+    rig.check(rig.space.shading.type == "SOLID", "the artist's shading is back")
+    yield 1
+    rig.space.shading.type = "RENDERED"
+    yield 15
+    rig.shot("engine_8_cycles.png")

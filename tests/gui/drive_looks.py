@@ -1,0 +1,87 @@
+"""How the panels look: light and dark theme, twice the scale, a narrow sidebar; for the eye above all."""
+
+from pathlib import Path
+
+import bpy
+from hands import drag, settings, until
+
+SIZE = "1600x900"
+NARROW = 220  # pixels at scale 1
+
+
+def main(rig):
+    rig.camera_view()
+    settings().techniques, settings().cycles_samples = {"ltc", "ltsh2", "ltsh4"}, 16
+    settings().resolution_percentage, settings().bake_size, settings().bake_error = 50, "256", True
+    bpy.data.objects["floor"].select_set(True)
+    with rig.override():
+        bpy.ops.ltsh.bake()
+        bpy.ops.ltsh.compare()
+    rig.panel()
+    yield 1
+    rig.tab("LTSH")
+    with rig.override():
+        bpy.ops.ltsh.open_results()
+    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+    yield 2
+    rig.check(rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", "the tab of the Image Editor is open")
+    rig.shot("1_dark.png")
+    theme("Blender_Light")
+    yield 1
+    rig.shot("2_light.png")
+    theme("Blender_Dark")
+    yield from narrow(rig)
+    rig.shot("3_narrow.png")
+    settings().mode = "ERROR"
+    bpy.context.preferences.view.ui_scale = 2.0
+    yield 2
+    rig.shot("4_twice_the_scale.png")
+    bpy.context.preferences.view.ui_scale = 1.0
+    rig.area("PROPERTIES").spaces.active.context = "RENDER"
+    yield 1
+    with rig.override("PROPERTIES"):
+        bpy.ops.screen.screen_full_area()
+    yield 2
+    rig.shot("5_render_properties.png")
+    with rig.override("PROPERTIES"):
+        bpy.ops.screen.back_to_previous()
+    yield 1
+    yield from preferences(rig)
+
+
+def theme(name):
+    """Choose one of Blender's own themes."""
+    folder = Path(bpy.utils.resource_path("LOCAL")) / "scripts" / "presets" / "interface_theme"
+    folders = [folder, *(Path(path) / "interface_theme" for path in bpy.utils.preset_paths(""))]
+    path = next(path for folder in folders if (path := folder / f"{name}.xml").exists())
+    bpy.ops.script.execute_preset(filepath=str(path), menu_idname="USERPREF_MT_interface_theme_presets")
+
+
+def narrow(rig):
+    """Make the sidebar of the 3D view narrow by its edge."""
+    region = rig.region("VIEW_3D", "UI")
+    y = rig.size[1] - region.y - region.height // 8
+    yield from drag(rig, (region.x - 1, y), (region.x + region.width - NARROW, y))
+    yield 1
+    width = rig.region("VIEW_3D", "UI").width
+    rig.check(abs(width - NARROW) < 30, f"the sidebar is narrow: {width}")
+
+
+def preferences(rig):
+    """The preferences of the add-on."""
+    bpy.ops.screen.userpref_show()
+    yield 1
+    window = bpy.context.window_manager.windows[-1]
+    bpy.context.preferences.active_section = "ADDONS"
+    bpy.context.window_manager.addon_search = "LTSH"
+    import addon_utils
+
+    addon_utils.modules_refresh()
+    for module in addon_utils.modules():
+        if module.__name__ == "bl_ext.user_default.ltsh":
+            addon_utils.module_bl_info(module)["show_expanded"] = True
+    yield 2
+    rig.shot("6_preferences.png")
+    with bpy.context.temp_override(window=window):
+        bpy.ops.wm.window_close()
+    yield 1

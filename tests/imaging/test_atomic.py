@@ -1,0 +1,90 @@
+"""Files that appear complete or not at all, and what killed processes leave of them."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ltsh_addon.imaging.atomic import replacing, write_bytes
+
+ROOT = Path(__file__).resolve().parents[2]
+# Writes half a file and ends as a killed process does, or waits for a line before it goes on.
+HALF = """
+import os, sys
+from ltsh_addon.imaging.atomic import replacing
+with replacing(sys.argv[1]) as temporary:
+    temporary.write_bytes(b"half")
+    print("half", flush=True)
+    if not sys.stdin.readline():
+        os.kill(os.getpid(), 9)
+    temporary.write_bytes(b"whole")
+"""
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def half_written(path):
+    """A process that has written half of the file `path`."""
+    command = [sys.executable, "-c", HALF, str(path)]
+    process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "half\n"
+    return process
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are not killed by signals there")
+def test_what_a_killed_process_has_left_goes_with_the_next_write_of_that_file(tmp_path):
+    write_bytes(tmp_path / "a", b"old")
+    half_written(tmp_path / "a").communicate()
+    assert (tmp_path / "a").read_bytes() == b"old" and len(names(tmp_path)) == 2
+    write_bytes(tmp_path / "a.b", b"another file")
+    assert len(names(tmp_path)) == 3
+    write_bytes(tmp_path / "a", b"new")
+    assert (tmp_path / "a").read_bytes() == b"new" and names(tmp_path) == ["a", "a.b"]
+
+
+def test_what_another_process_is_writing_stays(tmp_path):
+    process = half_written(tmp_path / "a")
+    write_bytes(tmp_path / "a", b"first")
+    assert len(names(tmp_path)) == 2
+    process.communicate("go on\n")
+    assert (tmp_path / "a").read_bytes() == b"whole" and names(tmp_path) == ["a"]
+
+
+def test_files_of_similar_names_stay(tmp_path):
+    others = [".a.0123456.tmp", ".a.012345678.tmp", ".a.0123456g.tmp", ".b.01234567.tmp", "a.01234567.tmp", ".a.tmp"]
+    for name in others:
+        (tmp_path / name).write_bytes(b"not ours")
+    write_bytes(tmp_path / "a", b"new")
+    assert names(tmp_path) == sorted([*others, "a"])
+
+
+def test_an_exception_leaves_what_was_there(tmp_path):
+    write_bytes(tmp_path / "a", b"old")
+    with pytest.raises(KeyError), replacing(tmp_path / "a") as temporary:
+        temporary.write_bytes(b"new")
+        raise KeyError
+    assert (tmp_path / "a").read_bytes() == b"old" and names(tmp_path) == ["a"]
+
+
+def test_of_files_within_one_another_the_one_that_failed_is_named(tmp_path):
+    with pytest.raises(OSError) as raised, replacing(tmp_path / "outer"), replacing(tmp_path / "absent" / "inner"):
+        pass
+    assert (
+        str(raised.value) == f"{tmp_path}/absent/inner: cannot be written: the folder {tmp_path}/absent does not exist"
+    )
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [("absent/a", "absent does not exist"), ("file/a", "file is not a folder"), ("folder", "a folder has that name")],
+)
+def test_what_cannot_be_written_is_named(tmp_path, name, reason):
+    (tmp_path / "file").write_bytes(b"")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(OSError, match=f"{name}: cannot be written: .*{reason}"):
+        write_bytes(tmp_path / name, b"new")
+    assert names(tmp_path) == ["file", "folder"]

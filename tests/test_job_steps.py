@@ -1,0 +1,45 @@
+"""Command lines behind the panels: a report where there is one, else the line that says what was wrong."""
+
+import io
+import json
+
+import fake_scene
+import pytest
+
+from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.jobs import job_steps
+
+SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
+
+
+@pytest.fixture
+def room(tmp_path):
+    path = tmp_path / "room.blend"
+    path.write_bytes(b"BLENDER")
+    return path
+
+
+def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, room, tmp_path):
+    fake_scene.FakeChild().install(monkeypatch)
+    messages = io.StringIO()
+    arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL]
+    report, _ = job_steps._command(arguments, job_steps.LineProgress(messages))
+    assert report == json.loads((tmp_path / "out" / "report.json").read_text()) and report["resolution"]
+    sent = [json.loads(line.removeprefix(job_steps.MESSAGE)) for line in messages.getvalue().splitlines()]
+    assert "samples" in [message["stage"] for message in sent]
+    assert sorted(message["step"] for message in sent) == [message["step"] for message in sent]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "complaint"),
+    [
+        ([], SceneError("no area light\nthat renders"), "no area light that renders"),
+        (["--aa", "none"], None, "ltsh shade: argument --aa: 'none' was given"),
+        (["--camera", "A"], RuntimeError("what?"), "unexpected error: RuntimeError: what?"),
+    ],
+)
+def test_a_command_that_fails_gives_the_line_that_says_why(monkeypatch, room, tmp_path, arguments, error, complaint):
+    fake_scene.FakeChild(error=error).install(monkeypatch)
+    arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL, *arguments]
+    report, line = job_steps._command(arguments, job_steps.LineProgress(io.StringIO()))
+    assert report is None and line.startswith(complaint)

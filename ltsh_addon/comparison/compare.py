@@ -169,11 +169,10 @@ def make_picture(options: Options, with_cycles: bool, progress: Progress | None 
 
 def _make_writable(path: Path) -> None:
     """Make the output folder and prove that it takes files."""
+    from ..imaging.atomic import check_takes_files
+
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".ltsh-write-test"
-        probe.write_bytes(b"")
-        probe.unlink()
+        check_takes_files(path)
     except OSError as error:
         raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
 

@@ -56,6 +56,20 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
+def check_takes_files(folder: str | os.PathLike) -> None:
+    """Make the folder where it is missing, and an empty file in it that goes again; raises OSError where that fails.
+
+    Processes that do so in one folder at a time do not meet: each file has a name of its own.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    prefix = ".ltsh-write-test."
+    _remove_abandoned(folder, prefix)
+    path, file = _locked(folder, prefix)
+    _closed(file)
+    path.unlink(missing_ok=True)  # once closed, another process may take it for abandoned
+
+
 def _locked(folder: Path, prefix: str) -> tuple[Path, int]:
     """A new file in `folder` and its descriptor, which holds the lock that tells others that somebody writes it."""
     while True:

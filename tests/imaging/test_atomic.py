@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from ltsh_addon.imaging.atomic import replacing, write_bytes
+from ltsh_addon.imaging.atomic import check_takes_files, replacing, write_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 # Writes half a file and ends as a killed process does, or waits for a line before it goes on.
@@ -88,3 +89,16 @@ def test_what_cannot_be_written_is_named(tmp_path, name, reason):
     with pytest.raises(OSError, match=f"{name}: cannot be written: .*{reason}"):
         write_bytes(tmp_path / name, b"new")
     assert names(tmp_path) == ["file", "folder"]
+
+
+def test_many_that_check_a_folder_at_the_same_time_all_find_that_it_takes_files(tmp_path):
+    folder = tmp_path / "new" / "folder"
+    with ThreadPoolExecutor(8) as threads:
+        assert list(threads.map(check_takes_files, [folder] * 2000)) == [None] * 2000
+    assert names(folder) == []
+
+
+def test_a_folder_that_takes_no_files_is_told(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        check_takes_files(tmp_path / "file")

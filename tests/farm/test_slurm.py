@@ -75,6 +75,8 @@ def test_what_cannot_be_submitted_is_refused_with_the_usage(arguments, complaint
 
 OBJECTS = ["floor", "back wall", "left wall", "right wall"]
 OBJECTS += [f"cabinet left {number} plastic screen" for number in (1, 2, 3, 4)]
+
+
 @pytest.mark.parametrize(
     ("arguments", "logs", "merged"),
     [

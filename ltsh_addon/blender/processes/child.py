@@ -7,7 +7,6 @@ and the data of a running Blender stay untouched.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import threading
 from dataclasses import asdict, dataclass
@@ -109,17 +108,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
 
 
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Build the example scene and save it as the .blend `path`, at once or not at all."""
-    path = Path(path).absolute()
-    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
-    try:
-        with temporary_folder() as folder:
-            run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
-        if not unfinished.is_file():
-            raise SceneError(f"{path}: Blender built the example scene but saved no file")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    """Build the example scene and save it as the .blend `path`, at once or not at all. Raises SceneError, OSError."""
+    from ...imaging.atomic import replacing_by_copy  # the child imports this module too, and has no use for imaging
+
+    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
+        run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
 def check_readable(scene: Path) -> None:
@@ -172,7 +165,7 @@ def termination_as_exception():
 
 def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
     """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
-    from ...imaging.exr import read_channels  # the child imports this module too, and has no use for imaging
+    from ...imaging.exr import read_channels
 
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0

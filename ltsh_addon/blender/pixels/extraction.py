@@ -19,6 +19,7 @@ from ..materials.material_outputs import (
 from ..processes import memory
 from ..processes.child import SceneError
 from ..processes.missing_files import missing_files
+from ..processes.missing_names import listed
 from . import cameras, render_settings
 from .color_management import working_space
 from .cycles_reference import render_reference
@@ -138,7 +139,7 @@ def _scene_named(name: str | None):
     if name is None:
         return bpy.context.scene
     if name not in bpy.data.scenes:
-        scenes = ", ".join(repr(scene.name) for scene in bpy.data.scenes)
+        scenes = listed((scene.name for scene in bpy.data.scenes), name)
         raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
     return bpy.data.scenes[name]
 

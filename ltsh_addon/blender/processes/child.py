@@ -120,7 +120,9 @@ def check_readable(scene: Path) -> None:
     try:
         if not scene.exists():
             raise SceneError(f"{scene}: no such file, expected a .blend")
-        if not scene.is_file() and not scene.is_dir():  # reading a pipe or a device might never end
+        if scene.is_dir():
+            raise SceneError(f"{scene}: is a folder, expected a .blend")
+        if not scene.is_file():  # reading a pipe or a device might never end
             raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
         with scene.open("rb") as file:
             start = file.read(7)

@@ -13,22 +13,24 @@ PACKAGE = ROOT / "ltsh_addon"
 BLENDER_MODULES = frozenset(
     "aud bl_operators bl_ui blf bmesh bpy bpy_extras gpu gpu_extras idprop imbuf mathutils".split()
 )
-CORE_PARTS = {"scene", "shading", "imaging"}
+CORE_PARTS = {"scene", "ownership", "shading", "imaging"}
 
 # part -> parts of the package it may use besides itself, and distributions it may use besides the standard library.
 # "top" stands for the modules beside scene.py: the command line and what it is made of.
 MAY_USE_PARTS = {
     "scene": set(),
+    "ownership": set(),
     "shading": {"scene"},
-    "imaging": {"scene"},
+    "imaging": {"scene", "ownership"},
     "blender": CORE_PARTS,
     "top": CORE_PARTS | {"blender", "top"},
 }
 MAY_USE_DISTRIBUTIONS = {
     "scene": {"numpy"},
+    "ownership": set(),
     "shading": {"numpy"},
     "imaging": {"numpy", "OpenEXR", "Imath"},  # one distribution
-    "blender": {"numpy", "OpenEXR"} | BLENDER_MODULES,
+    "blender": {"numpy", "OpenEXR", "zstandard"} | BLENDER_MODULES,  # bpy requires zstandard
     "top": {"numpy", "OpenEXR"},
 }
 

@@ -6,7 +6,6 @@ The pictures made from it have direct light only and no shadows, and the scene i
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import bpy
@@ -205,11 +204,7 @@ def _set_up_view() -> None:
 
 
 def build(path: Path) -> None:
-    """Write the example scene to `path`; what Blender has open is replaced by it.
-
-    An existing file is replaced only when the new one is complete.
-    """
-    path = Path(path)
+    """Write the example scene to `path`; what Blender has open is replaced by it."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     _materials()
     for part in demo_objects.everything():
@@ -217,9 +212,4 @@ def build(path: Path) -> None:
     for settings in LIGHTS:
         _add_light(settings)
     _set_up_view()
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.blend")
-    try:
-        save_copy(temporary, check_existing=False)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    save_copy(Path(path), check_existing=False)

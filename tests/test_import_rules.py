@@ -30,7 +30,7 @@ MAY_USE_DISTRIBUTIONS = {
     "ownership": set(),
     "shading": {"numpy"},
     "imaging": {"numpy", "OpenEXR", "Imath"},  # one distribution
-    "blender": {"numpy", "OpenEXR"} | BLENDER_MODULES,
+    "blender": {"numpy", "OpenEXR", "zstandard"} | BLENDER_MODULES,  # bpy requires zstandard
     "top": {"numpy", "OpenEXR"},
 }
 

@@ -17,11 +17,9 @@ import numpy as np
 from ...scene import REC709, AreaLight, Border, ColorSpace, Film, SurfaceSamples
 from ..materials.specular_horizon import end_at_horizons_of_cycles
 from ..pixels import gbuffer
+from . import blend_header
 from .blender_process import Progress, SceneError, disk_is_full, no_room, run_child
 from .temporary_folders import locked_folder
-
-# Of a .blend as it is, or compressed by Blender since 3.0 and before.
-STARTS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 
 
 @dataclass(frozen=True)
@@ -126,13 +124,17 @@ def check_readable(scene: Path) -> None:
             raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
         with scene.open("rb") as file:
             start = file.read(7)
+        saved = blend_header.saved_with(scene)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"{str(scene)[:200]!r}: cannot be read: {reason}") from None
     if not start:
         raise SceneError(f"{scene}: the file is empty, expected a .blend")
-    if not start.startswith(STARTS):
+    if not start.startswith(blend_header.STARTS):
         raise SceneError(f"{scene}: is no .blend, it starts with {start!r}")
+    here = blend_header.running()
+    if saved and here and saved > here:
+        raise SceneError(blend_header.newer(scene, saved, here))
 
 
 @contextlib.contextmanager

@@ -22,8 +22,8 @@ DOUBLE_CHUNK = 4096
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
     """The lobe, approximating BRDF times cosine with F = 1, in sr^-1.
 
-    cos_theta_o (P,) in [0, 1], roughness (P,) in [0, 1], unit directions (P, S, 3) in the local frame -> (P, S), float32
-    if the directions are, else float64; 0 below the horizon. Raises ValueError where the shapes do not fit.
+    cos_theta_o and roughness (P,) in [0, 1], unit directions (P, S, 3) in the local frame -> (P, S), float32 if the
+    directions are, else float64; 0 below the horizon. Raises ValueError where the shapes do not fit.
     """
     cosine, roughness, directions = _as_float(cos_theta_o, roughness, directions)
     if directions.ndim != 3 or directions.shape[2] != 3 or directions.shape[0] != cosine.shape[0]:

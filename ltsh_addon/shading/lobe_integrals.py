@@ -133,4 +133,3 @@ def _as_float(cos_theta_o, roughness, vectors):
     vectors = np.asarray(vectors)
     dtype = np.float32 if vectors.dtype == np.float32 else np.float64
     return np.asarray(cos_theta_o, dtype=dtype), np.asarray(roughness, dtype=dtype), vectors.astype(dtype, copy=False)
-

@@ -65,7 +65,7 @@ def left_over(folder):
 def test_compare_as_a_program(room, out, temporary_root):
     before = room.read_bytes()
     command = programs.command_line("compare", room, "-o", out, *SMALL, "--json", "--quiet")
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=120, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=600, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     report = programs.document(done.stdout)
     assert report == json.loads((out / "report.json").read_text(encoding="utf-8"))

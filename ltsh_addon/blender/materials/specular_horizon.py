@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...scene import AreaLight, SurfaceSamples
+from ...shading import brdf, polygon
 
 SMALLEST_ALPHA = 1e-3
 # Directions at which both probabilities are compared: around the horizon, closest to each other near the highlight,
@@ -71,14 +72,18 @@ def horizon_excess(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> tu
 
 
 def _solid_angle(position, light) -> np.ndarray:
-    """Solid angle (P,) of the light in sr, 0 from behind it (Van Oosterom and Strackee 1983, eq. 8)."""
-    corners = light.polygon()[None] - position[:, None]
-    corners /= np.maximum(np.linalg.norm(corners, axis=2, keepdims=True), 1e-12)
-    first, second, third = corners[:, :1], corners[:, 1:-1], corners[:, 2:]
-    volume = (first * np.cross(second, third)).sum(axis=2)
-    below = 1.0 + (first * second).sum(axis=2) + (second * third).sum(axis=2) + (third * first).sum(axis=2)
-    whole = np.abs(2.0 * np.arctan2(volume, below).sum(axis=1))
-    return np.where((light.center - position) @ light.direction < 0.0, whole, 0.0)
+    """Solid angle (P,) of the light in sr, 0 from behind it."""
+    axes = np.concatenate([_plane_axes(light), -light.direction[None]])
+    corners = np.einsum("ak,pvk->avp", axes, light.polygon() - position[:, None])
+    whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
+    return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
+
+
+def _plane_axes(light) -> np.ndarray:
+    """Two orthonormal axes (2, 3) in the plane of the light."""
+    first = light.polygon()[0] - light.center
+    first /= max(np.linalg.norm(first), 1e-30)
+    return np.stack([first, np.cross(light.direction, first)])
 
 
 def _crosses(samples, light) -> np.ndarray:
@@ -91,14 +96,13 @@ def _crosses(samples, light) -> np.ndarray:
 
 
 def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, H, N) per sr that the lobe chooses the directions, GGX's visible normals (Heitz 2018, eq. 17)."""
+    """Probability (P, H, N) per sr that the lobe chooses the directions."""
     half = towards + samples.view[:, None, None]
-    half /= np.maximum(np.linalg.norm(half, axis=3, keepdims=True), 1e-12)
+    vertical = np.square(np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0))
+    horizontal = np.maximum(np.square(half).sum(axis=3) - vertical, 0.0)
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
-    height = np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0)
-    cosine = np.maximum(np.einsum("pi,pi->p", samples.normal, samples.view), 1e-3)[:, None, None]
-    masking = 1.0 / (1.0 + 0.5 * (np.sqrt(1.0 + alpha2 * (1.0 / cosine**2 - 1.0)) - 1.0))
-    return alpha2 / (np.pi * np.square(height * height * (alpha2 - 1.0) + 1.0)) * masking / (4.0 * cosine)
+    cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
+    return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)
 
 
 def _directions(samples):
@@ -125,10 +129,8 @@ def _directions(samples):
 
 def _hits(light, position, towards) -> np.ndarray:
     """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
-    corners = light.polygon() - light.center
-    first = corners[0] / max(np.linalg.norm(corners[0]), 1e-30)
-    axes = np.stack([first, np.cross(light.direction, first)])
-    outline = corners @ axes.T
+    axes = _plane_axes(light)
+    outline = (light.polygon() - light.center) @ axes.T
     steepness = towards @ light.direction
     height = ((light.center - position) @ light.direction)[:, None, None]
     distance = height / np.where(steepness < 0.0, steepness, -1e-30)

@@ -33,7 +33,6 @@ NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specula
            "transmission": 0.0}  # fmt: skip
 # Layers of the Principled BSDF that the viewport leaves out, and what they are called.
 LEFT_OUT = {"Coat Weight": "coat", "Sheen Weight": "sheen"}
-FLAT_DISTRIBUTIONS = ("GGX", "MULTI_GGX", *NEAREST_ALPHA)
 
 
 @dataclass(frozen=True)

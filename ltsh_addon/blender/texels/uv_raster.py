@@ -238,7 +238,6 @@ def cross(u, v):
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
-
 def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the area that they
     have in all, 1 for a tile, where some of it may be outside of these tiles; else 0.

@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import tempfile
 from pathlib import Path
 
 import bpy
@@ -41,15 +40,6 @@ def room(tmp_path):
 @pytest.fixture
 def out(tmp_path):
     return tmp_path / "out"
-
-
-@pytest.fixture
-def temporary_root(tmp_path, monkeypatch):
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    return folder
 
 
 def run(capsys, *arguments):
@@ -105,7 +95,7 @@ def damaged_scene(folder, kind):
     ("kind", "complaint"),
     [
         ("missing", "no such file"),
-        ("folder", "cannot be read"),
+        ("folder", "is a folder, expected a .blend"),
         ("cut", "cannot open it"),
         ("text", "is no .blend"),
         ("no camera", "no active camera"),

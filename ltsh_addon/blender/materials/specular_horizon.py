@@ -35,38 +35,40 @@ def end_at_horizons_of_cycles(samples: SurfaceSamples, lights: tuple[AreaLight, 
     normal = np.array(samples.geometric_normal)
     for start in range(0, len(differ), BLOCK):
         block = differ[start : start + BLOCK]
-        smooth = block[_smooth_is_nearer(samples.take(block), lights)]
+        by_lobe, by_light = horizon_excess(samples.take(block), lights)
+        # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
+        smooth = block[np.abs(by_lobe) <= np.abs(by_light)]
         normal[smooth] = samples.smooth_normal[smooth]
     return replace(samples, geometric_normal=normal)
 
 
-def _smooth_is_nearer(samples, lights) -> np.ndarray:
-    """Mask (P,)."""
+def horizon_excess(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """What only one of the horizons lets through (P,), of directions that the lobe chose and of those that the light
+    chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
+
+    Where both horizons make no difference the first is 1 and the second 0.
+    """
     crossed = np.stack([_crosses(samples, light) for light in lights])
     index = np.flatnonzero(crossed.any(axis=0))
-    smooth = np.zeros(len(samples), bool)
+    by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
     if len(index) == 0:
-        return smooth
+        return by_lobe, by_light
     samples, crossed = samples.take(index), crossed[:, index]
     solid_angle = np.stack([_solid_angle(samples.position, light) for light in lights])
     brightness = solid_angle * np.array([np.abs(light.radiance).sum() for light in lights])[:, None]
     density = brightness / np.maximum(brightness.sum(axis=0) * solid_angle, 1e-12)
     towards, width = _directions(samples)
     lobe = _lobe_density(samples, towards)
-    # What only one of the horizons lets through, of directions that the light chose and of those that the lobe chose:
-    # the smooth horizon is wrong about the latter, that of the mesh about the former.
-    by_light, by_lobe = np.zeros(len(index)), np.zeros(len(index))
+    by_lobe[index] = 0.0
     for number, light in enumerate(lights):
         rows = np.flatnonzero(crossed[number])
         excess = np.abs(light.radiance).sum() * lobe[rows] * width[rows]
         excess *= _hits(light, samples.position[rows], towards[rows])
         light2 = np.square(density[number, rows])[:, None, None]
         weight = light2 / (light2 + np.square(lobe[rows]))
-        by_light[rows] += (excess * weight).sum(axis=(1, 2))
-        by_lobe[rows] += (excess * (1.0 - weight)).sum(axis=(1, 2))
-    # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
-    smooth[index] = np.abs(by_lobe) <= np.abs(by_light)
-    return smooth
+        by_light[index[rows]] += (excess * weight).sum(axis=(1, 2))
+        by_lobe[index[rows]] += (excess * (1.0 - weight)).sum(axis=(1, 2))
+    return by_lobe, by_light
 
 
 def _solid_angle(position, light) -> np.ndarray:

@@ -17,7 +17,8 @@ from ltsh_addon.blender.processes.missing_names import listed
         ("shade room.blend -o out --cycles-samples 8", "--cycles-samples is unknown here (an option of demo, compare, "
          "bake)"),
         ("shade room.blend -o out --zzz", "option --zzz is unknown here; see ltsh shade --help"),
-        ("shade room.blend -o out hall.blend", "'hall.blend' is not expected here (name all files one after another); see"),
+        ("shade room.blend -o out hall.blend", "'hall.blend' is not expected here (name all files one "
+         "after another); see"),
         ("demo room.blend -o out", "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
         ("tables export -o out --jsn", "option --jsn is unknown here"),
     ],

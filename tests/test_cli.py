@@ -46,7 +46,7 @@ def run(capsys, *arguments, **options):
 def run_python(code):
     """Run `code` in an interpreter of its own."""
     command = [sys.executable, "-c", code]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
 
 
 def assert_failure(result, complaint):

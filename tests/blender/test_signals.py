@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import tempfile
 import threading
 import time
 from pathlib import Path
@@ -31,15 +30,6 @@ def room(tmp_path_factory):
     scene_parts.add_top_camera()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     return path
-
-
-@pytest.fixture
-def temporary_root(tmp_path, monkeypatch):
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    return folder
 
 
 class Running:

@@ -21,7 +21,7 @@ def script(name, *arguments, **environment):
     """A script without Slurm, in which `ltsh` and sbatch only say how they were called."""
     return subprocess.run(
         ["bash", str(FARM / name), *map(str, arguments)], env={"PATH": os.environ["PATH"], **environment},
-        capture_output=True, text=True, timeout=30, check=False,
+        capture_output=True, text=True, timeout=600, check=False,
     )  # fmt: skip
 
 

@@ -240,7 +240,7 @@ class ObjectBake:
         self.ob.data.update()
 
 
-def view_of(scene, wanted, camera, bent: bool) -> BakeView:
+def view_of(wanted, camera, bent: bool) -> BakeView:
     """The view `wanted`: "camera", "above" or a position (3,)."""
     if wanted == "above":
         return BakeView("above")

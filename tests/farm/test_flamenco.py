@@ -78,7 +78,7 @@ BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True
 )  # fmt: skip
 def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expected):
     for number, arguments in enumerate(commands(compiled(tmp_path, shards=2, **settings))[:-1], 1):
-        parsed = vars(cli._parser("ltsh").parse_args(arguments))
+        parsed = vars(cli._parser("ltsh")[0].parse_args(arguments))
         assert parsed["command"] == settings.get("command", "bake") and parsed["scenes"] == [SCENE]
         assert parsed["shard"] == (number, 2) and parsed["output"] == Path("/shared/out")
         assert {name: parsed[name] for name in expected} == expected

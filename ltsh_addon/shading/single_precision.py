@@ -272,7 +272,9 @@ def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
     normal, view = columns(samples.normal, index), columns(samples.view, index)
     cosine = _dot(normal, view)
-    tangent = view - cosine * normal
+    # The difference of vectors that are close is exact, so that nothing of it runs along the normal.
+    tangent = view - normal
+    tangent -= _dot(normal, tangent) * normal
     sine = np.sqrt(_dot(tangent, tangent))
     straight = np.nonzero(sine < 1e-6)[0]
     if len(straight):

@@ -50,7 +50,7 @@ def _perform(job: dict, folder: Path) -> dict:
     if job["task"] == "facts":
         return _module("processes.scene_facts").answer(job, _progress)
     if job["task"] == "apply":
-        return _module("texels.bake_apply").apply_bake(job, folder, _progress)
+        return _module("texels.bake_apply").apply_bake(job, _progress)
     return _module("pixels.extraction").extract(job, folder, _progress)
 
 

@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scenes import area_light, random_samples
+import random_surfaces
 
 from ltsh_addon import shading
 from ltsh_addon.blender.lights.patches import cut_into_patches, split_light
+from ltsh_addon.scene import AreaLight
 from ltsh_addon.shading.light_detail import fitting_patches
 
 PLACES = {
@@ -25,15 +26,21 @@ def textured_light(place="rectangle", most=128):
     image = np.exp(image / image.std())
     x, y = np.meshgrid(*(np.linspace(-1.0, 1.0, 64),) * 2)
     covered = np.hypot(x, y) < 1.0 if place == "ellipse" else np.ones((64, 64), bool)
-    (light,) = split_light(area_light(center=(0.0, 0.0, 2.0), **PLACES[place]), cut_into_patches(image, covered, most))
+    placed = {
+        "shape": "RECTANGLE",
+        "center": (0.0, 0.0, 2.0),
+        "direction": (0.0, 0.0, -1.0),
+        "radiance": (5.0, 3.0, 1.0),
+    }
+    (light,) = split_light(AreaLight("Lamp", **{**placed, **PLACES[place]}), cut_into_patches(image, covered, most))
     return light
 
 
 def metals(count):
     """White metals of all kinds of roughness."""
-    samples = random_samples(count, lowest_roughness=0.02)
-    white = np.ones((count, 3))
-    return replace(samples, specular_f0=white, specular_f90=white, dielectric=0.0 * white, diffuse_albedo=white)
+    samples, white = random_surfaces.samples("plain", count, np.random.default_rng(1)), np.ones((count, 3))
+    terms = {"specular_f0": white, "specular_f90": white, "specular_dip": 0.0 * white, "dielectric": 0.0 * white}
+    return replace(samples, roughness=0.02 + 0.98 * samples.roughness, diffuse_albedo=white, **terms)
 
 
 @pytest.mark.parametrize("specular", [False, True])

@@ -25,6 +25,8 @@ NEAREST_SAFE = 0.01
 LARGEST_SAFE_ANGLE = 5.9
 # Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
 MANY_CORNERS = 64
+# Corners of the polygons whose moments are computed at a time: their arrays stay in a second-level cache of 1 MiB.
+PIECE_CORNERS = 24624
 VIEWS_KEPT = 1000
 _TINY = np.float32(1e-30)
 _PHI_DEGREE, _PSI_DEGREE = 7, 8
@@ -209,6 +211,30 @@ def moments(
     squared *= normal[:4]
     _sum_edges(squared, result[6:10])
     return result, fragile
+
+
+def weighted_moments(
+    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
+    in sr, and the mask (P,) of fragile points. `degree` 1 to 4."""
+    vectors, _, points = weights.shape
+    sums = np.empty((vectors, points), np.float32)
+    angle, fragile = np.empty(points, np.float32), np.empty(points, bool)
+    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
+        found, fragile[part] = moments(corners[:, :, part], degree, scratch, smallest)
+        weight = weights[:, :, part]
+        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
+        np.add.reduce(products, axis=1, out=sums[:, part])
+        angle[part] = found[0]
+    return sums, angle, fragile
+
+
+def pieces(count: int, most: int) -> list[slice]:
+    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
+    number = max(-(-count // max(most, 512)), 1)
+    size = max(-(-count // number), 1)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def _sum_edges(values, out):

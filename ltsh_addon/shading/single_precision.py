@@ -70,7 +70,7 @@ def shade_specular(samples, lights, table, radiance, scratch):
 
 
 def _chunks(members):
-    return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
+    return (members[part] for part in edge_loop.pieces(len(members), CHUNK))
 
 
 def _add_double(samples, members, lights, radiance, shade):
@@ -251,9 +251,8 @@ class _LobeIntegral:
             values = weights[:, 0] * integral
             values *= np.float32(-1.0 / np.pi)
         else:
-            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch, smallest)
-            products = np.multiply(weights, moments, out=self.scratch("weighted", weights.shape))
-            values = np.add.reduce(products, axis=1)
+            degree = self.ridges.degree
+            values, _, fragile = edge_loop.weighted_moments(corners, weights, degree, self.scratch, smallest)
             np.negative(values, out=values)
         return np.maximum(values, np.float32(0.0), out=values), fragile
 

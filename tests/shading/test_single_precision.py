@@ -121,6 +121,28 @@ def test_edge_loop_gives_the_moments(degree, corners):
     assert np.abs(moments - expected)[:, ~fragile].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
 
 
+@pytest.mark.parametrize("most", [1, 513, 1000, 5000])
+def test_pieces_of_a_batch_have_the_sums_of_the_whole(most, monkeypatch):
+    """1500 polygons in pieces of at least 512, against their moments at once."""
+    monkeypatch.setattr(edge_loop, "PIECE_CORNERS", 4 * most)
+    polygons = regular_polygons(4, 1500, seed=5)
+    weights = np.random.default_rng(6).normal(size=(2, 15, 1500)).astype(np.float32)
+    moments, expected_mask = edge_loop.moments(polygons, 4, edge_loop.Scratch())
+    sums, angle, fragile = edge_loop.weighted_moments(polygons, weights, 4, edge_loop.Scratch())
+    expected = np.einsum("fkp,kp->fp", weights.astype(float), moments.astype(float))
+    assert np.abs(sums - expected).max() < 15 * 1e-7 * np.abs(weights * moments).max()
+    assert np.abs(angle - moments[0]).max() < 1e-6 and np.array_equal(fragile, expected_mask)
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 600), (1, 600), (512, 1), (1200, 600), (1201, 600), (100_000, 4111)])
+def test_pieces_make_up_the_whole_and_are_about_equal(count, most):
+    parts = edge_loop.pieces(count, most)
+    assert [index for part in parts for index in range(count)[part]] == list(range(count))
+    lengths = [part.stop - part.start for part in parts]
+    assert max(lengths, default=0) <= max(most, 512)
+    assert max(lengths, default=0) - min(lengths, default=0) <= len(lengths)
+
+
 def test_edge_loop_gives_the_integrals_of_the_direction():
     polygons = regular_polygons(6, 300, seed=9)
     expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))

@@ -17,8 +17,8 @@ from .task import Task
 
 PASSES = ("specular", "diffuse")
 # Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
-# the longest are two chunks; towards the end they get shorter, so that all processes end at about the same time.
-BLOCK_LIMITS = (12296, 49184)
+# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
+BLOCK_LIMITS = (24592, 49184)
 REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 

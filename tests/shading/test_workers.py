@@ -97,7 +97,7 @@ def test_single_passes_travel_too(part, started, children_only):
 
 @pytest.mark.parametrize("count", [0, 1, 1023, 1024, 5000, 123_457])
 def test_blocks_make_up_the_samples_and_are_short_at_the_end(count):
-    """With two processes one waits for the other's last block only: an eighth of a long one."""
+    """Whoever ends first waits for the other's last block."""
     blocks = integrator._blocks(count, 256, 2048)
     assert [block.start for block in blocks] + [count] == [0] + [block.stop for block in blocks]
     lengths = [block.stop - block.start for block in blocks]

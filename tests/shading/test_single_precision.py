@@ -204,6 +204,19 @@ def test_premultiplied_weights_are_the_coefficients_lobe_integrals_use(name):
     assert isinstance(table, LookupTable) and ridge_table.prepare(table) is ridge_table.prepare(table)
 
 
+@pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])
+def test_shaders_and_the_edge_loop_weigh_their_moments_alike(name):
+    """One node of the table for 300 polygons."""
+    table, node = shading.load_table(name), 40 * 64 + 20
+    polygons = regular_polygons(4, 300, seed=8)
+    moments, fragile = edge_loop.moments(polygons, table.degree, edge_loop.Scratch())
+    along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), table.degree)
+    found = ridge_table.prepare(table).weights[..., node] @ moments
+    expected = ridge_table.along_directions(table).weights[..., node] @ along_directions
+    assert np.abs(expected).max() > 0.1
+    assert np.abs(found - expected)[:, ~fragile].max() < 2e-6
+
+
 def test_degrees_beyond_the_fast_path_are_shaded_in_double():
     table = shading.load_table("ltsh2")
     rows, columns, curves, _ = table.coefficients.shape

@@ -6,6 +6,7 @@ linear transform turns the lobe into something simple and keeps polygons polygon
 highlights. Either way the integral has a closed form, so the picture has no noise.
 
     scene      AreaLight, SurfaceSamples, Film: the shared vocabulary
+    ownership  temporary files of processes on several machines
     shading    the paper: warp, polygon, moments, lookup table, reference quadrature (numpy only)
     imaging    EXR, metrics, false color, comparison sheet, report
     blender    .blend to lights and samples, Cycles ground truth, panels, render engine (the only place that knows bpy)

@@ -7,7 +7,9 @@ Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the argu
 from __future__ import annotations
 
 import argparse
+import difflib
 import logging
+import re
 import shlex
 import sys
 
@@ -30,6 +32,8 @@ EXAMPLES = """examples:
   %(prog)s compare room.blend -o out/room --frames 1-240 --shard 1/4 --resume
   %(prog)s merge out/room
   %(prog)s run night.toml
+
+exit codes: 0 done; 1 a file, scene or folder is wrong; 2 the arguments are; 130 Ctrl-C; 143 SIGTERM
 """
 
 
@@ -55,7 +59,7 @@ class _Parser(argparse.ArgumentParser):
 
 def _main(arguments, program, open_file, bar) -> int:
     try:
-        options = _parser(program).parse_args(arguments)
+        options = _parsed(program, arguments)
     except SystemExit as stop:  # argparse has printed help
         return int(stop.code or 0)
     except values.Misuse as error:
@@ -108,7 +112,38 @@ def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
     return code
 
 
-def _parser(program: str) -> argparse.ArgumentParser:
+def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
+    """What the arguments mean. Raises Misuse, with what may have been meant."""
+    parser, commands = _parser(program)
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
+        hint = _similar(arguments[0], commands) or f"expected one of {', '.join(commands)}"
+        raise values.Misuse(f"{program}: command {arguments[0]!r} is unknown ({hint}); see {program} --help")
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        raise values.Misuse(_unknown_argument(options, unknown, commands))
+    return options
+
+
+def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
+    """What is wrong with arguments that the command does not have."""
+    program = commands[options.command].prog
+    name = next((word.partition("=")[0] for word in unknown if word.startswith("-")), None)
+    if name is None:
+        hint = " (name all files one after another)" if getattr(options, "scenes", None) else ""
+        return f"{program}: {unknown[0]!r} is not expected here{hint}; see {program} --help"
+    known = {command: re.findall(r"--[\w-]+", parser.format_help()) for command, parser in commands.items()}
+    owners = [command for command, names in known.items() if name in names]
+    hint = f"an option of {', '.join(owners)}" if owners else _similar(name, known[options.command])
+    return f"{program}: option {name} is unknown here{f' ({hint})' if hint else ''}; see {program} --help"
+
+
+def _similar(name: str, known) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {near[0]}?" if near else ""
+
+
+def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser, and those of the commands by name."""
     parser = _Parser(
         prog=program,
         description="Shade scenes under area lights with linearly transformed lobes and compare with Cycles.",
@@ -117,11 +152,14 @@ def _parser(program: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    picture_commands.add_demo(commands.add_parser("demo", help="build the example scene and run compare on it"))
-    picture_commands.add_compare(commands.add_parser("compare", help="techniques beside Cycles: EXR, sheet, report"))
-    picture_commands.add_shade(commands.add_parser("shade", help="shade per pixel of the camera"))
-    bake_command.add(commands.add_parser("bake", help="bake lighting and errors into the texels of UV maps"))
-    run_command.add(commands.add_parser("run", help="do the jobs of a file"))
-    merge_command.add(commands.add_parser("merge", help="assemble the report of what shards have done"))
-    tables_command.add(commands.add_parser("tables", help="fit, validate or export the lookup tables"))
-    return parser
+    for name, add, meaning in (
+        ("demo", picture_commands.add_demo, "build the example scene and run compare on it"),
+        ("compare", picture_commands.add_compare, "techniques beside Cycles: EXR, sheet, report"),
+        ("shade", picture_commands.add_shade, "shade per pixel of the camera"),
+        ("bake", bake_command.add, "bake lighting and errors into the texels of UV maps"),
+        ("run", run_command.add, "do the jobs of a file"),
+        ("merge", merge_command.add, "assemble the report of what shards have done"),
+        ("tables", tables_command.add, "fit, validate or export the lookup tables"),
+    ):
+        add(commands.add_parser(name, help=meaning))
+    return parser, commands.choices

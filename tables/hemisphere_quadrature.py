@@ -27,12 +27,12 @@ def _half(cos_theta_o, alpha, radial, angular):
     zero = np.zeros_like(sin_o)
     axis = np.stack([-sin_o, zero, cos_theta_o], axis=-1)[:, None, None]
     up = np.stack([cos_theta_o, zero, sin_o], axis=-1)[:, None, None]
-    quarter, quarter_weights = _gauss_legendre(angular, 0.5 * np.pi)
+    quarter, quarter_weights = gauss_legendre(angular, 0.5 * np.pi)
     azimuth = np.concatenate([quarter, np.pi - quarter])
     azimuth_weights = np.concatenate([quarter_weights, quarter_weights])
     cosine, mu, sine = np.abs(np.cos(azimuth)), cos_theta_o[:, None], sin_o[:, None]
     reach = np.where(azimuth < 0.5 * np.pi, np.arctan2(sine, cosine * mu), np.arctan2(mu, cosine * sine))
-    nodes, weights = _gauss_legendre(radial, 1.0)
+    nodes, weights = gauss_legendre(radial, 1.0)
     scale = (0.3 * alpha)[:, None, None]
     stretch = np.arcsinh(reach[..., None] / scale)
     r = scale * np.sinh(stretch * nodes)
@@ -43,6 +43,7 @@ def _half(cos_theta_o, alpha, radial, angular):
     return directions.reshape(count, -1, 3), measure.reshape(count, -1)
 
 
-def _gauss_legendre(count, length):
+def gauss_legendre(count: int, length: float = 1.0):
+    """Nodes and weights (count,) of the Gauss-Legendre rule on [0, length]."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * length * (nodes + 1.0), 0.5 * length * weights

@@ -68,7 +68,7 @@ def _linearize(family, points, values, derivatives):
     warp, coefficients = values[:, : family.parameters], values[:, family.parameters :]
     basis = _basis(family, points, warp)
     lobe = np.einsum("psk,pk->ps", basis, coefficients)
-    functionals, scales = _functionals(points, lobe)
+    functionals, scales = _functionals(points)
     # Missing: of every curve for the right-hand side, of F = 1 for the error
     targets = points.lobes.copy()
     targets[..., 0] -= lobe
@@ -130,7 +130,7 @@ def _albedo_row(family, points, warp, coefficients):
     return np.concatenate([by_warp, family.basis_albedo(tilt)], axis=1) / points.albedo[:, :1]
 
 
-def _functionals(points, lobe):
+def _functionals(points):
     """Rows (P, W, S) that integrate over soft lights, mirror-symmetric in y, and the scale (P,) of their squares."""
     k = np.arange(WINDOWS) + 0.5
     z, azimuth = 1.0 - k / WINDOWS, np.pi * (1.0 + np.sqrt(5.0)) * k

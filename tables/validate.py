@@ -15,6 +15,8 @@ import numpy as np
 from ltsh_addon.shading import brdf, evaluate_lobe, spherical_harmonics
 from ltsh_addon.shading.lookup_table import LookupTable
 
+from .hemisphere_quadrature import gauss_legendre
+
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
 # Disk-shaped lights of the light error: as many directions, and the radii in degrees that they take in turn.
 LIGHTS = 96
@@ -37,6 +39,7 @@ class TableStatistics:
     negative_mass_maximum: float
 
     def to_dict(self) -> dict:
+        """The figures by name."""
         return asdict(self)
 
 
@@ -132,6 +135,7 @@ class CornerStatistics:
     largest_number: float  # stored
 
     def to_dict(self) -> dict:
+        """The figures by name."""
         return asdict(self)
 
 
@@ -184,13 +188,8 @@ def hemisphere_samples(cos_theta_o, alpha, radial: int = 56, angular: int = 56, 
     return directions, np.where(directions[..., 2] > 0.0, share / density, 0.0)
 
 
-def _unit_interval(count):
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (nodes + 1.0), 0.5 * weights
-
-
 def _visible_normal_samples(cos_theta_o, alpha, radial, angular):
-    u, u_weights = _unit_interval(radial)
+    u, u_weights = gauss_legendre(radial)
     azimuth = (np.arange(angular) + 0.5) / angular * np.pi
     u, azimuth = (grid.ravel() for grid in np.meshgrid(u, azimuth, indexing="ij"))
     sin_o = np.sqrt(1.0 - cos_theta_o**2)
@@ -212,17 +211,13 @@ def _visible_normal_samples(cos_theta_o, alpha, radial, angular):
 
 
 def _visible_normal_density(cos_theta_o, alpha, directions):
-    """Density of the reflected direction: G1(o) D(h) / (4 cos_theta_o), Walter et al. 2007 and Heitz 2018."""
-    mu, alpha_squared = cos_theta_o[:, None], (alpha**2)[:, None]
     view = np.stack([np.sqrt(1.0 - cos_theta_o**2), np.zeros_like(cos_theta_o), cos_theta_o], axis=-1)[:, None]
-    half = directions + view
-    half = half / np.linalg.norm(half, axis=-1, keepdims=True)
-    slope = half[..., 0] ** 2 + half[..., 1] ** 2 + alpha_squared * half[..., 2] ** 2
-    return alpha_squared / np.pi / slope**2 / (2.0 * (mu + np.sqrt(mu**2 + alpha_squared * (1.0 - mu**2))))
+    x, y, z = np.moveaxis(directions + view, -1, 0)
+    return brdf.visible_normal_density(cos_theta_o[:, None], x * x + y * y, z * z, (alpha**2)[:, None])
 
 
 def _horizon_samples(count):
-    u, weights = _unit_interval(count)
+    u, weights = gauss_legendre(count)
     azimuths = count + count // 2
     azimuth = 0.5 * np.pi * (1.0 - np.cos(np.pi * (np.arange(azimuths) + 0.5) / azimuths))
     z, azimuth = (grid.ravel() for grid in np.meshgrid(u * u, azimuth, indexing="ij"))

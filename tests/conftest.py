@@ -3,6 +3,7 @@
 import atexit
 import os
 import platform
+import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
 
@@ -13,6 +14,12 @@ settings.register_profile("ltsh", derandomize=True, deadline=None, database=None
 settings.load_profile("ltsh")
 
 EXIT_STATUS = pytest.StashKey[int]()
+
+
+def pytest_sessionstart(session):
+    """Shells start what runs in the background with Ctrl-C ignored, and children inherit that."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_report_header():

@@ -12,7 +12,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 MARK = "LTSH_TEST_RUN"
 # Seconds within which processes see that the one which started them is gone, also on a busy machine.
-PATIENCE = 20.0
+PATIENCE = 60.0
 
 # command(output, *more) is the command line that writes to the folder `output`.
 Command = Callable[..., list[str]]
@@ -23,6 +23,7 @@ class Runs:
 
     def __init__(self, temporary: Path):
         self.temporary = temporary
+        self.slowest_end = 0.0  # seconds from a signal to the end of the process
         temporary.mkdir(parents=True)
 
     def start(self, command: list[str], **options) -> subprocess.Popen:
@@ -54,7 +55,9 @@ class Runs:
             while process.poll() is None:
                 if moment():
                     process.send_signal(number)
+                    start = time.monotonic()
                     process.wait(PATIENCE)
+                    self.slowest_end = max(self.slowest_end, time.monotonic() - start)
                     return True
                 time.sleep(0.001)
             return False

@@ -98,7 +98,7 @@ def setup_script(tmp_path):
         settings = {"HOME": str(tmp_path / "home"), "PATH": ":".join([*map(str, path), str(tools)]), **environment}
         return subprocess.run(
             [shutil.which("bash"), str(script), *arguments],
-            env=settings, capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL, check=False,
+            env=settings, capture_output=True, text=True, timeout=600, stdin=subprocess.DEVNULL, check=False,
         )  # fmt: skip
 
     run.clone = tmp_path / "clone"

@@ -3,6 +3,7 @@
 Those that are scenes: tests/blender/test_hostile_scenes.py.
 """
 
+import gzip
 import os
 import re
 from pathlib import Path
@@ -10,8 +11,10 @@ from pathlib import Path
 import fake_scene
 import numpy as np
 import pytest
+import zstandard
 
 from ltsh_addon import cli, imaging
+from ltsh_addon.blender.processes import blend_header
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = (ROOT / "tables" / "ltsh2.npz").read_bytes()
@@ -49,6 +52,14 @@ def table_of_objects(path):
     np.savez(path, anything=np.array([{"a": 1}], dtype=object), metadata=np.array([{"b": 2}], dtype=object))
 
 
+def newer_scene(pack=bytes, header=b"BLENDER17-01v0999"):
+    """A .blend of Blender 9.99: the header as it is since 5.0, or as it was before."""
+    return data(pack(header + NUMBERS.bytes(9999)))
+
+
+NEWER = "was saved by Blender 9.99, but this is Blender {}[.]{}".format(*blend_header.running())
+SHADE_A = ["shade", "a.blend", "-o", "out"]
+
 # id: how to make which file (None: none is needed), the arguments, the exit code, what the line must say
 CASES = {
     "missing scene": (None, ["shade", "none.blend", "-o", "out"], 1, r"none\.blend: no such file"),
@@ -56,7 +67,13 @@ CASES = {
     "text as scene": (("a.blend", text("hello\n")), ["shade", "a.blend", "-o", "out"], 1, r"a\.blend: is no \.blend"),
     "EXR as scene": (("a.blend", exr), ["compare", "a.blend", "-o", "out"], 1, r"a\.blend: is no \.blend"),
     "noise as scene": (("a.blend", data(NUMBERS.bytes(999))), ["bake", "a.blend", "-o", "out"], 1, r"is no \.blend"),
-    "folder as scene": (("a.blend", Path.mkdir), ["bake", "a.blend", "-o", "out"], 1, "a.blend.*directory"),
+    "newer scene": (("a.blend", newer_scene()), SHADE_A, 1, NEWER),
+    "newer scene, old header": (("a.blend", newer_scene(header=b"BLENDER-v999")), SHADE_A, 1, NEWER),
+    "newer scene, next header": (("a.blend", newer_scene(header=b"BLENDER19-02v0999")), SHADE_A, 1, NEWER),
+    "newer scene, gzip": (("a.blend", newer_scene(gzip.compress)), SHADE_A, 1, NEWER),
+    "newer scene, Zstandard": (("a.blend", newer_scene(zstandard.compress)), SHADE_A, 1, NEWER),
+    "newer scene in a job file": (("room.blend", newer_scene()), ["run", "job.toml"], 1, f"line 1: .*{NEWER}"),
+    "folder as scene": (("a.blend", Path.mkdir), ["bake", "a.blend", "-o", "out"], 1, r"a\.blend: is a folder"),
     "pipe as scene": (("a.blend", os.mkfifo), ["shade", "a.blend", "-o", "out"], 1, "is a device or a pipe"),
     "device as scene": (None, ["shade", "/dev/zero", "-o", "out"], 1, "/dev/zero: is a device or a pipe"),
     "name of a scene too long": (None, ["shade", "x" * 300, "-o", "out"], 1, "File name too long"),
@@ -117,6 +134,7 @@ def test_a_hostile_input_is_refused_in_one_line(capsys, monkeypatch, tmp_path, c
     child = fake_scene.FakeChild().install(monkeypatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "room.blend").write_bytes(b"BLENDER")
+    (tmp_path / "job.toml").write_text(JOB, encoding="utf-8")
     if file is not None:
         file[1](tmp_path / file[0])
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}

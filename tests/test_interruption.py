@@ -17,7 +17,8 @@ pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_the_first_signal_raises_and_the_next_ones_do_not_disturb(number):
+def test_the_first_signal_raises_and_the_next_ones_do_not_disturb(number, monkeypatch):
+    monkeypatch.setattr(interruption, "PATIENCE_SECONDS", 600.0)  # on a busy machine this process shall live on
     before = [signal.getsignal(each) for each in NUMBERS]
     cleared = []
     with pytest.raises(interruption.Interrupted) as caught, interruption.raised("ltsh"):
@@ -34,12 +35,12 @@ def test_the_first_signal_raises_and_the_next_ones_do_not_disturb(number):
 def test_what_ends_in_time_goes_on():
     """The process lives on where the caller takes the exception; the thread that watches ends."""
     code = (
-        "import signal, time\nfrom ltsh_addon import interruption\ninterruption.PATIENCE_SECONDS = 0.1\n"
+        "import signal, time\nfrom ltsh_addon import interruption\ninterruption.PATIENCE_SECONDS = 2.0\n"
         "try:\n    with interruption.raised('ltsh'):\n        signal.raise_signal(signal.SIGTERM)\n"
-        "except KeyboardInterrupt:\n    time.sleep(0.5)\n    print('alive')\n"
+        "except KeyboardInterrupt:\n    time.sleep(2.5)\n    print('alive')\n"
     )
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=20, check=True)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
     assert (done.stdout, done.stderr) == ("alive\n", "")
 
 
@@ -85,13 +86,12 @@ def test_what_cannot_be_interrupted_is_left_where_it_is(number):
         "    hashlib.pbkdf2_hmac('sha512', b'', b'', 100_000_000)\n"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    ) as process:  # fmt: skip
+        [sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         try:
             assert process.stdout.readline() == "begun\n"
             process.send_signal(number)
-            _, stderr = process.communicate(timeout=20)
+            _, stderr = process.communicate(timeout=600)
         finally:
             process.kill()
     text = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}[number]

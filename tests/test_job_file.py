@@ -109,7 +109,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
         (SHADE + "frames = 1.5\n", ["line 5: frames: frame is '1.5'"]),
         (SHADE + "frames = true\n", ["line 5: frames is True, expected text, a number or a list"]),
         (SHADE + "frames = []\n", ["line 5: frames is [], expected"]),
-        (SHADE + "resolution = \"480\"\n", ["line 5: resolution is '480', expected WIDTHxHEIGHT"]),
+        (SHADE + 'resolution = "480"\n', ["line 5: resolution is '480', expected WIDTHxHEIGHT"]),
         (SHADE + "cycles-samples = 4\n", ["line 5: option 'cycles-samples' is unknown here"]),
         (SHADE + "resume = true\n", ["line 5: option 'resume' is unknown here; give it to `ltsh run`"]),
         (SHADE + "[defaults]\ntechnique = 1\n", ["line 6: option 'technique' is unknown here; did you mean"]),

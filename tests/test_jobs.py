@@ -1,7 +1,6 @@
 """Jobs of many tasks without Blender: names, order, shards, what is kept, what is named as missing."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,11 +9,10 @@ import pytest
 
 from ltsh_addon import cli
 from ltsh_addon.blender.processes.child import SceneError
-from ltsh_addon.commands import argument_values
 from ltsh_addon.comparison.compare import Options
-from ltsh_addon.jobs import batch, output_names, task_records
+from ltsh_addon.jobs import batch, task_records
 from ltsh_addon.jobs.merge import merge
-from ltsh_addon.jobs.tasks import Job, shard_of, tasks_of
+from ltsh_addon.jobs.tasks import Job
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
@@ -47,96 +45,6 @@ def contents(folder):
     """Bytes by name of all files below `folder` but for times."""
     files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("7", (7,)),
-        ("-3", (-3,)),
-        ("1-4", (1, 2, 3, 4)),
-        ("1-9:3,300", (1, 4, 7, 300)),
-        ("-2-1", (-2, -1, 0, 1)),
-        ("-4--2", (-4, -3, -2)),
-        ("3,1,2-3", (3, 1, 2)),
-        ("5-5", (5,)),
-    ],
-)
-def test_frames_are_ranges_and_single_ones_each_once(text, expected):
-    assert argument_values.frames(text) == expected
-
-
-@pytest.mark.parametrize(
-    ("option", "text", "complaint"),
-    [
-        *(("--frames", text, "frame is") for text in ("", "1,", "1..4", "1-4:x", "a-b", "1048575", "1-1048575", "+1")),
-        *(("--frames", text, "upwards, STEP above 0") for text in ("4-1", "1-4:0")),
-        *(("--shard", text, "expected I/N") for text in ("0/4", "5/4", "1", "1/0", "-1/4", "a/b", "1/4/2", "/")),
-        *(("--name", text, "is unknown, expected fields") for text in ("{object}", "{0}", "{}", "{frame!r}", "{x.y}")),
-        *(("--name", text, "expected names below the output folder")
-          for text in ("../x", "/x", "a//b", "a/../../b", ".hidden", "x/.y", "x.", "a/")),
-        *(("--name", text, "letter") for text in ("a\\b", "c:x", "a*", "x\ny")),
-        ("--name", "{frame:q}", "name '{frame:q}'"),
-        ("--name", "{frame", "name '{frame'"),
-        ("--name", "", "0 letters"),
-    ],
-)  # fmt: skip
-def test_wrong_values_are_misuse(capsys, child, room, tmp_path, option, text, complaint):
-    code, stdout, stderr = run(capsys, "shade", room, "-o", tmp_path / "out", f"{option}={text}")
-    assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1] and not (tmp_path / "out").exists()
-
-
-def test_stems_differ_in_any_case_and_hold_no_separators():
-    names = ["Floor", "floor", "a/b", "a:b", "../../x", "", "Bücher", "x" * 300, "x" * 301]
-    stems = output_names.file_stems(names)
-    assert len({stem.casefold() for stem in stems}) == len(names) and stems[0] == "Floor" and stems[6] == "Bücher"
-    assert not [stem for stem in stems if set(stem) & set("/\\:.") or not stem.strip() or len(stem) > 110]
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({}, ["shade"]),
-        ({"frames": (5,)}, ["shade"]),
-        ({"frames": (1, -20)}, ["shade_0001", "shade_-020"]),
-        ({"cameras": ("A", "B")}, ["shade_A", "shade_B"]),
-        ({"cameras": ("A", "B"), "frames": (1, 2)}, ["shade_A_0001", "shade_A_0002", "shade_B_0001", "shade_B_0002"]),
-        ({"cameras": ("A",), "frames": (1,), "name": "{scene}/{camera}.{frame}"}, ["room/A.1"]),
-        ({"cameras": ("../A", "..:A"), "name": "{camera}"}, ["___A", "___A_2"]),
-    ],
-)
-def test_names_have_what_there_is_several_of(room, tmp_path, changes, expected):
-    assert [task.name for task in tasks_of(job(room, tmp_path, **changes))] == expected
-
-
-def test_scenes_of_one_name_get_different_names(room, tmp_path):
-    other = tmp_path / "other" / "room.blend"
-    other.parent.mkdir()
-    shutil.copy(room, other)
-    assert [task.name for task in tasks_of(job(room, tmp_path, scenes=(room, other)))] == ["shade_room", "shade_room_2"]
-
-
-def test_tasks_that_would_write_the_same_file_are_misuse(capsys, child, room, tmp_path):
-    code, _, stderr = run(capsys, "shade", room, "-o", tmp_path / "out", "--frames", "1-2", "--name", "x", *SMALL)
-    assert code == 2 and "the same name 'x'; add {frame}" in stderr and child.asked == []
-
-
-def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatch, capsys, child, room, tmp_path):
-    from ltsh_addon.blender.processes import scene_facts
-
-    found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}}
-    monkeypatch.setattr(scene_facts, "ask", lambda *arguments, **options: [found])
-    name = "{camera}_{frame:03d}"
-    assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0
-    assert (tmp_path / "out" / "Main_1_012.exr").is_file() and child.asked[0].frame is None
-
-
-def test_shards_are_disjoint_and_together_everything(room, tmp_path):
-    tasks = tasks_of(job(room, tmp_path, frames=tuple(range(23))))
-    for count in (1, 2, 4, 23, 40):
-        shards = [shard_of(tasks, (number, count)) for number in range(1, count + 1)]
-        assert sorted((task for shard in shards for task in shard), key=tasks.index) == tasks
-        assert max(map(len, shards)) - min(map(len, shards)) <= 1
 
 
 @pytest.mark.parametrize("command", ["shade", "compare"])
@@ -208,31 +116,6 @@ def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
     assert batch.run_tasks(changed, existing=batch.RESUME).kept == 0
     assert batch.run_tasks(wanted, existing=batch.SKIP).kept == 3 and merge(tmp_path / "out").missing == ()
     assert batch.run_tasks(wanted).kept == 0
-
-
-def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
-    records = task_records.Records(tmp_path, "tiles")
-    names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
-    for name in names:
-        records.write(name, "key", {"name": name}, ())
-    read = []
-    read_one = task_records._read
-    monkeypatch.setattr(task_records, "_read", lambda path: read.append(path) or read_one(path))
-
-    def found(*stems):
-        return {record["task"]["name"] for record in records.all_whole("key", stems or None)}
-
-    assert found() == set(names) and found("Floor") == {"Floor.1001", "Floor.1002"} and len(read) == len(names) + 2
-    assert found("a[b]") == {"a[b].1001"} and found("y") == set()
-    assert found("x/Floor", "ab") == {"x/Floor.1001", "ab.1001"}
-
-
-def test_a_changed_file_has_another_digest(room, tmp_path):
-    options = job(room, tmp_path).options
-    first = task_records.contents_digest(options)
-    assert task_records.contents_digest(options) == first
-    room.write_bytes(b"BLENDER, other")
-    assert task_records.contents_digest(options) != first
 
 
 def test_what_was_kept_is_told(capsys, child, room, tmp_path):

@@ -42,7 +42,7 @@ def compiled(folder: Path, name: str, source: str, *options: str) -> Path:
     library = folder / f"lib{name}.so"
     subprocess.run(
         [COMPILER, "-shared", "-fPIC", "-O0", "-fno-builtin", *options, "-o", str(library), str(folder / f"{name}.c")],
-        check=True, timeout=60,
+        check=True, timeout=600,
     )  # fmt: skip
     return library
 

@@ -222,7 +222,7 @@ def installed(tmp_path_factory):
 def _run_without_scipy(folder, package, *arguments):
     code = f"import sys; sys.modules['scipy'] = None; from {package} import cli; sys.exit(cli.main(sys.argv[1:]))"
     command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_the_installed_add_on_exports_without_scipy(installed, exported, out):

@@ -11,6 +11,8 @@ from . import argument_values as values
 from . import common_options as options
 from .job_runs import run_job
 
+DESCRIPTION = """Shade the texels of UV maps. OUT gets an EXR for each object, with a layer for each
+technique and pass, and report.json; UDIM tiles get files of their own."""
 EXAMPLES = """examples:
   %(prog)s room.blend -o out/room
   %(prog)s room.blend -o out/room --object Floor --object Wall --size 2048 --uv Lightmap --view above
@@ -25,7 +27,7 @@ ERROR_SAMPLES = 256
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, EXAMPLES)
+    options.with_examples(parser, DESCRIPTION, EXAMPLES)
     parser.add_argument("scenes", nargs="*", metavar=options.SCENES, help="left out when Blender has a file open")
     options.add_output(parser)
     chosen = parser.add_mutually_exclusive_group()

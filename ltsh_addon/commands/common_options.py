@@ -12,9 +12,11 @@ from . import argument_values as values
 SCENES = "SCENE.blend"
 
 
-def add_output(parser, meaning: str = "folder for the results") -> None:
+def add_output(parser) -> None:
     """-o."""
-    parser.add_argument("-o", dest="output", type=values.folder, required=True, metavar="OUT", help=meaning)
+    parser.add_argument(
+        "-o", dest="output", type=values.folder, required=True, metavar="OUT", help="folder for the results"
+    )
 
 
 def add_scenes(parser) -> None:
@@ -76,9 +78,10 @@ def add_talk(parser, json_meaning: str = "print the report on stdout as one JSON
     parser.add_argument("--log", type=Path, metavar="FILE", help="append to FILE what was done when")
 
 
-def with_examples(parser, examples: str) -> None:
-    """Show `examples` as they are, below the options."""
-    parser.epilog, parser.formatter_class = examples, argparse.RawDescriptionHelpFormatter
+def with_examples(parser, description: str, examples: str) -> None:
+    """Show `description` above the options and `examples` below, as they are."""
+    parser.description, parser.epilog = description, examples
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
 
 
 def cameras(arguments) -> tuple[str, ...]:

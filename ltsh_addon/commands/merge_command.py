@@ -9,19 +9,19 @@ from .argument_values import Misuse
 from .job_runs import merge_folder
 from .run_command import merge_jobs
 
+DESCRIPTION = "Write report.json and timing.json of all that the shards of a job have done in OUT."
 EXAMPLES = """examples:
   %(prog)s out/room
   %(prog)s out/room --json > room.json
   %(prog)s night.toml
 
-Writes report.json and timing.json. What is missing is named, and the exit code is 1; the same command with --resume
-and the same --shard does what is missing.
+What is missing is named, and the exit code is 1; the command with --resume and the same --shard does it.
 """
 
 
 def add(parser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, EXAMPLES)
+    options.with_examples(parser, DESCRIPTION, EXAMPLES)
     parser.add_argument("output", type=Path, metavar="OUT", help="the folder that -o named, or JOB.toml of `run`")
     options.add_baseline(parser)
     options.add_talk(parser)

@@ -12,6 +12,13 @@ from . import common_options as options
 from .job_runs import run_job
 
 DEMO_RESOLUTION = (480, 270)
+DEMO = "Build the example scene, OUT/demo.blend, and do with it what compare does."
+COMPARE = """Shade what the camera sees with several techniques, render the same direct light
+with Cycles, and measure how far apart they are. OUT gets compare.exr (all layers
+in float), compare.png (side by side, signed errors below), report.html and
+report.json."""
+SHADE = """Shade what the camera sees. OUT gets shade.exr, with a layer for each technique and
+pass, and report.json."""
 DEMO_EXAMPLES = """examples:
   %(prog)s -o out/demo
   %(prog)s -o out/demo --resolution 960x540 --cycles-samples 4096
@@ -31,7 +38,7 @@ SHADE_EXAMPLES = """examples:
 
 def add_demo(parser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, DEMO_EXAMPLES)
+    options.with_examples(parser, DEMO, DEMO_EXAMPLES)
     options.add_moments(parser, values.name_of_picture)
     _add_picture(parser, cycles=True, resolution="{}x{}".format(*DEMO_RESOLUTION))
     parser.set_defaults(run=_demo, scenes=[])
@@ -39,7 +46,7 @@ def add_demo(parser) -> None:
 
 def add_compare(parser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, COMPARE_EXAMPLES)
+    options.with_examples(parser, COMPARE, COMPARE_EXAMPLES)
     options.add_scenes(parser)
     _add_picture(parser, cycles=True)
     options.add_baseline(parser)
@@ -48,7 +55,7 @@ def add_compare(parser) -> None:
 
 def add_shade(parser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, SHADE_EXAMPLES)
+    options.with_examples(parser, SHADE, SHADE_EXAMPLES)
     options.add_scenes(parser)
     _add_picture(parser, cycles=False)
     parser.set_defaults(run=_run)
@@ -60,7 +67,7 @@ def _add_picture(parser, *, cycles, resolution="as in the file"):
     parser.add_argument("--techniques", type=values.techniques, default=DEFAULT_TECHNIQUES, metavar="T",
                         help=f"{values.TECHNIQUES_HELP} (default: {names})")  # fmt: skip
     parser.add_argument("--passes", type=values.passes, default=PASSES, metavar="P",
-                        help=f"separated by commas (default: {','.join(PASSES)})")  # fmt: skip
+                        help=f"some of {','.join(PASSES)} (default: both)")  # fmt: skip
     parser.add_argument("--resolution", type=values.resolution, metavar="WxH", help=f"default: {resolution}")
     parser.add_argument("--aa", type=values.positive, default=1, metavar="N",
                         help="points per pixel, drawn from its filter; 1: pixel centers")  # fmt: skip

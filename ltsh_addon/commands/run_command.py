@@ -13,6 +13,7 @@ from . import bake_command, picture_commands
 from . import common_options as options
 from .job_runs import do_job, finish, print_json
 
+DESCRIPTION = "Do the jobs of a file, each a shade, compare or bake, one after another."
 EXAMPLES = """examples:
   %(prog)s night.toml
   %(prog)s night.toml --shard 1/4 --resume --log night.log
@@ -43,7 +44,7 @@ are done all the same.
 
 def add(parser) -> None:
     """Add the arguments and the function that runs."""
-    options.with_examples(parser, EXAMPLES)
+    options.with_examples(parser, DESCRIPTION, EXAMPLES)
     parser.add_argument("file", type=Path, metavar="JOB.toml", help="the jobs")
     options.add_batch(parser)
     options.add_talk(parser)

@@ -10,20 +10,40 @@ from pathlib import Path
 
 from ..shading import SHIPPED_TABLES
 from . import argument_values as values
-from .common_options import add_talk
+from .common_options import add_talk, with_examples
 from .job_runs import print_json
 from .progress_bar import say
+
+DESCRIPTION = "Fit, measure and export the lookup tables. All but export need the source checkout and scipy."
+EXAMPLES = """examples:
+  %(prog)s export -o out/tables
+  %(prog)s validate ltsh4 --json
+  %(prog)s fit ltsh6 -o out/tables
+"""
+EXPORT = "Write each table as an EXR and as a header for C, C++ and GLSL; see tables/EXPORT.md."
+EXPORT_EXAMPLES = """examples:
+  %(prog)s -o out/tables
+  %(prog)s ltsh4 my_table.npz -o out/tables --json
+"""
+SCRIPTS = {
+    "fit": "fit tables to a BRDF, which takes hours",
+    "validate": "errors of tables between their nodes",
+    "optimum": "how good any table of a family could be",
+    "plot": "the figures of tables/README.md",
+}
 
 
 def add(parser) -> None:
     """Add the arguments and the functions that run."""
+    with_examples(parser, DESCRIPTION, EXAMPLES)
     actions = parser.add_subparsers(dest="action", required=True)
-    for action in ("fit", "validate", "optimum", "plot"):
+    for action, meaning in SCRIPTS.items():
         # The script parses its own options: nothing starts with this prefix, so that all of them are taken as they are.
-        script = actions.add_parser(action, help="in the source checkout", add_help=False, prefix_chars="\0")
+        script = actions.add_parser(action, help=meaning, add_help=False, prefix_chars="\0")
         script.add_argument("arguments", nargs="*")
         script.set_defaults(run=_run_table_script, quiet=False, log=None)
-    export = actions.add_parser("export", help="an EXR and a C, C++ and GLSL header of each, for other engines")
+    export = actions.add_parser("export", help="for other engines: an EXR, a header for C, C++ and GLSL")
+    with_examples(export, EXPORT, EXPORT_EXAMPLES)
     export.add_argument("names", nargs="*", type=values.table, metavar="TABLE",
                         help="or a path (.npz); default: all shipped")  # fmt: skip
     export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
-import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-try:
-    import fcntl
-except ImportError:  # Windows, where a file that is open cannot be removed anyway
-    fcntl = None
+from .. import ownership
+
+SUFFIX = ".tmp"
 
 
 class NotWritten(OSError):
@@ -28,16 +26,14 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     line, when the folder is missing or not writable, the disk is full, ...
     """
     target = Path(os.path.realpath(path))
-    prefix = f".{target.name[:100]}."
     temporary, file = None, None
     try:
         if target.is_dir():
             raise OSError("a folder has that name")
-        _remove_abandoned(target.parent, prefix)
-        temporary, file = _locked(target.parent, prefix)
+        temporary, file = ownership.new_file(target.parent, _prefix(target.name), SUFFIX)
         yield temporary
-        if fcntl is None:
-            file = _closed(file)
+        if os.name == "nt":
+            file = _closed(file)  # what is open cannot be renamed there
         os.replace(temporary, target)
     except NotWritten:
         raise  # another file, within the block
@@ -48,6 +44,19 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         if temporary is not None:
             with suppress(OSError):
                 temporary.unlink()
+
+
+@contextmanager
+def replacing_by_copy(path: str | os.PathLike) -> Iterator[Path]:
+    """As `replacing`, for programs that put a file of their own in the place of the one that they are given, as Blender
+    does: it is copied then, since nobody holds its lock. What is yielded does not exist yet."""
+    with replacing(path) as temporary:
+        made = temporary.with_name(f"{temporary.name}.saved")
+        try:
+            yield made
+            shutil.copyfile(made, temporary)
+        finally:
+            made.unlink(missing_ok=True)
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
@@ -63,53 +72,14 @@ def check_takes_files(folder: str | os.PathLike) -> None:
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    prefix = ".ltsh-write-test."
-    _remove_abandoned(folder, prefix)
-    path, file = _locked(folder, prefix)
+    path, file = ownership.new_file(folder, ".ltsh-write-test.", SUFFIX)
     _closed(file)
     path.unlink(missing_ok=True)  # once closed, another process may take it for abandoned
 
 
-def _locked(folder: Path, prefix: str) -> tuple[Path, int]:
-    """A new file in `folder` and its descriptor, which holds the lock that tells others that somebody writes it."""
-    while True:
-        path = folder / f"{prefix}{secrets.token_hex(4)}.tmp"
-        # Not tempfile.mkstemp: its 0600 would stay on the finished file; this one follows the umask.
-        file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
-        try:
-            _lock(file)
-            taken = os.fstat(file).st_nlink == 0
-        except BlockingIOError:
-            taken = True
-        except OSError:
-            taken = False  # a file system without locks
-        if not taken:
-            return path, file
-        os.close(file)  # another process took it for abandoned, before it was locked
-
-
-def _remove_abandoned(folder: Path, prefix: str) -> None:
-    """Remove temporary files with that prefix that nobody writes any more."""
-    name, found = re.compile(re.escape(prefix) + r"[0-9a-f]{8}\.tmp@?"), []  # Blender writes to NAME@
-    with suppress(OSError), os.scandir(folder) as entries:
-        found = [entry for entry in entries if name.fullmatch(entry.name)]
-    for entry in found:
-        with suppress(OSError):
-            if fcntl is None:
-                os.unlink(entry.path)  # fails where it is open
-                continue
-            file = os.open(entry.path, os.O_WRONLY)
-            try:
-                _lock(file)
-                os.unlink(entry.path)
-            finally:
-                os.close(file)
-
-
-def _lock(file: int) -> None:
-    """Take the lock of an open file; raises OSError where another process has it."""
-    if fcntl is not None:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+def _prefix(name: str) -> str:
+    """What the names of temporary files of the file `name` begin with; names have 255 bytes at most."""
+    return f".{os.fsencode(name)[:100].decode(errors='ignore')}."
 
 
 def _closed(file: int | None) -> None:

@@ -35,12 +35,11 @@ def comparison_sheet(
     techniques: Sequence[Tile],
     *,
     notes: Sequence[str] = (),
-    error_scale: float | None = None,
 ) -> np.ndarray:
     """The sheet (H, W, 3), 8-bit sRGB.
 
-    `reference` is a label and a linear image (H, W, 3); all images have its size. One exposure and one error scale (a
-    radiance; left out: the 99.5th percentile of all absolute errors) serve all tiles; both are printed.
+    `reference` is a label and a linear image (H, W, 3); all images have its size. One exposure and one error scale
+    (`common_error_scale`) serve all tiles; both are printed.
     """
     label, image = reference
     for tile in techniques:
@@ -48,7 +47,7 @@ def comparison_sheet(
             if part.shape != image.shape:
                 raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
     exposure = exposure_factor(image)
-    scale = error_scale or common_error_scale([tile.error for tile in techniques], image)
+    scale = common_error_scale([tile.error for tile in techniques], image)
     pictures = [to_srgb8(exposure * _resized(part)) for part in (image, *(tile.image for tile in techniques))]
     errors = [_to_8bit(signed_error_colors(_resized(tile.error), scale)) for tile in techniques]
     height, width = pictures[0].shape[:2]

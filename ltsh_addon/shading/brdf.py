@@ -19,14 +19,29 @@ def ggx_brdf_cosine(cos_theta_o, alpha, directions):
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     half_x = x + np.sqrt(np.maximum(1.0 - mu_o * mu_o, 0.0))
     half_z = z + mu_o
-    horizontal = half_x * half_x + y * y
-    vertical = half_z * half_z
-    # D(h) with h unnormalized: alpha^2 |h|^4 / (pi (h_x^2 + h_y^2 + alpha^2 h_z^2)^2)
-    ratio = (horizontal + vertical) / np.maximum(horizontal + alpha_squared * vertical, 1e-300)
-    distribution = alpha_squared / np.pi * ratio * ratio
+    distribution = ggx_distribution(half_x * half_x + y * y, half_z * half_z, alpha_squared)
     mu_i = np.maximum(z, 0.0)
     masking = mu_o * _slope_length(mu_i, alpha_squared) + mu_i * _slope_length(mu_o, alpha_squared)
     return distribution * mu_i / (2.0 * np.maximum(masking, 1e-300))
+
+
+def ggx_distribution(horizontal, vertical, alpha_squared):
+    """D(h) of GGX in sr^-1 for half vectors of any length (Walter et al. 2007, eq. 33); broadcasts.
+
+    horizontal = h_x^2 + h_y^2 and vertical = h_z^2: D = alpha^2 |h|^4 / (pi (horizontal + alpha^2 vertical)^2).
+    """
+    ratio = (horizontal + vertical) / np.maximum(horizontal + alpha_squared * vertical, 1e-300)
+    return alpha_squared / np.pi * ratio * ratio
+
+
+def visible_normal_density(cos_theta_o, horizontal, vertical, alpha_squared):
+    """Density in sr^-1 with which directions are chosen by reflection at visible normals: G1(o) D(h) / (4 cos theta_o).
+
+    Heitz 2018, "Sampling the GGX Distribution of Visible Normals", eq. 17 and 18; cos_theta_o > 0, the half vectors as
+    for `ggx_distribution`; broadcasts.
+    """
+    distribution = ggx_distribution(horizontal, vertical, alpha_squared)
+    return distribution / (2.0 * (cos_theta_o + _slope_length(cos_theta_o, alpha_squared)))
 
 
 def _slope_length(mu, alpha_squared):

@@ -57,7 +57,7 @@ def shade(
     points where single precision does not suffice are computed in double. "reference" and degrees above 4 always are.
     Raises TableError and ValueError.
     """
-    task = _task(samples, tuple(lights), technique, passes, dtype)
+    task = _task(tuple(lights), technique, passes, dtype)
     count = len(samples)
     shape = (len(task.groups), count, 3)
     radiance = {name: np.zeros(shape, np.dtype(dtype)) for name in task.passes}
@@ -86,7 +86,7 @@ def _blocks(count: int, least: int, most: int) -> list[slice]:
     return blocks
 
 
-def _task(samples, lights, technique, passes, dtype) -> Task:
+def _task(lights, technique, passes, dtype) -> Task:
     unknown = [name for name in passes if name not in PASSES]
     if unknown or not passes:
         raise ValueError(f"passes are {list(passes)}, expected some of {', '.join(PASSES)}")

@@ -132,15 +132,16 @@ def split_long_edges(vertices: np.ndarray) -> np.ndarray:
     """
     following = np.roll(vertices, -1, axis=1)
     along = following - vertices
-    squared = _dot(along, along)
+    squared = dot(along, along)
     squared = np.where(squared > 0.0, squared, 1.0)
     # Written so that both directions of an edge give the same bits.
-    start, end = (np.clip(side / squared, 0.0, 1.0) for side in (_dot(following, along), -_dot(vertices, along)))
+    start, end = (np.clip(side / squared, 0.0, 1.0) for side in (dot(following, along), -dot(vertices, along)))
     nearest = start * vertices + end * following
     return np.stack([vertices, nearest], axis=2).reshape(3, -1, vertices.shape[2])
 
 
-def _dot(a, b):
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Scalar products (...) of vectors (3, ...)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from . import brdf
 from .edge_integrals import arc_factors
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
-from .polygon import one_plus_cosine, project_to_sphere
+from .polygon import dot, one_plus_cosine, project_to_sphere
 
 # Gauss-Legendre orders along each piece of the boundary, and along a radius; tried in turn.
 _ORDERS = ((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72))
@@ -36,11 +36,13 @@ class PolygonBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
+        """Of polygons (3, V, P) in the local frame."""
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
 
     def take(self, index) -> PolygonBoundary:
+        """Those of the points `index` (Q,)."""
         return PolygonBoundary(self.unit[:, :, index])
 
     def apex(self) -> np.ndarray:
@@ -76,6 +78,7 @@ class EllipseBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, center, half_u, half_v) -> EllipseBoundary:
+        """Of ellipses with centers and half axes (3, P) in the local frame."""
         center, half_u, half_v = (warp.to_original_domain(vector) for vector in (center, half_u, half_v))
         swing = np.hypot(half_u[2], half_v[2])
         ratio = np.divide(-center[2], swing, out=np.where(center[2] > 0.0, -1.0, 1.0), where=swing > 0.0)
@@ -84,18 +87,19 @@ class EllipseBoundary:
     pieces = _ELLIPSE_PIECES + 1
 
     def take(self, index) -> EllipseBoundary:
+        """Those of the points `index` (Q,)."""
         vectors = (self.center[:, index], self.half_u[:, index], self.half_v[:, index])
         return EllipseBoundary(*vectors, self.middle[index], self.reach[index])
 
     def apex(self) -> np.ndarray:
         """As `PolygonBoundary.apex`; e_z is inside where the z axis meets the ellipse."""
         normal = np.cross(self.half_u, self.half_v, axis=0)
-        height = _dot(normal, self.center) / np.where(normal[2] != 0.0, normal[2], 1.0)
+        height = dot(normal, self.center) / np.where(normal[2] != 0.0, normal[2], 1.0)
         offset = -self.center + height * np.array([0.0, 0.0, 1.0])[:, None]
-        scale = _dot(normal, normal)
+        scale = dot(normal, normal)
         scale = np.where(scale > 0.0, scale, 1.0)
-        u = _dot(np.cross(offset, self.half_v, axis=0), normal) / scale
-        v = _dot(np.cross(self.half_u, offset, axis=0), normal) / scale
+        u = dot(np.cross(offset, self.half_v, axis=0), normal) / scale
+        v = dot(np.cross(self.half_u, offset, axis=0), normal) / scale
         inside = (normal[2] != 0.0) & (height > 0.0) & (u * u + v * v <= 1.0)
         turns = (np.arange(16) + 0.5) / 8.0 - 1.0
         return _peak_or_mean(inside, project_to_sphere(self._at(turns[:, None])))
@@ -108,7 +112,7 @@ class EllipseBoundary:
         angle = self.middle + turns * self.reach
         velocity = np.cos(angle) * self.half_v[:, None] - np.sin(angle) * self.half_u[:, None]
         step = np.tile(weights, _ELLIPSE_PIECES)[:, None] * 2.0 / _ELLIPSE_PIECES * self.reach
-        measure = np.cross(vectors, velocity, axis=0) * step / _dot(vectors, vectors)
+        measure = np.cross(vectors, velocity, axis=0) * step / dot(vectors, vectors)
         closing = PolygonBoundary(project_to_sphere(self._at(np.array([[1.0], [-1.0]]))))
         points, closing_measure = closing.nodes(order)
         # The polygon of two corners has two edges; only the first is the chord, and only of a clipped ellipse.
@@ -133,13 +137,14 @@ class Cone:
     at_foot: np.ndarray  # (P,) points whose lights are best integrated around the axis, where the factor has its tip
 
     def take(self, index) -> Cone:
+        """Those of the points `index` (Q,)."""
         return Cone(self.axis[:, index], self.tangent, self.share, self.at_foot[index])
 
     def factor(self, direction: np.ndarray) -> np.ndarray:
         """Factors (..., P) for unit directions (3, ..., P)."""
         across = np.cross(direction, np.broadcast_to(self._axis_for(direction), direction.shape), axis=0)
-        along = _dot(direction, self._axis_for(direction))
-        tangent = np.sqrt(_dot(across, across)) / np.maximum(along, 1e-30)
+        along = dot(direction, self._axis_for(direction))
+        tangent = np.sqrt(dot(across, across)) / np.maximum(along, 1e-30)
         return np.maximum((self.tangent - tangent) / self.share, 0.0)
 
     def _axis_for(self, direction):
@@ -186,10 +191,6 @@ def limit_warp(cosine, alpha) -> Lobe:
     return Lobe(squared, np.sqrt(squared) * sine, np.ones_like(alpha), 2.0 * alpha, None, np.empty((0, 0, len(alpha))))
 
 
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def _peak_or_mean(inside, unit):
     mean = project_to_sphere(unit.sum(axis=1, keepdims=True))[:, 0]
     return np.where(inside, np.array([0.0, 0.0, 1.0])[:, None], mean)
@@ -198,9 +199,9 @@ def _peak_or_mean(inside, unit):
 def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior, cone):
     """Integrals (4, P) with fixed Gauss-Legendre orders."""
     points, measure = boundary.nodes(order[0])
-    wedge = _dot(measure, apex[:, None])  # (B, P)
+    wedge = dot(measure, apex[:, None])  # (B, P)
     wedge = wedge * np.sign(wedge.sum(axis=0))
-    rho = np.maximum(np.arccos(np.clip(_dot(points, apex[:, None]), -1.0, 1.0)), 1e-7)[:, None]
+    rho = np.maximum(np.arccos(np.clip(dot(points, apex[:, None]), -1.0, 1.0)), 1e-7)[:, None]
     fractions, weights = _unit_interval(order[1])
     fractions = fractions[:, None]
     inner_sine, sine = np.sin(rho * fractions), np.sin(rho)

@@ -14,11 +14,9 @@ import numpy as np
 from . import double_precision, edge_loop, light_cone, ridge_table
 from .fresnel_kinds import any_component, columns, fresnel_kinds
 from .light_polygons import integrate_visible, light_levels, local_corners
+from .polygon import dot
+from .single_integrals import CHUNK, CORNERS, Cosine, Focused, LobeIntegral, ShadowedCosine
 
-# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
-# multiple of a page long, where the cache would hold few of them.
-CHUNK = 24592
-CORNERS = 4 * CHUNK
 DOUBLE_CHUNK = 4096
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
@@ -39,9 +37,9 @@ def shade_diffuse(samples, lights, radiance, scratch):
             if is_bumped:
                 smooth = columns(samples.smooth_normal, index)
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
-                integrate = _ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
+                integrate = ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
             colors = columns(samples.diffuse_albedo, index)[None]
-            integrate = integrate or _Cosine(scratch)
+            integrate = integrate or Cosine(scratch)
             _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, 1.0, radiance, fragile, scratch)
     _add_fragile(samples, lights, fragile, radiance, double_precision.shade_diffuse)
 
@@ -52,13 +50,13 @@ def shade_specular(samples, lights, table, radiance, scratch):
     ridges = ridge_table.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
     reflective = np.logical_or.reduce([any_component(term) for term in terms])
-    lit = reflective & (_dot(samples.normal.T, samples.view.T) > 0.0)
+    lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < ridge_table.SHARP_ROUGHNESS)
     fragile = [[] for _ in lights]
     for vectors, members, color_rows in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
-            integrate = _LobeIntegral(ridges, weights, scratch)
+            integrate = LobeIntegral(ridges, weights, scratch)
             colors, width = color_rows(index), double_precision.lobe_width(samples, index)
             _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch)
 
@@ -129,12 +127,12 @@ def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, widt
             continue
         for part, outline, effort in _batches(light, corners, position, width):
             offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
-            facing = _dot(offset, light.direction.astype(np.float32)) < 0.0
+            facing = dot(offset, light.direction.astype(np.float32)) < 0.0
             if allowed is not None:
                 facing &= allowed[part]
             axes, of_part = rows[:, :, part], partial(integrate, part)
             if light.is_focused:
-                of_part = _Focused(light, effort, offset, axes, of_part, len(colors))
+                of_part = Focused(light, effort, offset, axes, of_part, len(colors))
                 axes = of_part.rows
             polygons = local_corners(light, outline, offset, axes, scratch)
             found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
@@ -163,100 +161,6 @@ def _batches(light, corners, position, width):
             yield part if chosen is None else chosen[part], outline, effort
 
 
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _selected(values, part, index):
-    """Columns `index` (None: all) of the columns `part`, a slice, of values (..., Q)."""
-    values = values[..., part]
-    return values if index is None else np.take(values, index, axis=-1)
-
-
-class _Focused:
-    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
-
-    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
-    """
-
-    def __init__(self, light, effort, offset, axes, integrate, count):
-        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
-        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
-        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
-        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
-
-    def __call__(self, corners, index):
-        index = np.arange(corners.shape[2]) if index is None else index
-        values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
-        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
-        for start in range(0, len(index), step):
-            part = slice(start, start + step)
-            flat, view = corners[-2:, :, part], self.view.take(index[part])
-            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
-            for number, (near, weights, polygons) in enumerate(layers):
-                # The small disks count little, so that the rounding of their edges is lost in the sum.
-                smallest = 0.0 if number < self.effort.layers - 1 else edge_loop.SMALLEST_SAFE
-                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
-                values[:, start + near] += weights * found
-                fragile[start + near] |= redo
-        return values, fragile
-
-
-def _along_rows(axes, vector):
-    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
-    x, y, z = vector.astype(np.float32)
-    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]
-
-
-class _Cosine:
-    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
-
-    def __init__(self, scratch):
-        self.scratch = scratch
-
-    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
-        integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
-        integral *= np.float32(-1.0 / np.pi)
-        return np.maximum(integral, np.float32(0.0))[None], fragile
-
-
-class _ShadowedCosine:
-    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
-
-    def __init__(self, rows, bump_alpha2, scratch):
-        self.smooth = np.stack([_dot(row, rows[3]) for row in rows[:3]])
-        self.bump_alpha2, self.scratch = bump_alpha2, scratch
-
-    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
-        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, fragile = edge_loop.vector_irradiance(corners, self.scratch, smallest)
-        direction = np.negative(integrals, out=integrals)
-        along = np.maximum(_dot(direction, smooth), np.float32(1e-15))
-        tangent2 = np.maximum(_dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
-        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
-        return values[None], fragile
-
-
-class _LobeIntegral:
-    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `_Cosine`."""
-
-    def __init__(self, ridges, weights, scratch):
-        self.ridges, self.weights, self.scratch = ridges, weights, scratch
-
-    def __call__(self, part, corners, index, smallest=edge_loop.SMALLEST_SAFE):
-        weights = _selected(self.weights, part, index)
-        if self.ridges.source.family == "ltc":
-            integral, fragile = edge_loop.cosine_integral(corners, self.scratch, smallest)
-            values = weights[:, 0] * integral
-            values *= np.float32(-1.0 / np.pi)
-        else:
-            degree = self.ridges.degree
-            values, _, fragile = edge_loop.weighted_moments(corners, weights, degree, self.scratch, smallest)
-            np.negative(values, out=values)
-        return np.maximum(values, np.float32(0.0), out=values), fragile
-
-
 def _normal_frame(normal):
     """Frames (3, 3, P) around normals (3, P), without a preferred tangent (Duff et al. 2017)."""
     x, y, z = normal
@@ -270,9 +174,9 @@ def _normal_frame(normal):
 def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
     normal, view = columns(samples.normal, index), columns(samples.view, index)
-    cosine = _dot(normal, view)
+    cosine = dot(normal, view)
     tangent = view - cosine * normal
-    sine = np.sqrt(_dot(tangent, tangent))
+    sine = np.sqrt(dot(tangent, tangent))
     straight = np.nonzero(sine < 1e-6)[0]
     if len(straight):
         # The lobe is round there: any tangent serves.

@@ -55,9 +55,7 @@ class Task:
 
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
-        prepared = [
-            (light, self.groups.index(light.group), light.polygon()) for light in self.lights
-        ]
+        prepared = [(light, self.groups.index(light.group), light.polygon()) for light in self.lights]
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         if self.single:

@@ -6,8 +6,6 @@ import numpy as np
 
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
-SIGNS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-
 
 def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

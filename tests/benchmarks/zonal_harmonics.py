@@ -81,9 +81,12 @@ class ZonalHarmonics:
             c /= band + 1
             d.append(d[band - 1] + (2 * band + 1) * b_current)
             b_previous, b_current = b_current, ((2 * band + 1) * c - band * b_previous) / (band + 1)
-            p_previous, p_current = p_current, tuple(
-                ((2 * band + 1) * z * p - band * q) / (band + 1)
-                for z, p, q in zip((a, end), p_current, p_previous, strict=True)
+            p_previous, p_current = (
+                p_current,
+                tuple(
+                    ((2 * band + 1) * z * p - band * q) / (band + 1)
+                    for z, p, q in zip((a, end), p_current, p_previous, strict=True)
+                ),
             )
         return d
 

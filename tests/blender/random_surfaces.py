@@ -43,6 +43,11 @@ def samples(kind: str, count: int, random: np.random.Generator) -> SurfaceSample
     normal = unit(rounded(normal))
     bends = 0.5 if kind == "tilted" else 0.0
     bent = [unit(rounded(normal + bends * random.normal(size=(count, 3)))) for _ in range(3)] if bends else [None] * 3
+    if bends:
+        # Horizons that are the same one: of both lobes, and of the diffuse one alone.
+        for other in bent:
+            other[::4] = normal[::4]
+        bent[1][1::4] = bent[0][1::4]
     return SurfaceSamples(
         position=position,
         view=view,

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from pathlib import Path
@@ -21,16 +20,6 @@ from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extra
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def temporary_root(tmp_path, monkeypatch):
-    """The folder in which temporary folders are made, to see what is left behind."""
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    return folder
 
 
 def saved_scene(path: Path, *, camera=True, light=True, look=(0.0, 0.0, 0.0)) -> Path:
@@ -114,7 +103,7 @@ def test_a_camera_that_sees_nothing_is_a_warning(tmp_path):
         (None, "no such file"),
         (b"", "is empty"),
         (b"not a blend file at all\n" * 20, "is no .blend"),
-        ("folder", "cannot be read"),
+        ("folder", "is a folder, expected a .blend"),
         ("cut", "cannot open it"),
     ],
 )

@@ -46,7 +46,7 @@ def test_a_demo_that_does_not_fit_leaves_no_file(tmp_path):
         "from ltsh_addon import cli\nsys.exit(cli.main(sys.argv[1:]))"
     )
     command = [sys.executable, "-c", code, "demo", "-o", str(tmp_path / "out"), "--quiet"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 1 and done.stderr.startswith(f"ltsh: {tmp_path / 'out'}: Blender c"), done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not list((tmp_path / "out").glob("*.blend")) and not list((tmp_path / "out").glob(".*.blend"))
@@ -176,7 +176,7 @@ def fingerprint_in_fresh_interpreter():
         "print(digest.hexdigest())\n"
     )
     command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
     return done.stdout.strip()
 
 

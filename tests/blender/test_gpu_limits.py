@@ -8,13 +8,13 @@ import gpu
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport import lighting, picture_pass, surface_pass, surface_uniforms
+from ltsh_addon.blender.viewport import horizon_pass, lighting, picture_pass, surface_pass, surface_uniforms
 from ltsh_addon.blender.viewport.lighting_source import Features
 
 # Vulkan asks for 128 bytes of push constants and 16384 of a uniform buffer, Metal has 16 samplers per stage, and all
 # can draw into 8 textures; Blender's OpenGL path has 31 locations of attributes and varyings.
 PUSH_BYTES, BLOCK_BYTES, SAMPLERS, TARGETS = 128, 16384, 16, 8
-BYTES = {"FLOAT": 4, "INT": 4, "VEC2": 8, "VEC3": 16, "VEC4": 16, "IVEC4": 16, "MAT4": 64}
+BYTES = {"FLOAT": 4, "INT": 4, "VEC2": 8, "VEC3": 16, "VEC4": 16, "IVEC2": 8, "IVEC4": 16, "MAT4": 64}
 # Types and address spaces of Metal's language, and what later versions of GLSL reserve.
 RESERVED = (
     "half half3 uchar device constant thread threadgroup kernel vertex fragment texture sampler sample filter input "
@@ -47,7 +47,8 @@ def recorded(monkeypatch):
     monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", create)
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
-    monkeypatch.setattr(picture_pass, "batch_for_shader", lambda *arguments: None)
+    for module in (picture_pass, horizon_pass):
+        monkeypatch.setattr(module, "batch_for_shader", lambda *arguments: None)
 
     def run(function):
         made.clear()
@@ -74,7 +75,7 @@ def check(info):
 @pytest.mark.parametrize("technique", shading.SHIPPED_TABLES)
 def test_the_lighting_pass_keeps_to_the_limits(technique, recorded):
     table = shading.load_table(technique)
-    for choice in itertools.product((False, True), repeat=5):
+    for choice in itertools.product((False, True), repeat=6):
         features = Features(*choice)
         if features.specular or features.diffuse:
             [info] = recorded(lambda features=features: lighting._create_info(table, features))
@@ -85,7 +86,7 @@ def test_surfaces_and_pictures_keep_to_the_limits(recorded):
     for outputs in (surface_pass.SURFACES, surface_pass.NORMALS, surface_pass.EMISSION):
         [info] = recorded(lambda outputs=outputs: surface_pass._shader(outputs))
         check(info)
-    for info in recorded(picture_pass.PicturePass):
+    for info in (*recorded(picture_pass.PicturePass), *recorded(horizon_pass.HorizonPass)):
         check(info)
     # All values are vec4 or matrices of them, which std140 lays out as arrays of floats are in Python.
     assert 16 * surface_uniforms.LOOK_SIZE <= BLOCK_BYTES

@@ -1,6 +1,7 @@
 """Scenes that nobody meant: what cannot be done ends with one line, what is merely odd is done, with a warning."""
 
 import contextlib
+import gzip
 import json
 import os
 import re
@@ -12,7 +13,9 @@ import numpy as np
 import pytest
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.processes import blender_process
+from ltsh_addon.blender.pixels import extraction
+from ltsh_addon.blender.processes import blend_header, blender_process
+from ltsh_addon.blender.processes.child import SceneError
 
 # `make soak` takes 10,000.
 MANY = int(os.environ.get("LTSH_MANY_LIGHTS", "500"))
@@ -107,6 +110,47 @@ def test_a_hostile_scene(run, tmp_path, case):
         assert all(np.isfinite(plane).all() for plane in imaging.read_channels(file).values()), file.name
     if command != "bake" and code == 1:
         assert len(stderr.splitlines()) == 1 and list(out.iterdir()) == []
+
+
+def zstandard_packed(data):
+    return pytest.importorskip("zstandard").compress(data)
+
+
+PACKING = {"plain": bytes, "gzip": gzip.compress, "Zstandard": zstandard_packed}
+
+
+@pytest.mark.parametrize("packing", PACKING)
+@pytest.mark.parametrize("share", [1.0, 0.5, 40])
+def test_a_scene_is_opened_however_it_is_packed_and_refused_where_it_is_cut(run, tmp_path, packing, share):
+    """All of it, half of it, or its first bytes."""
+    hostile_scenes.plain()
+    path, out = tmp_path / "scene.blend", tmp_path / "out"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=False)
+    whole = PACKING[packing](path.read_bytes())
+    cut = whole[: int(share if share > 1 else share * len(whole))]
+    path.write_bytes(cut)
+    code, _, stderr = run("shade", path, "-o", out, "--quiet", *OPTIONS["shade"])
+    if cut == whole:
+        assert (code, stderr) == (0, "") and (out / "shade.exr").is_file()
+        return
+    (line,) = stderr.splitlines()
+    assert code == 1 and line.startswith(f"ltsh: {path}: Blender {bpy.app.version_string} cannot open it, is it whole?")
+    assert line.count(str(path)) == 1 and list(out.iterdir()) == []
+
+
+def test_a_newer_file_is_refused_also_where_its_header_cannot_be_read_before(tmp_path):
+    hostile_scenes.plain()
+    path = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=False)
+    data = path.read_bytes()
+    version = blend_header.saved_with(path)
+    digits = b"0999" if data[7:9].isdigit() else b"999"
+    end = 17 if data[7:9].isdigit() else 12
+    path.write_bytes(data[: end - len(digits)] + digits + data[end:])
+    assert version == bpy.app.version[:2] and blend_header.saved_with(path) == (9, 99)
+    expected = f"scene.blend: was saved by Blender 9.99, but this is Blender {version[0]}.{version[1]}, "
+    with pytest.raises(SceneError, match=expected):
+        extraction.open_scene(path, [])
 
 
 def test_many_lights_add_up(run, tmp_path):

@@ -52,7 +52,7 @@ def contents(folder):
 
 
 def run(command):
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
 
 
 def run_python(*arguments):
@@ -129,9 +129,9 @@ def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path
         return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
     single = start(*common, tmp_path / "one")
-    assert (single.communicate(timeout=240)[1], single.returncode) == (b"", 0)
+    assert (single.communicate(timeout=600)[1], single.returncode) == (b"", 0)
     shards = [start(*common, tmp_path / "four", "--shard", f"{number}/4") for number in (1, 2, 3, 4, 1)]
-    assert [shard.communicate(timeout=240)[1] for shard in shards] == [b""] * 5
+    assert [shard.communicate(timeout=600)[1] for shard in shards] == [b""] * 5
     assert [shard.returncode for shard in shards] == [0] * 5
     assert merge(tmp_path / "four").missing == ()
     assert contents(tmp_path / "four") == contents(tmp_path / "one") and len(contents(tmp_path / "one")) == 22

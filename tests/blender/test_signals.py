@@ -3,7 +3,6 @@
 import os
 import signal
 import subprocess
-import tempfile
 import threading
 import time
 from pathlib import Path
@@ -17,8 +16,8 @@ from kills import is_blenders_own
 ROOT = Path(__file__).resolve().parents[2]
 LINES = {signal.SIGINT: "ltsh: interrupted", signal.SIGTERM: "ltsh: terminated"}
 LARGE = "--reference-samples", "1000000"
-# A second would do; the machine may be busy with other tests.
-SECONDS = 5.0
+# Less than what the commands below would take; `make soak` prints in how many seconds signals end commands.
+SECONDS = 60.0
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="processes as Linux tells them")
 
 
@@ -31,15 +30,6 @@ def room(tmp_path_factory):
     scene_parts.add_top_camera()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     return path
-
-
-@pytest.fixture
-def temporary_root(tmp_path, monkeypatch):
-    folder = tmp_path / "temporary"
-    folder.mkdir()
-    monkeypatch.setenv("TMPDIR", str(folder))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    return folder
 
 
 class Running:

@@ -139,7 +139,7 @@ def test_a_file_full_of_unsupported_things_is_shaded_and_each_is_named(tmp_path)
     before = path.read_bytes()
     command = programs.command_line("compare", path, "-o", tmp_path / "out", "--cycles-samples", "8")
     command += ["--aa", "2", "--techniques", "ltc,ltsh4", "--json", "--quiet"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=200, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=600, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     report = programs.document(done.stdout)
     warnings = report["warnings"]
@@ -160,6 +160,6 @@ def test_the_panoramic_camera_of_such_a_file_is_refused(tmp_path):
     path = tmp_path / "everything.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     command = programs.command_line("shade", path, "-o", tmp_path / "out", "--camera", "Panorama")
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=200, check=False)
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, encoding="utf-8", timeout=600, check=False)
     assert done.returncode == 1 and programs.said_nothing(done.stdout)
     assert "camera 'Panorama' is panoramic" in done.stderr.splitlines()[-1]

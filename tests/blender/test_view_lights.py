@@ -4,14 +4,20 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
+from graphics_card import with_graphics
+from lit_plane import add_image, add_lamp_plane, light_tree
+from view_pictures import SIZE, viewport_picture
 
-from ltsh_addon.blender.viewport.view_lights import view_lights
+from ltsh_addon import shading
+from ltsh_addon.blender.lights.shown_textures import ShownTextures
+from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.viewport.view_lights import strongest, view_lights
 
 
 def seen():
     """The lights by name, and all notes as one text."""
     bpy.context.view_layer.update()
-    lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True)
+    lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
     return {light.name: light for light in lights}, "\n".join(notes)
 
 
@@ -49,3 +55,99 @@ def test_what_cycles_shows_otherwise_is_named():
     lights, notes = seen()
     assert set(lights) == {"Dark", "Sheared"}
     assert "'Dark': negative power" in notes and "'Sheared': its transform is sheared" in notes
+
+
+def picture_light(pixels, **settings):
+    """An area light with an image of float `pixels` (H, W, 3)."""
+    light = parts.add_area_light("Picture", **settings)
+    tree, emission = light_tree(light)
+    tree.links.new(add_image(tree, pixels).outputs["Color"], emission.inputs["Color"])
+    return light
+
+
+def random_picture(height, width):
+    return np.random.default_rng(3).random((height, width, 3)) ** 3
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
+def test_an_image_on_a_light_becomes_patches_of_its_power(shape):
+    parts.empty_scene()
+    light = picture_light(random_picture(4, 8), shape=shape, scale=(-1.0, 1.0, 1.0))
+    parts.add_camera()
+    bpy.context.view_layer.update()
+    lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
+    expected = parts.prepare()[2].lights
+
+    def power(many):
+        return sum(np.linalg.norm(one.area_vector) * one.radiance for one in many)
+
+    def moment(many):
+        return sum(np.linalg.norm(one.area_vector) * one.radiance.sum() * one.center for one in many)
+
+    assert len(lights) > 16 and (not notes or "patches" in notes[0])
+    np.testing.assert_allclose(power(lights), power(expected), rtol=2e-2)
+    # The picture lies on the light as in Cycles, not mirrored.
+    away = moment(expected) - power(expected).sum() * np.array(light.location)
+    np.testing.assert_allclose(moment(lights), moment(expected), atol=0.05 * np.abs(away).max())
+
+
+def test_a_fine_texture_is_shown_as_few_patches_and_named():
+    parts.empty_scene()
+    picture_light(np.random.default_rng(8).random((256, 256, 3)))
+    bpy.context.view_layer.update()
+    lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
+    assert len(lights) == 64
+    assert any("'Picture'" in note or "Picture:" in note for note in notes) and "64 patches" in notes[0]
+
+
+def test_of_too_many_lights_the_strongest_are_shown():
+    parts.empty_scene()
+    for number in range(6):
+        parts.add_area_light(f"Light {number}", energy=10.0 + (number * 5) % 7)
+    lights = list(seen()[0].values())
+    notes = []
+    kept = strongest(lights, notes, most=4)
+    power = sorted((light.radiance.sum() for light in lights), reverse=True)
+    assert sorted((light.radiance.sum() for light in kept), reverse=True) == power[:4]
+    assert [light.name for light in kept] == [light.name for light in lights if light in kept]
+    assert "Of 6 lights" in notes[0] and f"{100.0 * sum(power[4:]) / sum(power):.1f} %" in notes[0]
+    assert strongest(lights, [], most=6) is lights
+
+
+def lit_scene():
+    """A plane and a sphere under one light of every kind; one of them lights the plane alone. The camera."""
+    parts.empty_scene(*SIZE)
+    plane = parts.add_plane(parts.principled("Floor", Roughness=0.4)[0], size=7.0)
+    ball = parts.add_sphere(parts.principled("Ball", Roughness=0.5, Metallic=1.0)[0], 0.7, segments=48)
+    ball.location = (0.2, 0.3, 0.7)
+    parts.add_area_light("Mirrored", (-1.5, 0.5, 1.4), shape="ELLIPSE", scale=(-1.0, 1.5, 1.0))
+    parts.add_area_light("Disk", (1.4, -0.6, 2.0), (0.1, 0.4, 0.0), shape="DISK", size=0.6)
+    picture_light(random_picture(2, 4), location=(0.0, 2.2, 1.2), rotation=(-1.1, 0.0, 0.0))
+    linked = parts.add_area_light("Linked", (1.8, 1.0, 1.0), (0.0, 0.9, 0.0), color=(0.2, 1.0, 0.3), energy=150.0)
+    group = bpy.data.collections.new("Lit by it")
+    group.objects.link(plane)
+    linked.light_linking.receiver_collection = group
+    lamp = add_lamp_plane(location=(-1.2, -1.2, 1.0), rotation=(0.5, -0.4, 0.0), scale=(0.8, 0.6, -1.0))
+    lamp.visible_camera = False
+    camera = parts.add_camera((0.0, -4.5, 2.6), (1.1, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    return camera, ball
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
+    camera, ball = lit_scene()
+    pictures, notes = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES]), []
+    path = tmp_path / "lights.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    found = child.extract(child.ExtractOptions(scene=path))
+    distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
+    # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.
+    on_ball = np.abs(distance - 0.7) < 0.01
+    for name, (picture, notes) in zip(shading.PASSES, pictures, strict=True):
+        shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=(name,), workers=1).combined
+        seen_there = picture.reshape(-1, 3)[found.film.pixel]
+        for part in (on_ball, ~on_ball):
+            error = np.abs(seen_there - shaded)[part].max(axis=1) / (1e-3 + shaded[part].max(axis=1))
+            assert np.quantile(error, 0.9) < 1e-2, f"{name}: {np.quantile(error, [0.5, 0.9, 0.99])}"
+        assert notes == []

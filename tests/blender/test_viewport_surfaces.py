@@ -4,17 +4,14 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from graphics_card import Canvas, with_graphics
+from graphics_card import with_graphics
+from view_pictures import SIZE, away_from_edges, viewport_picture
 
 from ltsh_addon import shading
 from ltsh_addon.blender.materials.surface_looks import look_of
 from ltsh_addon.blender.processes import child
 from ltsh_addon.blender.viewport import view_text
-from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
-from ltsh_addon.blender.viewport.surface_pass import View
-from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
 
-SIZE = (96, 72)
 COLUMNS = 4
 # Mesa's llvmpipe decodes the colors of sRGB images by a polynomial, up to 0.7 % off; without them 5e-3 would do.
 RELATIVE, ABSOLUTE = 1e-2, 1e-4
@@ -142,6 +139,35 @@ MATERIALS = (
 )
 
 
+def scattered(node_type, name, fresnel_type=None, **inputs):
+    """A material of one BSDF with Multiscatter GGX."""
+
+    def make():
+        material, node = parts.bsdf_material(node_type, name)
+        node.distribution = "MULTI_GGX"
+        if fresnel_type is not None:
+            node.fresnel_type = fresnel_type
+        for key, value in inputs.items():
+            node.inputs[key.replace("_", " ")].default_value = value
+        return material
+
+    return make
+
+
+PAINT, GOLD = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0)
+PRINCIPLED, METALLIC = "ShaderNodeBsdfPrincipled", "ShaderNodeBsdfMetallic"
+SCATTERED = (
+    scattered(PRINCIPLED, "scattered plastic", Base_Color=PAINT, Roughness=0.7, IOR=1.6),
+    scattered(PRINCIPLED, "tinted plastic", Base_Color=PAINT, Roughness=0.4, Specular_Tint=(0.3, 0.9, 0.5, 1.0)),
+    scattered(PRINCIPLED, "scattered metal", Base_Color=GOLD, Metallic=1.0, Roughness=0.8),
+    scattered(PRINCIPLED, "half metal", Base_Color=GOLD, Metallic=0.5, Roughness=0.5, Specular_IOR_Level=0.8),
+    scattered(METALLIC, "F82", "F82", Base_Color=GOLD, Edge_Tint=(0.4, 0.7, 0.9, 1.0), Roughness=0.5),
+    scattered(METALLIC, "conductor", "PHYSICAL_CONDUCTOR", Roughness=0.6),
+    scattered("ShaderNodeBsdfAnisotropic", "scattered gloss", Color=GOLD, Roughness=0.9),
+    lambda: parts.bsdf_material("ShaderNodeBsdfTranslucent", "paper", Color=PAINT)[0],
+)
+
+
 def patches_of(materials):
     """One square of each material, side by side, seen from above and a light over them."""
     scene = parts.empty_scene(*SIZE)
@@ -155,63 +181,44 @@ def patches_of(materials):
     return scene, camera
 
 
-def viewport_picture(camera, shown, is_parallel):
-    """(H, W, 3), row 0 on top, and the notes."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
-    mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
-    try:
-        mirror.sync(depsgraph)
-        view = View.of(camera.matrix_world.inverted(), projection, is_parallel)
-        settings = ShownPicture("ltsh4", shown, "single", "ltc", 0.5, 1.0, 1.0, True)
-        renderer.draw(mirror, view, SIZE, settings, canvas.buffer)
-        return renderer.read()[::-1, :, :3].astype(np.float64), mirror.notes
-    finally:
-        renderer.free()
-
-
-def sampled_picture(path, name):
-    """(H, W, 3) of the samples that Cycles took, and the number of the square (H, W) that each pixel sees, or -1."""
+def sampled_pictures(path, passes, rows):
+    """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
+    sees, or -1."""
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     found = child.extract(child.ExtractOptions(scene=path))
-    shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=(name,), workers=1)
+    shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
     square = np.full(SIZE[0] * SIZE[1], -1)
-    rows = -(-len(MATERIALS) // COLUMNS)
     column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)
                    for axis, count in enumerate((COLUMNS, rows)))  # fmt: skip
     square[found.film.pixel] = COLUMNS * row + column
-    return found.film.image(shaded.combined), square.reshape(SIZE[1], SIZE[0])
-
-
-def away_from_edges(square):
-    """Pixels (H, W) all of whose neighbors see the same square."""
-    same = square >= 0
-    for axis in (0, 1):
-        for step in (-1, 1):
-            same &= np.roll(square, step, axis) == square
-    same[0] = same[-1] = same[:, 0] = same[:, -1] = False
-    return same
+    pictures = {name: found.film.image(getattr(shaded, name).sum(axis=0)) for name in passes}
+    return pictures, square.reshape(SIZE[1], SIZE[0])
 
 
 @pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
-@pytest.mark.parametrize(("name", "kind"), [("specular", "PERSP"), ("diffuse", "PERSP"), ("specular", "ORTHO")])
-def test_the_viewport_shows_what_cycles_sampled(tmp_path, name, kind):
-    _, camera = patches_of(MATERIALS)
+@pytest.mark.parametrize(
+    ("materials", "kind", "passes"),
+    [(MATERIALS, "PERSP", shading.PASSES), (MATERIALS, "ORTHO", ("specular",)), (SCATTERED, "PERSP", shading.PASSES)],
+    ids=["perspective", "parallel", "scattered"],
+)
+def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind, passes):
+    _, camera = patches_of(materials)
     camera.data.type, camera.data.ortho_scale = kind, 4.2
-    found, notes = with_graphics(lambda: viewport_picture(camera, name, kind == "ORTHO"))
-    expected, square = sampled_picture(tmp_path / "patches.blend", name)
+    seen = with_graphics(lambda: [viewport_picture(camera, name, kind == "ORTHO") for name in passes])
+    expected, square = sampled_pictures(tmp_path / "patches.blend", passes, -(-len(materials) // COLUMNS))
     usable = away_from_edges(square)
-    assert notes == []
     failures = []
-    times = np.abs(found - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))
-    for number in range(len(MATERIALS)):
-        pixels = usable & (square == number)
-        assert pixels.sum() > 50
-        if times[pixels].max() > 1.0:
-            material = bpy.data.objects[f"Plane.{number:03d}" if number else "Plane"].active_material.name
-            failures.append(f"{material}: {times[pixels].max():.1f} times as far off as it may be")
+    for name, (picture, notes) in zip(passes, seen, strict=True):
+        assert notes == []
+        times = np.abs(picture - expected[name]) / (ABSOLUTE + RELATIVE * np.abs(expected[name]))
+        for number in range(len(materials)):
+            pixels = usable & (square == number)
+            assert pixels.sum() > 50
+            if times[pixels].max() > 1.0:
+                material = bpy.data.objects[f"Plane.{number:03d}" if number else "Plane"].active_material.name
+                failures.append(f"{material}, {name}: {times[pixels].max():.1f} times as far off as it may be")
+        assert expected[name][usable].max() > 0.05
     assert not failures, "\n".join(failures)
-    assert expected[usable].max() > 0.05
 
 
 def test_long_lines_of_the_view_are_broken():
@@ -262,6 +269,23 @@ def test_of_mixed_shaders_the_heavier_is_shown_and_the_rest_named():
     assert look.kind == "glossy"
     np.testing.assert_allclose(look.value("color").offset, (0.1, 0.2, 0.3), rtol=1e-6)
     assert any("of 2 BSDF nodes only" in note for note in look.notes)
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_missing_images_are_pink_and_named():
+    parts.empty_scene(*SIZE)
+    material, _, texture = textured("Lost", "Base Color")
+    texture.image = bpy.data.images.new("lost.png", 4, 4)
+    texture.image.source, texture.image.filepath = "FILE", "/nowhere/lost.png"
+    texture.image.reload()
+    parts.add_plane(material)
+    parts.add_area_light()
+    camera = parts.add_camera()
+    bpy.context.view_layer.update()
+    picture, notes = with_graphics(lambda: viewport_picture(camera, "diffuse", False))
+    red, green, blue = picture.reshape(-1, 3).max(axis=0)
+    assert red > 0.1 and blue == pytest.approx(red) and green == 0.0
+    assert notes == ["Lost: image 'lost.png' is missing, it is pink"]
 
 
 def test_nothing_of_the_file_is_changed():

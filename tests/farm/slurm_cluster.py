@@ -67,7 +67,7 @@ class Cluster:
     def run(self, *command, **changes) -> str:
         """Output of a command; raises where it fails."""
         done = subprocess.run(
-            list(map(str, command)), env={**self.environment, **changes}, capture_output=True, text=True, timeout=60,
+            list(map(str, command)), env={**self.environment, **changes}, capture_output=True, text=True, timeout=600,
             check=False,
         )  # fmt: skip
         assert done.returncode == 0, f"{command}: {done.returncode}\n{done.stdout}{done.stderr}"

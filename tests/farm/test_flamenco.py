@@ -23,7 +23,7 @@ def compiled(tmp_path, **settings):
     script = tmp_path / "job.js"
     texts = [(ROOT / name).read_text() for name in ("tests/farm/flamenco_stub.js", "farm/ltsh_bake.js")]
     script.write_text("\n".join([*texts, f"report({json.dumps(given)});\n"]), encoding="utf-8")
-    done = subprocess.run([ENGINE, str(script)], capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run([ENGINE, str(script)], capture_output=True, text=True, timeout=600, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     return json.loads(done.stdout)
 

@@ -21,7 +21,7 @@ def script(name, *arguments, **environment):
     """A script without Slurm, in which `ltsh` and sbatch only say how they were called."""
     return subprocess.run(
         ["bash", str(FARM / name), *map(str, arguments)], env={"PATH": os.environ["PATH"], **environment},
-        capture_output=True, text=True, timeout=30, check=False,
+        capture_output=True, text=True, timeout=600, check=False,
     )  # fmt: skip
 
 
@@ -75,6 +75,8 @@ def test_what_cannot_be_submitted_is_refused_with_the_usage(arguments, complaint
 
 OBJECTS = ["floor", "back wall", "left wall", "right wall"]
 OBJECTS += [f"cabinet left {number} plastic screen" for number in (1, 2, 3, 4)]
+
+
 @pytest.mark.parametrize(
     ("arguments", "logs", "merged"),
     [

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.imaging.atomic import check_takes_files, replacing, write_bytes
+from ltsh_addon.imaging.atomic import check_takes_files, replacing, replacing_by_copy, write_bytes
+from ltsh_addon.ownership import machine
 
 ROOT = Path(__file__).resolve().parents[2]
 # Writes half a file and ends as a killed process does, or waits for a line before it goes on.
@@ -54,8 +55,37 @@ def test_what_another_process_is_writing_stays(tmp_path):
     assert (tmp_path / "a").read_bytes() == b"whole" and names(tmp_path) == ["a"]
 
 
+def test_a_file_that_a_program_puts_in_place_itself_stays_while_others_write(tmp_path):
+    """As Blender saves: to a name with @, which it renames at the end."""
+    for content in (b"first", b"second"):
+        with replacing_by_copy(tmp_path / "a") as made:
+            unfinished = made.with_name(f"{made.name}@")
+            unfinished.write_bytes(content)
+            half_written(tmp_path / "a").communicate()
+            write_bytes(tmp_path / "a", b"another's")
+            unfinished.rename(made)
+            write_bytes(tmp_path / "a", b"another's")
+            assert made.read_bytes() == content
+        assert (tmp_path / "a").read_bytes() == content and names(tmp_path) == ["a"]
+
+
+def test_a_program_that_puts_nothing_in_place_is_told(tmp_path):
+    write_bytes(tmp_path / "a", b"old")
+    with pytest.raises(OSError, match="a: cannot be written"), replacing_by_copy(tmp_path / "a"):
+        pass
+    assert (tmp_path / "a").read_bytes() == b"old" and names(tmp_path) == ["a"]
+
+
+def test_names_as_long_as_may_be_can_be_written(tmp_path):
+    for name in ("x" * 255, "鍵" * 85):
+        write_bytes(tmp_path / name, b"whole")
+        assert names(tmp_path) == [name]
+        (tmp_path / name).unlink()
+
+
 def test_files_of_similar_names_stay(tmp_path):
-    others = [".a.0123456.tmp", ".a.012345678.tmp", ".a.0123456g.tmp", ".b.01234567.tmp", "a.01234567.tmp", ".a.tmp"]
+    mark = f"{machine()}-01234567"
+    others = [f".a.{mark[:-1]}.tmp", f".a.{mark}0.tmp", f".b.{mark}.tmp", f"a.{mark}.tmp", ".a.tmp"]
     for name in others:
         (tmp_path / name).write_bytes(b"not ours")
     write_bytes(tmp_path / "a", b"new")

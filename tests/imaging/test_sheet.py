@@ -17,9 +17,7 @@ def contains(page, part):
     """Whether the pixels `part` stand somewhere in `page`."""
     rows, columns = np.nonzero((page == part[0, 0]).all(axis=-1))
     height, width = part.shape[:2]
-    return any(
-        np.array_equal(page[y : y + height, x : x + width], part) for y, x in zip(rows, columns, strict=True)
-    )
+    return any(np.array_equal(page[y : y + height, x : x + width], part) for y, x in zip(rows, columns, strict=True))
 
 
 @pytest.mark.parametrize("count", [1, 4, 7])

@@ -1,6 +1,6 @@
 """Runs inside a real Blender: enables, disables and uninstalls the extension; what each leaves is printed as JSON.
 
-    blender -b --python enable_and_disable.py -- FOLDER_OF_BLENDER_STATE
+To call: blender -b --python enable_and_disable.py -- FOLDER_OF_BLENDER_STATE
 """
 
 import json

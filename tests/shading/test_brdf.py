@@ -55,6 +55,21 @@ def test_distribution_has_projected_area_one():
         assert area == pytest.approx(share, rel=1e-6), alpha
 
 
+@pytest.mark.parametrize("mu", [0.05, 0.3, 0.9])
+@pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
+def test_visible_normals_reflect_in_all_directions_with_probability_one(mu, alpha):
+    """Weak white furnace (Heitz 2014, eq. 80), summed over half vectors that the view sees: d omega_i = 4 o.h d h."""
+    # Half vectors as in `half_vector_rule`; 1 - u is a square, since the sum over u ends like 1 / sqrt(1 - u).
+    rest, azimuth = np.meshgrid((np.arange(300) + 0.5) / 300, np.pi * (np.arange(300) + 0.5) / 300)
+    tangent, weight = alpha * np.sqrt(1.0 - rest**2) / rest, 2.0 * rest / rest.size
+    cos_h = 1.0 / np.sqrt(1.0 + tangent**2)
+    seen = np.maximum((np.sqrt(1.0 - mu * mu) * tangent * np.cos(azimuth) + mu) * cos_h, 0.0)
+    horizontal, vertical = 9.0 * (1.0 - cos_h**2), 9.0 * cos_h**2  # of half vectors 3 long
+    density = brdf.visible_normal_density(mu, horizontal, vertical, alpha**2)
+    distribution = brdf.ggx_distribution(1.0 - cos_h**2, cos_h**2, alpha**2)
+    assert (density / distribution / cos_h * 4.0 * seen * weight).sum() == pytest.approx(1.0, rel=1e-4)
+
+
 def test_reciprocity():
     """f(o, i) = f(i, o): the lobe divided by its cosine does not change when view and light swap."""
     lights = upper_directions(300, seed=3)

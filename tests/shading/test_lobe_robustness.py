@@ -183,9 +183,7 @@ def test_polygons_of_many_corners_are_the_sum_of_their_triangles(name, corners):
         return shading.integrate_polygon(TABLES[name], cosine, roughness, vertices, signed=True)
 
     following = np.roll(polygons, -1, axis=1)
-    triangles = sum(
-        integral(np.stack([center[:, 0], polygons[:, k], following[:, k]], axis=1)) for k in range(corners)
-    )
+    triangles = sum(integral(np.stack([center[:, 0], polygons[:, k], following[:, k]], axis=1)) for k in range(corners))
     # Triangles with a corner in common share no long edge unless the point is in their plane.
     assert np.abs(triangles - integral(polygons)).max() < 1e-8
 

@@ -43,9 +43,10 @@ def test_nodes_are_reproduced(name):
     assert known[[0, 2]].all() and known[1].sum() == rows * (columns - 1)
     scale = np.abs(table.warp).max()
     assert np.abs(found - expected)[known].max() < 1e-9 * scale
-    assert np.abs(lobe.coefficients - np.moveaxis(table.coefficients[i, j], 0, -1)).max() < 1e-9 * np.abs(
-        table.coefficients
-    ).max()
+    assert (
+        np.abs(lobe.coefficients - np.moveaxis(table.coefficients[i, j], 0, -1)).max()
+        < 1e-9 * np.abs(table.coefficients).max()
+    )
 
 
 @table_names

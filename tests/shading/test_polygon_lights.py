@@ -91,9 +91,7 @@ def test_splitting_a_polygon_adds_up(technique):
     """A star cut into kites from its middle."""
     samples = random_samples(40, seed=4)
     star = polygon_light(STAR)
-    kites = [
-        polygon_light(np.stack([[0.0, 0.0], STAR[n - 1], STAR[n], STAR[(n + 1) % 14]])) for n in range(0, 14, 2)
-    ]
+    kites = [polygon_light(np.stack([[0.0, 0.0], STAR[n - 1], STAR[n], STAR[(n + 1) % 14]])) for n in range(0, 14, 2)]
     parts = [shaded(samples, [kite], technique) for kite in kites]
     assert_same(shaded(samples, [star], technique), parts, technique)
 

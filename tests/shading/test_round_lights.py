@@ -82,7 +82,7 @@ def test_sharp_lobes_and_near_points_get_more_corners():
         assert found.tolist() == expected
     assert set(found) <= set(ROUND_CORNERS)
     # In the light's plane and at its middle no lobe is resolved.
-    (corners, _), = round_levels(light, light.center[:, None], 1.0)
+    ((corners, _),) = round_levels(light, light.center[:, None], 1.0)
     assert len(corners) == ROUND_CORNERS[-1]
     sample = single_sample(position=light.center + 1e-9 * light.direction, normal=-light.direction)
     assert np.isfinite(shading.shade(sample, [light], "ltsh4").combined).all()

@@ -230,7 +230,7 @@ def test_shared_blocks_hold_arrays_side_by_side():
 
 def test_a_normal_that_stands_for_another_is_sent_once():
     samples = random_samples(20)
-    task = integrator._task(samples, tuple(four_lights()), "ltc", ("specular",), np.float32)
+    task = integrator._task(tuple(four_lights()), "ltc", ("specular",), np.float32)
     side = block_exchange.ParentSide(task, samples, 20)
     assert side.same == {"geometric_normal": "normal"}
     assert not {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"} & set(side.sent)
@@ -283,14 +283,13 @@ position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0
 samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)
 light = scene.AreaLight("Lamp", "RECTANGLE", (0, 0, 2), (1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 1, 1))
 import time
-deadline = time.monotonic() + 60.0
-def patient(_):
-    while not any(by_children) and time.monotonic() < deadline:
+def leave_some(fraction):
+    limit = time.monotonic() + 60.0
+    while not any(by_children) and time.monotonic() < limit:
         time.sleep(0.01)
-one, two = (
-    shading.shade(samples, [light], "ltsh4", workers=count, progress=progress).combined
-    for count, progress in ((1, None), (2, patient))
-)
+one = shading.shade(samples, [light], "ltsh4", workers=1).combined
+by_children.clear()
+two = shading.shade(samples, [light], "ltsh4", workers=2, progress=leave_some).combined
 print(np.array_equal(one, two), any(by_children), "ltsh_addon" in sys.modules)
 """
 
@@ -298,6 +297,6 @@ print(np.array_equal(one, two), any(by_children), "ltsh_addon" in sys.modules)
 def test_children_work_for_the_package_as_blender_loads_it():
     run = subprocess.run(
         [sys.executable, "-W", "error", "-c", RENAMED.format(root=str(ROOT))],
-        capture_output=True, text=True, timeout=120, check=False, cwd=Path(__file__).parent,
+        capture_output=True, text=True, timeout=600, check=False, cwd=Path(__file__).parent,
     )  # fmt: skip
     assert run.stdout.split() == ["True", "True", "False"], run.stderr

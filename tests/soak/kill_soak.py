@@ -59,6 +59,7 @@ def soak(command, folder, count, seed):
         how = (f"{moment:.2f} s", f"{moment:.2f} s", "full disk", "while writing")[number % 4]
         print(f"  {number + 1} of {count}: {how}, {signal_number.name}, same", flush=True)
     print(f"{command}: killed {killed} of {count} times, always the same bytes")
+    print(f"{command}: ended at most {trial.runs.slowest_end:.2f} s after a signal")
     return killed
 
 

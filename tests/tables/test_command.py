@@ -81,7 +81,7 @@ def test_an_interrupted_fit_leaves_no_child_and_can_go_on(tmp_path):
     while not list(tmp_path.glob("*.progress")) and time.monotonic() < deadline:
         time.sleep(0.1)
     os.killpg(fit.pid, signal.SIGINT)
-    _, errors = fit.communicate(timeout=60)
+    _, errors = fit.communicate(timeout=600)
     assert fit.returncode == 130 and "goes on from here" in errors and "Traceback" not in errors
     with pytest.raises(ProcessLookupError):
         os.killpg(fit.pid, 0)

@@ -30,10 +30,12 @@ class Part:
 
 
 CABINET_WIDTH = 0.72
+# fmt: off
 CABINET_OUTLINE = (  # y and z of the side view, counterclockwise as seen from +x; the front is at -y
     (-0.42, 0.10), (0.40, 0.10), (0.40, 1.86), (-0.26, 1.92), (-0.44, 1.86), (-0.46, 1.60), (-0.20, 1.53),
     (-0.34, 1.06), (-0.62, 0.98), (-0.62, 0.90), (-0.42, 0.82),
 )
+# fmt: on
 
 
 def _slope(lower, upper) -> tuple[np.ndarray, np.ndarray]:
@@ -85,9 +87,7 @@ def cabinet(name: str, material: str, location, degrees: float) -> list[Part]:
     }
     parts |= {key: (shape, 0.004 if key == "metal iron" else 0.0) for key, shape in _controls().items()}
     turn = shapes.rotation("z", degrees)
-    return [
-        Part(f"{name} {key}", shape, key, tuple(location), turn, bevel) for key, (shape, bevel) in parts.items()
-    ]
+    return [Part(f"{name} {key}", shape, key, tuple(location), turn, bevel) for key, (shape, bevel) in parts.items()]
 
 
 def ball_row(kind: str, start, end, radius: float = 0.19) -> list[Part]:
@@ -142,8 +142,15 @@ def sprite_sign(sprite: str, cell: float, location) -> list[Part]:
         for j, letter in enumerate(line)
         if letter == "#"
     ]
-    return [Part(f"sign {sprite}", shapes.joined([cube.moved(p) for p in places]), "metal copper", location,
-                 bevel=0.09 * cell)]
+    return [
+        Part(
+            f"sign {sprite}",
+            shapes.joined([cube.moved(p) for p in places]),
+            "metal copper",
+            location,
+            bevel=0.09 * cell,
+        )
+    ]
 
 
 def room() -> list[Part]:
@@ -166,8 +173,10 @@ def room() -> list[Part]:
 def everything() -> list[Part]:
     """All parts of the scene."""
     parts = room() + sculpture((0.0, 0.9)) + sprite_sign("moth", 0.14, (0.0, WALL_Y - 0.1, 2.35))
-    rows = ((-2.35, 62.0, ("plastic violet", "plastic cyan", "plastic orange", "plastic magenta")),
-            (2.35, -62.0, ("plastic cyan", "plastic magenta", "plastic violet", "plastic orange")))
+    rows = (
+        (-2.35, 62.0, ("plastic violet", "plastic cyan", "plastic orange", "plastic magenta")),
+        (2.35, -62.0, ("plastic cyan", "plastic magenta", "plastic violet", "plastic orange")),
+    )
     for x, degrees, bodies in rows:
         for index, (body, y) in enumerate(zip(bodies, (-2.3, -1.1, 0.1, 1.3), strict=True)):
             side = "left" if x < 0.0 else "right"

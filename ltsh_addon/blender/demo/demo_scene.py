@@ -6,7 +6,6 @@ The pictures made from it have direct light only and no shadows, and the scene i
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import bpy
@@ -19,6 +18,7 @@ from . import demo_objects, demo_textures
 RESOLUTION = (480, 270)
 CAMERA = {"location": (0.25, -6.55, 1.12), "target": (0.0, 0.0, 0.98), "lens": 29.0}
 
+# fmt: off
 # Sizes in m, power in W. `up` is the world direction of the light's y axis.
 LIGHTS = (
     {"name": "Neon", "shape": "RECTANGLE", "size": 5.2, "size_y": 0.22, "color": (1.0, 0.06, 0.62), "energy": 110.0,
@@ -30,6 +30,7 @@ LIGHTS = (
     {"name": "Skylight", "shape": "SQUARE", "size": 2.4, "color": (0.80, 0.88, 1.0), "energy": 22.0, "exposure": 1.0,
      "location": (0.0, -3.4, 3.9), "target": (0.0, 1.4, 0.9), "up": (0.0, 1.0, 0.0)},
 )
+# fmt: on
 
 # Base color (linear), metallic, roughness, index of refraction.
 MATERIALS = {
@@ -48,10 +49,22 @@ MATERIALS = {
     "plastic button yellow": ((0.85, 0.55, 0.03), 0.0, 0.20, 1.5),
     "wall paint": ((0.035, 0.025, 0.08), 0.0, 0.50, 1.45),
 }
-METAL_BALLS = ((0.93, 0.92, 0.90), (0.95, 0.72, 0.42), (0.92, 0.55, 0.42), (0.75, 0.78, 0.85), (0.90, 0.88, 0.84),
-               (0.85, 0.64, 0.34))
-PLASTIC_BALLS = ((0.75, 0.02, 0.04), (0.85, 0.35, 0.01), (0.10, 0.55, 0.06), (0.01, 0.30, 0.60), (0.25, 0.04, 0.60),
-                 (0.75, 0.72, 0.68))
+METAL_BALLS = (
+    (0.93, 0.92, 0.90),
+    (0.95, 0.72, 0.42),
+    (0.92, 0.55, 0.42),
+    (0.75, 0.78, 0.85),
+    (0.90, 0.88, 0.84),
+    (0.85, 0.64, 0.34),
+)
+PLASTIC_BALLS = (
+    (0.75, 0.02, 0.04),
+    (0.85, 0.35, 0.01),
+    (0.10, 0.55, 0.06),
+    (0.01, 0.30, 0.60),
+    (0.25, 0.04, 0.60),
+    (0.75, 0.72, 0.68),
+)
 
 
 def _image(name: str, values: np.ndarray, *, data: bool, precise: bool = False) -> bpy.types.Image:
@@ -166,9 +179,7 @@ def _add_light(settings: dict) -> None:
     light.exposure, light.normalize, light.spread = settings.get("exposure", 0.0), True, np.pi
     if "temperature" in settings:
         light.use_temperature, light.temperature = True, settings["temperature"]
-    _add_object(settings["name"], light).matrix_world = _aimed(
-        settings["location"], settings["target"], settings["up"]
-    )
+    _add_object(settings["name"], light).matrix_world = _aimed(settings["location"], settings["target"], settings["up"])
 
 
 def _set_up_view() -> None:
@@ -193,11 +204,7 @@ def _set_up_view() -> None:
 
 
 def build(path: Path) -> None:
-    """Write the example scene to `path`; what Blender has open is replaced by it.
-
-    An existing file is replaced only when the new one is complete.
-    """
-    path = Path(path)
+    """Write the example scene to `path`; what Blender has open is replaced by it."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     _materials()
     for part in demo_objects.everything():
@@ -205,9 +212,4 @@ def build(path: Path) -> None:
     for settings in LIGHTS:
         _add_light(settings)
     _set_up_view()
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.blend")
-    try:
-        save_copy(temporary, check_existing=False)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    save_copy(Path(path), check_existing=False)

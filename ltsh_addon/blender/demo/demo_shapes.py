@@ -60,7 +60,9 @@ def _grid_faces(rows: int, columns: int, *, closed_rows: bool, closed_columns: b
     next_row, next_column = (row + 1) % rows, (column + 1) % columns
     quads = np.stack(
         np.broadcast_arrays(
-            row * columns + column, row * columns + next_column, next_row * columns + next_column,
+            row * columns + column,
+            row * columns + next_column,
+            next_row * columns + next_column,
             next_row * columns + column,
         ),
         axis=-1,

@@ -23,6 +23,7 @@ SAME_SHAPE = 0.01
 
 Rectangle = tuple[float, float, float, float]  # left, bottom, right, top in pixels of the region
 
+
 @dataclass(frozen=True)
 class Reference:
     """A Cycles picture: `pixels` (H, W, 3) in W m^-2 sr^-1, row 0 on top, in `frame` of the region."""

@@ -18,7 +18,6 @@ PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
 EMISSION = "LTSH Emission"
 
 
-
 @dataclass(frozen=True)
 class FinalJob:
     """What the render of one view layer needs to know of the scene."""

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...scene import AreaLight, SurfaceSamples
+from ...shading import brdf, polygon
 
 SMALLEST_ALPHA = 1e-3
 # Directions at which both probabilities are compared: around the horizon, closest to each other near the highlight,
@@ -34,49 +35,55 @@ def end_at_horizons_of_cycles(samples: SurfaceSamples, lights: tuple[AreaLight, 
     normal = np.array(samples.geometric_normal)
     for start in range(0, len(differ), BLOCK):
         block = differ[start : start + BLOCK]
-        smooth = block[_smooth_is_nearer(samples.take(block), lights)]
+        by_lobe, by_light = horizon_excess(samples.take(block), lights)
+        # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
+        smooth = block[np.abs(by_lobe) <= np.abs(by_light)]
         normal[smooth] = samples.smooth_normal[smooth]
     return replace(samples, geometric_normal=normal)
 
 
-def _smooth_is_nearer(samples, lights) -> np.ndarray:
-    """Mask (P,)."""
+def horizon_excess(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """What only one of the horizons lets through (P,), of directions that the lobe chose and of those that the light
+    chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
+
+    Where both horizons make no difference the first is 1 and the second 0.
+    """
     crossed = np.stack([_crosses(samples, light) for light in lights])
     index = np.flatnonzero(crossed.any(axis=0))
-    smooth = np.zeros(len(samples), bool)
+    by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
     if len(index) == 0:
-        return smooth
+        return by_lobe, by_light
     samples, crossed = samples.take(index), crossed[:, index]
     solid_angle = np.stack([_solid_angle(samples.position, light) for light in lights])
     brightness = solid_angle * np.array([np.abs(light.radiance).sum() for light in lights])[:, None]
     density = brightness / np.maximum(brightness.sum(axis=0) * solid_angle, 1e-12)
     towards, width = _directions(samples)
     lobe = _lobe_density(samples, towards)
-    # What only one of the horizons lets through, of directions that the light chose and of those that the lobe chose:
-    # the smooth horizon is wrong about the latter, that of the mesh about the former.
-    by_light, by_lobe = np.zeros(len(index)), np.zeros(len(index))
+    by_lobe[index] = 0.0
     for number, light in enumerate(lights):
         rows = np.flatnonzero(crossed[number])
         excess = np.abs(light.radiance).sum() * lobe[rows] * width[rows]
         excess *= _hits(light, samples.position[rows], towards[rows])
         light2 = np.square(density[number, rows])[:, None, None]
         weight = light2 / (light2 + np.square(lobe[rows]))
-        by_light[rows] += (excess * weight).sum(axis=(1, 2))
-        by_lobe[rows] += (excess * (1.0 - weight)).sum(axis=(1, 2))
-    # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
-    smooth[index] = np.abs(by_lobe) <= np.abs(by_light)
-    return smooth
+        by_light[index[rows]] += (excess * weight).sum(axis=(1, 2))
+        by_lobe[index[rows]] += (excess * (1.0 - weight)).sum(axis=(1, 2))
+    return by_lobe, by_light
 
 
 def _solid_angle(position, light) -> np.ndarray:
-    """Solid angle (P,) of the light in sr, 0 from behind it (Van Oosterom and Strackee 1983, eq. 8)."""
-    corners = light.polygon()[None] - position[:, None]
-    corners /= np.maximum(np.linalg.norm(corners, axis=2, keepdims=True), 1e-12)
-    first, second, third = corners[:, :1], corners[:, 1:-1], corners[:, 2:]
-    volume = (first * np.cross(second, third)).sum(axis=2)
-    below = 1.0 + (first * second).sum(axis=2) + (second * third).sum(axis=2) + (third * first).sum(axis=2)
-    whole = np.abs(2.0 * np.arctan2(volume, below).sum(axis=1))
-    return np.where((light.center - position) @ light.direction < 0.0, whole, 0.0)
+    """Solid angle (P,) of the light in sr, 0 from behind it."""
+    axes = np.concatenate([_plane_axes(light), -light.direction[None]])
+    corners = np.einsum("ak,pvk->avp", axes, light.polygon() - position[:, None])
+    whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
+    return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
+
+
+def _plane_axes(light) -> np.ndarray:
+    """Two orthonormal axes (2, 3) in the plane of the light."""
+    first = light.polygon()[0] - light.center
+    first /= max(np.linalg.norm(first), 1e-30)
+    return np.stack([first, np.cross(light.direction, first)])
 
 
 def _crosses(samples, light) -> np.ndarray:
@@ -89,14 +96,13 @@ def _crosses(samples, light) -> np.ndarray:
 
 
 def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, H, N) per sr that the lobe chooses the directions, GGX's visible normals (Heitz 2018, eq. 17)."""
+    """Probability (P, H, N) per sr that the lobe chooses the directions."""
     half = towards + samples.view[:, None, None]
-    half /= np.maximum(np.linalg.norm(half, axis=3, keepdims=True), 1e-12)
+    vertical = np.square(np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0))
+    horizontal = np.maximum(np.square(half).sum(axis=3) - vertical, 0.0)
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
-    height = np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0)
-    cosine = np.maximum(np.einsum("pi,pi->p", samples.normal, samples.view), 1e-3)[:, None, None]
-    masking = 1.0 / (1.0 + 0.5 * (np.sqrt(1.0 + alpha2 * (1.0 / cosine**2 - 1.0)) - 1.0))
-    return alpha2 / (np.pi * np.square(height * height * (alpha2 - 1.0) + 1.0)) * masking / (4.0 * cosine)
+    cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
+    return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)
 
 
 def _directions(samples):
@@ -123,10 +129,8 @@ def _directions(samples):
 
 def _hits(light, position, towards) -> np.ndarray:
     """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
-    corners = light.polygon() - light.center
-    first = corners[0] / max(np.linalg.norm(corners[0]), 1e-30)
-    axes = np.stack([first, np.cross(light.direction, first)])
-    outline = corners @ axes.T
+    axes = _plane_axes(light)
+    outline = (light.polygon() - light.center) @ axes.T
     steepness = towards @ light.direction
     height = ((light.center - position) @ light.direction)[:, None, None]
     distance = height / np.where(steepness < 0.0, steepness, -1e-30)

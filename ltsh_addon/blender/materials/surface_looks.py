@@ -5,7 +5,7 @@ What cannot be said that way gets the material's viewport settings and is named 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
@@ -33,7 +33,6 @@ NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specula
            "transmission": 0.0}  # fmt: skip
 # Layers of the Principled BSDF that the viewport leaves out, and what they are called.
 LEFT_OUT = {"Coat Weight": "coat", "Sheen Weight": "sheen"}
-FLAT_DISTRIBUTIONS = ("GGX", "MULTI_GGX", *NEAREST_ALPHA)
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,11 @@ class Look:
     def uv_map(self) -> str:
         """The UV map of its images ("": the active one)."""
         return next((use.uv_map for use in self.images.values()), "")
+
+
+def is_missing(image) -> bool:
+    """True for images without pixels: their file is not there, or cannot be read."""
+    return not all(image.size)
 
 
 def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
@@ -172,7 +176,10 @@ class _Reader:
         normal, strength = self._normal(source, values)
         scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
         corrected = cycles_setting(self.material, "use_bump_map_correction")
-        return Look(kind, values, normal, strength, scattered, corrected, emission, tuple(self.notes))
+        look = Look(kind, values, normal, strength, scattered, corrected, emission)
+        for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
+            self.note(f"image {name!r} is missing, it is pink")
+        return replace(look, notes=tuple(self.notes))
 
     def _value(self, source: Source, name: str, socket_name: str) -> Value:
         value = value_at(source.tree, source.node.inputs[socket_name], source.groups)

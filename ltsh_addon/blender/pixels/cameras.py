@@ -12,6 +12,7 @@ import numpy as np
 
 from ...scene import Border
 from ..processes.child import SceneError
+from ..processes.missing_names import listed
 
 CAMERA_TYPES = ("PERSP", "ORTHO")
 CAMERA_KINDS = {"PANO": "panoramic", "CUSTOM": "custom (Open Shading Language)"}
@@ -34,7 +35,7 @@ def choose_camera(scene, name: str | None):
     else:
         camera = scene.objects.get(name)
         if camera is None or camera.type != "CAMERA":
-            cameras = ", ".join(repr(ob.name) for ob in scene.objects if ob.type == "CAMERA") or "none"
+            cameras = listed((ob.name for ob in scene.objects if ob.type == "CAMERA"), name)
             raise SceneError(f"camera {name!r} is not in scene {scene.name!r}; cameras there: {cameras}")
     if camera.type != "CAMERA":
         raise SceneError(

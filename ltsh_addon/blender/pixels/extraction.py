@@ -16,9 +16,10 @@ from ..materials.material_outputs import (
     materials_in_use,
     objects_without_material,
 )
-from ..processes import memory
+from ..processes import blend_header, memory
 from ..processes.child import SceneError
 from ..processes.missing_files import missing_files
+from ..processes.missing_names import listed
 from . import cameras, render_settings
 from .color_management import working_space
 from .cycles_reference import render_reference
@@ -45,14 +46,23 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
     try:
         bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=scripts)
     except RuntimeError as error:
-        reason = " ".join(str(error).split()).removeprefix("Error: ")
-        raise SceneError(f"{path}: Blender {bpy.app.version_string} cannot open it: {reason}") from None
-    if tuple(bpy.data.version)[:2] > bpy.app.version[:2]:
-        saved = ".".join(str(part) for part in bpy.data.version[:2])
-        warnings.append(f"{path.name} was saved by Blender {saved}; {bpy.app.version_string} may miss parts of it")
+        raise SceneError(
+            f"{path}: Blender {bpy.app.version_string} cannot open it, is it whole? ({_reason(error, path)})"
+        ) from None
+    saved, here = tuple(bpy.data.version)[:2], bpy.app.version[:2]
+    if saved > here:
+        raise SceneError(blend_header.newer(path, saved, here))
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
     warnings.extend(missing_files())
+
+
+def _reason(error: RuntimeError, path: Path) -> str:
+    """What Blender says is wrong with a file, without the file's name."""
+    text = " ".join(str(error).split()).removeprefix("Error: ")
+    for named in (f'Loading "{path}" failed: ', f"Failed to read blend file '{path}': ", f' in file "{path}"'):
+        text = text.replace(named, "")
+    return text
 
 
 def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
@@ -138,7 +148,7 @@ def _scene_named(name: str | None):
     if name is None:
         return bpy.context.scene
     if name not in bpy.data.scenes:
-        scenes = ", ".join(repr(scene.name) for scene in bpy.data.scenes)
+        scenes = listed((scene.name for scene in bpy.data.scenes), name)
         raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
     return bpy.data.scenes[name]
 

@@ -9,6 +9,7 @@ import bpy
 
 from ...shading.workers import cores
 from ..processes.child import SceneError
+from ..processes.missing_names import listed
 from ..processes.whole_exr import is_whole
 from .cameras import hold_still
 from .inventory import SURFACE_TYPES
@@ -19,7 +20,7 @@ VIEW_LAYER = "ltsh"
 def choose_view_layer(scene, warnings: list[str], name: str | None = None):
     """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
     if name is not None and name not in scene.view_layers:
-        layers = ", ".join(repr(layer.name) for layer in scene.view_layers)
+        layers = listed((layer.name for layer in scene.view_layers), name)
         raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
     used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
     if name is not None:

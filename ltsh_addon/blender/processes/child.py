@@ -7,7 +7,6 @@ and the data of a running Blender stay untouched.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import threading
 from dataclasses import asdict, dataclass
@@ -18,11 +17,9 @@ import numpy as np
 from ...scene import REC709, AreaLight, Border, ColorSpace, Film, SurfaceSamples
 from ..materials.specular_horizon import end_at_horizons_of_cycles
 from ..pixels import gbuffer
+from . import blend_header
 from .blender_process import Progress, SceneError, disk_is_full, no_room, run_child
 from .temporary_folders import locked_folder
-
-# Of a .blend as it is, or compressed by Blender since 3.0 and before.
-STARTS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
 
 
 @dataclass(frozen=True)
@@ -109,17 +106,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
 
 
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Build the example scene and save it as the .blend `path`, at once or not at all."""
-    path = Path(path).absolute()
-    unfinished = path.with_name(f".{path.stem}-{os.getpid()}.blend")
-    try:
-        with temporary_folder() as folder:
-            run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
-        if not unfinished.is_file():
-            raise SceneError(f"{path}: Blender built the example scene but saved no file")
-        os.replace(unfinished, path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    """Build the example scene and save it as the .blend `path`, at once or not at all. Raises SceneError, OSError."""
+    from ...imaging.atomic import replacing_by_copy  # the child imports this module too, and has no use for imaging
+
+    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
+        run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
 def check_readable(scene: Path) -> None:
@@ -127,17 +118,23 @@ def check_readable(scene: Path) -> None:
     try:
         if not scene.exists():
             raise SceneError(f"{scene}: no such file, expected a .blend")
-        if not scene.is_file() and not scene.is_dir():  # reading a pipe or a device might never end
+        if scene.is_dir():
+            raise SceneError(f"{scene}: is a folder, expected a .blend")
+        if not scene.is_file():  # reading a pipe or a device might never end
             raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
         with scene.open("rb") as file:
             start = file.read(7)
+        saved = blend_header.saved_with(scene)
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL
         reason = getattr(error, "strerror", None) or error
         raise SceneError(f"{str(scene)[:200]!r}: cannot be read: {reason}") from None
     if not start:
         raise SceneError(f"{scene}: the file is empty, expected a .blend")
-    if not start.startswith(STARTS):
+    if not start.startswith(blend_header.STARTS):
         raise SceneError(f"{scene}: is no .blend, it starts with {start!r}")
+    here = blend_header.running()
+    if saved and here and saved > here:
+        raise SceneError(blend_header.newer(scene, saved, here))
 
 
 @contextlib.contextmanager
@@ -172,7 +169,7 @@ def termination_as_exception():
 
 def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
     """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
-    from ...imaging.exr import read_channels  # the child imports this module too, and has no use for imaging
+    from ...imaging.exr import read_channels
 
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0

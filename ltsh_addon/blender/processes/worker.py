@@ -50,7 +50,7 @@ def _perform(job: dict, folder: Path) -> dict:
     if job["task"] == "facts":
         return _module("processes.scene_facts").answer(job, _progress)
     if job["task"] == "apply":
-        return _module("texels.bake_apply").apply_bake(job, folder, _progress)
+        return _module("texels.bake_apply").apply_bake(job, _progress)
     return _module("pixels.extraction").extract(job, folder, _progress)
 
 
@@ -97,6 +97,7 @@ def main() -> int:
     job_path = Path(sys.argv[-1])
     # Running a script puts its own folder first, where `lights` and others would be found as top-level modules.
     sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
+    _module("processes.priority").weigh_session()
     jobs: queue.SimpleQueue = queue.SimpleQueue()
     temporary: list[Path] = []
     job = json.loads(job_path.read_text(encoding="utf-8"))

@@ -14,7 +14,7 @@ from ..processes.child import SceneError
 GROUP_PREFIX = "LTSH Bake"
 
 
-def apply_bake(job: dict, folder: Path, progress) -> dict:
+def apply_bake(job: dict, progress) -> dict:
     """Do the `job` (see `bake_child.apply_bake`): open the scene, give every baked object copies of its materials that
     show the texture, save the file `job["path"]`; the manifest."""
     warnings = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ...imaging.atomic import replacing
+from ...imaging.atomic import replacing_by_copy
 from ..processes import child
 
 
@@ -48,6 +48,6 @@ def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: child
     Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
     not at all. Raises as `extract` does.
     """
-    with replacing(Path(path).absolute()) as unfinished, child.temporary_folder() as folder:
+    with replacing_by_copy(Path(path).absolute()) as unfinished, child.temporary_folder() as folder:
         job = {"task": "apply", "scene": str(Path(scene).absolute()), "path": str(unfinished), "textures": textures}
         return child.run_child(job, folder, progress)["warnings"]

@@ -134,7 +134,7 @@ def _open(job: dict) -> BakeScene:
     if not lights:
         raise extraction.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
-    view = view_of(scene, job["view"], camera, bent=job["cycles_samples"] > 0)
+    view = view_of(job["view"], camera, bent=job["cycles_samples"] > 0)
     _look_from(scene, camera, job)
     remove_occlusion(scene)
     name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]

@@ -14,6 +14,7 @@ import numpy as np
 from ...scene import FARTHEST
 from ..materials.material_maps import MaterialPlan
 from ..processes.child import SceneError
+from ..processes.missing_names import listed
 from .texel_samples import BakeView, TexelMesh
 from .uv_raster import tiles_of
 
@@ -63,7 +64,7 @@ def chosen_objects(scene, view_layer, wanted) -> list:
         return objects
     missing = [name for name in wanted if name not in view_layer.objects]
     if missing:
-        names = ", ".join(repr(ob.name) for ob in view_layer.objects if ob.type == "MESH") or "none"
+        names = listed((ob.name for ob in view_layer.objects if ob.type == "MESH"), missing[0])
         raise SceneError(f"object {missing[0]!r} is not in scene {scene.name!r}; meshes there: {names}")
     return [view_layer.objects[name] for name in wanted]
 
@@ -239,7 +240,7 @@ class ObjectBake:
         self.ob.data.update()
 
 
-def view_of(scene, wanted, camera, bent: bool) -> BakeView:
+def view_of(wanted, camera, bent: bool) -> BakeView:
     """The view `wanted`: "camera", "above" or a position (3,)."""
     if wanted == "above":
         return BakeView("above")

@@ -9,8 +9,8 @@ Each is RGBA32F, one texel per pixel, row 0 at the bottom:
     f90               specular_f90; w = green of specular_dip
     dielectric        weight of the dielectric lobe; w = blue of specular_dip
     geometric_normal  may be None, where it is `normal` all over; w is not read
-    diffuse_normal    may be None, where it is `normal` all over and there is no bump shadowing; w = bump_alpha2
-    smooth_normal     None exactly where `diffuse_normal` is; w is not read
+    diffuse_normal    may be None, where it is `normal` all over; w = bump_alpha2
+    smooth_normal     may be None, where it is `diffuse_normal` all over; w is not read
 """
 
 from __future__ import annotations
@@ -21,6 +21,19 @@ import gpu
 import numpy as np
 
 from ...scene import SurfaceSamples
+
+# Field of `GBufferTextures` by its name in shaders.
+SAMPLERS = {
+    "positions": "position",
+    "normals": "normal",
+    "bases": "base",
+    "f0s": "f0",
+    "f90s": "f90",
+    "dielectric_weights": "dielectric",
+    "geometric_normals": "geometric_normal",
+    "diffuse_normals": "diffuse_normal",
+    "smooth_normals": "smooth_normal",
+}
 
 
 @dataclass(frozen=True)
@@ -38,8 +51,8 @@ class GBufferTextures:
     smooth_normal: gpu.types.GPUTexture | None = None
 
     def __post_init__(self):
-        if (self.diffuse_normal is None) != (self.smooth_normal is None):
-            raise ValueError("G-buffer: one of diffuse_normal and smooth_normal is missing, expected both or none")
+        if self.diffuse_normal is None and self.smooth_normal is not None:
+            raise ValueError("G-buffer: smooth_normal without diffuse_normal, expected both")
         sizes = {
             field.name: (texture.width, texture.height)
             for field in fields(self)
@@ -75,7 +88,8 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
         return float_texture(values.reshape(height, width, 4))
 
     dip = samples.specular_dip
-    bumped = (samples.diffuse_normal != samples.normal).any() or (samples.smooth_normal != samples.normal).any()
+    bumped = (samples.smooth_normal != samples.diffuse_normal).any()
+    turned = bumped or (samples.diffuse_normal != samples.normal).any()
     return GBufferTextures(
         position=texture(samples.position, 1.0 + samples.receiver),
         normal=texture(samples.normal, samples.roughness),
@@ -86,6 +100,6 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
         geometric_normal=texture(samples.geometric_normal, 0.0)
         if (samples.geometric_normal != samples.normal).any()
         else None,
-        diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if bumped else None,
+        diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
         smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
     )

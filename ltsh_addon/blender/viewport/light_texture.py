@@ -55,6 +55,18 @@ FIRST_LIGHT = sum(len(part) for part in _SHARED)
 ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, (*_FEW_LIMITS, *ROUND_LIMITS, np.inf), strict=True))
 
 
+def constants() -> dict[str, int]:
+    """What GLSL that reads the texture needs to know, by name."""
+    return {
+        "LIGHT_HEADER": HEADER,
+        "FIRST_LIGHT": FIRST_LIGHT,
+        "LIGHT_WIDTH": WIDTH,
+        "DIFFUSE_FLAG": DIFFUSE,
+        "SPECULAR_FLAG": SPECULAR,
+        "ROUND_FLAG": ROUND,
+    }
+
+
 def circle_first(count: int) -> int:
     """Texel of the first of `count` corners of a circle."""
     return _CIRCLE_FIRST[_CIRCLES.index(count)]

@@ -8,31 +8,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import gpu
-import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...scene import AreaLight
 from ...shading import load_table
 from ...shading.lookup_table import LookupTable
-from .gbuffer_textures import GBufferTextures, float_texture
-from .light_texture import light_texels, visible_lights
+from .gbuffer_textures import SAMPLERS, GBufferTextures, float_texture
 from .lighting_source import VERTEX, Features, fragment_source
 from .table_texture import dielectric_texels, table_texels
+from .uploaded_lights import UploadedLights, shares, upload_lights
 
 PASSES = ("specular", "diffuse", "combined")
-MOST_LOOPS = 40000
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
-_GBUFFER_SAMPLERS = {
-    "positions": "position",
-    "normals": "normal",
-    "bases": "base",
-    "f0s": "f0",
-    "f90s": "f90",
-    "dielectric_weights": "dielectric",
-    "geometric_normals": "geometric_normal",
-    "diffuse_normals": "diffuse_normal",
-    "smooth_normals": "smooth_normal",
-}
 
 
 class LightingPass:
@@ -49,13 +36,12 @@ class LightingPass:
         self._iors: tuple[float, ...] = ()
         self._table = self._dielectrics = None
         self.set_iors(iors)
-        self._light_values = None
         self.set_lights(())
 
     def free(self) -> None:
         """Let go of shaders and textures; the pass cannot draw any more."""
         self._shaders.clear()
-        self._table = self._dielectrics = self._lights = self._light_values = None
+        self._table = self._dielectrics = self._lights = None
 
     def set_iors(self, iors: Sequence[float]) -> None:
         """The indices of refraction that most dielectrics have, as for the constructor."""
@@ -66,14 +52,12 @@ class LightingPass:
         self._table = float_texture(table_texels(self.table, iors))
         self._dielectrics = float_texture(dielectric_texels(self.table, iors))
 
-    def set_lights(self, lights: Iterable[AreaLight]) -> None:
-        """The lights from now on; does nothing where they are the same. Light groups are added up."""
-        lights = visible_lights(lights)
-        texels = light_texels(lights)
-        if self._light_values is None or not np.array_equal(texels, self._light_values):
-            self._light_values, self._lights = texels, float_texture(texels)
-        self._shares = _shares([_loops(light) for light in lights])
-        self._has_focused = any(light.is_focused for light in lights)
+    def set_lights(self, lights: Iterable[AreaLight] | UploadedLights) -> None:
+        """The lights from now on. Light groups are added up."""
+        uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
+        self._lights = uploaded.texture
+        self._shares = shares([_loops(light) for light in uploaded.lights])
+        self._has_focused = any(light.is_focused for light in uploaded.lights)
 
     def draw(
         self,
@@ -102,8 +86,9 @@ class LightingPass:
             specular=passes != "diffuse",
             diffuse=passes != "specular",
             geometric=passes != "diffuse" and gbuffer.geometric_normal is not None,
-            bumped=passes != "specular" and gbuffer.diffuse_normal is not None,
+            bumped=passes != "specular" and gbuffer.smooth_normal is not None,
             focused=self._has_focused,
+            turned=passes != "specular" and gbuffer.diffuse_normal is not None,
         )
         if target is None:
             self._draw(features, gbuffer, view, (x, y, width, height), add)
@@ -133,7 +118,7 @@ class LightingPass:
 
     def _texture(self, name, gbuffer):
         own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}
-        return own[name] if name in own else getattr(gbuffer, _GBUFFER_SAMPLERS[name])
+        return own[name] if name in own else getattr(gbuffer, SAMPLERS[name])
 
     def _shader(self, features):
         """The shader for `features`, its batch and the names of its textures; compiled when first wanted."""
@@ -153,14 +138,6 @@ def _loops(light: AreaLight) -> int:
     return 2500 if light.is_round else 10 * len(light.polygon())
 
 
-def _shares(loops: Sequence[int]) -> list[tuple[int, int]]:
-    """The lights (first, end) of each draw call: llvmpipe breaks off the loops of a pixel that go round more than
-    65535 times, and other cards do not like long ones. The first call is there without lights, too."""
-    number = np.cumsum([0, *loops[:-1]]) // MOST_LOOPS if len(loops) else np.zeros(0)
-    starts = [0, *(np.nonzero(np.diff(number))[0] + 1).tolist(), len(loops)]
-    return list(zip(starts[:-1], starts[1:], strict=True))
-
-
 def _create_info(table, features):
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
@@ -174,8 +151,10 @@ def _create_info(table, features):
         samplers += ["f0s", "f90s", "dielectric_weights", "table", "dielectrics"]
     if features.geometric:
         samplers.append("geometric_normals")
+    if features.turned or features.bumped:
+        samplers.append("diffuse_normals")
     if features.bumped:
-        samplers += ["diffuse_normals", "smooth_normals"]
+        samplers.append("smooth_normals")
     for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D_ARRAY" if name == "table" else "FLOAT_2D", name)
     info.vertex_source(VERTEX)

@@ -38,8 +38,9 @@ class Features:
     specular: bool
     diffuse: bool
     geometric: bool  # a horizon of its own for the specular lobe
-    bumped: bool  # diffuse and smooth normals of their own
+    bumped: bool  # a horizon of its own for the diffuse lobe
     focused: bool = False  # lights with a spread
+    turned: bool = False  # a diffuse normal of its own
 
 
 def fragment_source(table: LookupTable, features: Features) -> str:
@@ -49,7 +50,7 @@ def fragment_source(table: LookupTable, features: Features) -> str:
             f"table {table.name} has degree {table.degree}, the graphics card's path goes up to {edge_loop.MAX_DEGREE}"
         )
     lights = text.LIGHTS.replace("@ROUND_LEVELS@", _round_levels())
-    parts = ["#define LTSH_GLSL 1", shared_text(), _constants(table), lights]
+    parts = ["#define LTSH_GLSL 1", shared_text(), _constants(table), text.LIGHT_TEXELS, lights]
     if features.focused:
         parts.append(spread_text())
     if features.specular:
@@ -65,7 +66,8 @@ def _specular_parts(table, features) -> list[str]:
     # A tilt turns around the second axis of the frame, and so does the horizon.
     seam = "lobe.row_y" if is_cosine else None
     parts = [specular_text.COSINE_SUM if is_cosine else _moment_sum(table), specular_text.SPECULAR_LOBE]
-    parts += [_heights("specular", "warped.z", horizons - 1), integral_function("specular", horizons, seam)]
+    parts += [_heights("specular", "warped.z", int(is_cosine), features.geometric)]
+    parts += [integral_function("specular", horizons, seam)]
     parts += [_lookup(table), _specular_setup(is_cosine, features.geometric), specular_text.SPECULAR]
     if features.focused:
         values = "specular_values(weights, sum)"
@@ -74,12 +76,19 @@ def _specular_parts(table, features) -> list[str]:
 
 
 def _diffuse_parts(features) -> list[str]:
-    parts = [text.DIFFUSE_LOBE, _heights("diffuse", "dot(lobe.plane_0, v)", int(features.bumped))]
-    parts += [integral_function("diffuse", 1 + features.bumped), text.BUMPED if features.bumped else text.PLAIN]
+    parts = [text.DIFFUSE_LOBE, _heights("diffuse", "dot(lobe.plane_0, v)", 0, features.bumped)]
+    parts += [integral_function("diffuse", 1 + features.bumped), _diffuse_start(features)]
     if features.focused:
         value = "vec4(diffuse_form_factor(lobe, sum), 0.0, 0.0, 0.0)"
         parts += [text.DIFFUSE_FRAME, spread_function("diffuse", "", value, "diffuse_frame(lobe)")]
     return parts
+
+
+def _diffuse_start(features) -> str:
+    if features.bumped:
+        return text.BUMPED
+    normal = "texelFetch(diffuse_normals, texel, 0).xyz" if features.turned else "point.normal"
+    return text.PLAIN.replace("@DIFFUSE_NORMAL@", normal)
 
 
 def _constants(table) -> str:
@@ -92,21 +101,18 @@ def _constants(table) -> str:
         "CURVES": curves,
         "COEFFICIENTS": count,
         "BLOCKS": -(-count // 4),
-        "LIGHT_HEADER": light_texture.HEADER,
-        "FIRST_LIGHT": light_texture.FIRST_LIGHT,
-        "LIGHT_WIDTH": light_texture.WIDTH,
-        "DIFFUSE_FLAG": light_texture.DIFFUSE,
-        "SPECULAR_FLAG": light_texture.SPECULAR,
-        "ROUND_FLAG": light_texture.ROUND,
+        **light_texture.constants(),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "IOR_STEPS": float_literal(IOR_STEPS),
     }
     return "\n".join(f"#define LTSH_{name} {value}" for name, value in values.items()) + "\n"
 
 
-def _heights(name, first, more) -> str:
-    """Heights of v above the horizons."""
+def _heights(name, first, more, own) -> str:
+    """Heights of v above the horizons; `own` adds one that is left out where it is another one's."""
     others = [f"dot(lobe.plane_{k}, v)" if k <= more else "rest" for k in (1, 2)]
+    if own:
+        others[more] = f"lobe.is_spare ? rest : dot(lobe.plane_{more + 1}, v)"
     return (
         f"vec3 {name}_heights({name}_lobe lobe, vec3 v, vec3 warped, float rest)\n"
         f"{{\n    return vec3({first}, {', '.join(others)});\n}}\n"
@@ -158,6 +164,7 @@ def _specular_setup(is_cosine, geometric) -> str:
         lines.append("    lobe.plane_1 = point.normal;")
     if geometric:
         lines.append(f"    lobe.plane_{1 + is_cosine} = point.geometric;")
+        lines.append("    lobe.is_spare = ltsh_is_same(point.geometric, point.normal);")
     tilt = specular_text.TILT if is_cosine else ""
     return specular_text.SPECULAR_SETUP.replace("@TILT@", tilt).replace("@PLANES@", "\n".join(lines))
 

@@ -3,6 +3,18 @@
 Names between @ are filled in there.
 """
 
+LIGHT_TEXELS = """\
+vec4 ltsh_light_texel(int index)
+{
+    return texelFetch(lights, ivec2(index % LTSH_LIGHT_WIDTH, index / LTSH_LIGHT_WIDTH), 0);
+}
+
+vec2 ltsh_corner(int texel) { return ltsh_light_texel(texel).xy; }
+
+/* Horizons of normals that are this close meet nowhere in single precision, and count as one. */
+bool ltsh_is_same(vec3 a, vec3 b) { return all(lessThan(abs(a - b), vec3(1e-6))); }
+"""
+
 LIGHTS = """\
 /* A light as seen from a point: vectors in the world, the first corner's texel and how many there are, the same for
    where no horizon cuts it. */
@@ -15,13 +27,6 @@ struct ltsh_point {
     vec3 position; vec3 view; vec3 normal; vec3 geometric; float roughness; float ior; float receiver;
     vec4 f0; vec4 f90; vec4 dielectric;
 };
-
-vec4 ltsh_light_texel(int index)
-{
-    return texelFetch(lights, ivec2(index % LTSH_LIGHT_WIDTH, index / LTSH_LIGHT_WIDTH), 0);
-}
-
-vec2 ltsh_corner(int texel) { return ltsh_light_texel(texel).xy; }
 
 /* The light as lobes `width` radians wide need it: of round ones the number of corners depends on that. */
 ltsh_light ltsh_seen_light(int header, vec3 position, float width)
@@ -63,7 +68,7 @@ bool ltsh_receives(int header, ltsh_point point)
 """
 
 DIFFUSE_LOBE = """\
-struct diffuse_lobe { vec3 plane_0; vec3 plane_1; vec3 plane_2; float bump_alpha2; };
+struct diffuse_lobe { vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2; };
 /* Integral of the direction over a polygon, times 2. */
 struct diffuse_sum { vec3 total; };
 
@@ -94,9 +99,10 @@ PLAIN = """\
 diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
 {
     diffuse_lobe lobe;
-    lobe.plane_0 = point.normal;
+    lobe.plane_0 = @DIFFUSE_NORMAL@;
     lobe.plane_1 = vec3(0.0);
     lobe.plane_2 = vec3(0.0);
+    lobe.is_spare = true;
     lobe.bump_alpha2 = 0.0;
     return lobe;
 }
@@ -115,6 +121,7 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     lobe.plane_0 = normal.xyz;
     lobe.plane_1 = texelFetch(smooth_normals, texel, 0).xyz;
     lobe.plane_2 = vec3(0.0);
+    lobe.is_spare = ltsh_is_same(lobe.plane_0, lobe.plane_1);
     lobe.bump_alpha2 = all(equal(lobe.plane_0, lobe.plane_1)) ? 0.0 : normal.w;
     return lobe;
 }

@@ -19,6 +19,7 @@ class MeshBatches:
     corner_count: int
     uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
     middle: np.ndarray  # (3,) of the bounding box
+    is_smooth: bool  # do normals differ from those of the faces?
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
 
@@ -67,6 +68,7 @@ def mesh_batches(ob) -> MeshBatches | None:
         place = _get(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)[vertex]
         normal = _get(mesh.corner_normals, "vector", (corners, 3), np.float32)
         uv = _uv_maps(mesh, corners)
+        is_smooth = mesh.normals_domain != "FACE"
     finally:
         ob.to_mesh_clear()
     slots = np.clip(material, 0, max(len(ob.material_slots) - 1, 0))
@@ -79,7 +81,7 @@ def mesh_batches(ob) -> MeshBatches | None:
     }
     buffer = _vertex_buffer({"position": place, "normal": normal})
     middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
-    return MeshBatches(used, count, indices, buffer, corners, uv, middle)
+    return MeshBatches(used, count, indices, buffer, corners, uv, middle, is_smooth)
 
 
 def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:

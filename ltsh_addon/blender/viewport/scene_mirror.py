@@ -10,6 +10,7 @@ from mathutils import Matrix
 
 from ...scene import AreaLight
 from ..lights.light_linking import Receivers
+from ..lights.shown_textures import ShownTextures
 from ..materials.surface_looks import Look, look_of
 from ..materials.world_look import world_radiance
 from ..pixels.inventory import SURFACE_TYPES
@@ -102,6 +103,7 @@ class SceneMirror:
         self._meshes: dict[tuple, MeshBatches | None] = {}
         self._looks: dict[str, ShownLook] = {}
         self._light_notes: tuple[str, ...] = ()
+        self._light_textures = ShownTextures()
         self._world_note: tuple[str, ...] = ()
         self._synced = False
 
@@ -123,8 +125,8 @@ class SceneMirror:
         if changes.surfaces:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
-        if changes.lights or changes.everything or changes.materials:
-            self.lights, self._light_notes = view_lights(depsgraph, in_view)
+        if changes.lights or changes.everything or changes.materials or changes.images:
+            self.lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures)
         if changes.world or changes.everything:
             self._read_world(depsgraph.scene)
         self._synced = True
@@ -136,6 +138,7 @@ class SceneMirror:
         for name in changes.materials:
             self._looks.pop(name, None)
         if changes.images:
+            self._light_textures.clear()
             for shown in self._looks.values():
                 shown.textures = None
 

@@ -83,7 +83,7 @@ specular_sum specular_finished(specular_sum sum)
 
 SPECULAR_LOBE = """\
 /* Axes of the warped local frame, and the normals of the horizons. */
-struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; };
+struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; };
 /* Weights of the moments by Fresnel term, and how wide the lobe is in radians. */
 struct specular_weights {
     float plain[LTSH_COEFFICIENTS]; float schlick[LTSH_COEFFICIENTS]; float dip[LTSH_COEFFICIENTS];
@@ -194,6 +194,7 @@ specular_lobe specular_at(ltsh_point point, ltsh_cell cell)
 @TILT@
     lobe.plane_1 = vec3(0.0);
     lobe.plane_2 = vec3(0.0);
+    lobe.is_spare = true;
 @PLANES@
     return lobe;
 }

@@ -8,7 +8,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from ..materials.surface_looks import IMAGE_SLOTS
+from ..materials.surface_looks import IMAGE_SLOTS, is_missing
 from . import surface_inputs, surface_lobes
 from . import surface_source as source
 from .gbuffer_textures import GBufferTextures, float_texture
@@ -17,8 +17,10 @@ from .surface_uniforms import DEFINES, LOOK_SIZE, albedo_table, blend_table, flo
 
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
-NORMALS = ("diffuse_normal", "smooth_normal")
+NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
 EMISSION = ("emission",)
+# That of images which are not found, as in Cycles.
+MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -44,17 +46,20 @@ class SurfacePass:
         self._shaders = {outputs: _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._nothing = float_texture(np.zeros((1, 1, 4)))
+        self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size, self._textures, self._buffers = None, {}, {}
 
     def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
-        """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call."""
+        """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call.
+
+        Normals of their own are there where a surface is smooth or bent.
+        """
         self._resize(size)
         self._draw_into(SURFACES, instances, view, size)
         textures = {name: self._textures[name] for name in SURFACES}
-        if any(_bends(look) for instance in instances for look in instance.looks):
+        if has_normals(instances):
             self._draw_into(NORMALS, instances, view, size)
             textures.update({name: self._textures[name] for name in NORMALS})
-            textures["geometric_normal"] = textures["smooth_normal"]
         return GBufferTextures(**textures)
 
     @property
@@ -82,7 +87,7 @@ class SurfacePass:
     def free(self) -> None:
         """Let go of everything."""
         self._size, self._textures, self._buffers, self._tables, self._shaders = None, {}, {}, {}, {}
-        self._nothing = self._depth = None
+        self._nothing = self._missing = self._depth = None
 
     def _resize(self, size) -> None:
         if size == self._size:
@@ -125,7 +130,7 @@ class SurfacePass:
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             shader.uniform_float("model", instance.model)
             if with_images:
-                shader.uniform_float("receiver_and_side", (instance.receiver, instance.side))
+                shader.uniform_float("placement", (instance.receiver, instance.side, instance.mesh.is_smooth, 0.0))
             for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
                 shader.uniform_block("look", look.uniforms)
                 if with_images:
@@ -134,9 +139,22 @@ class SurfacePass:
 
     def _bind_images(self, shader, shown: ShownLook) -> None:
         if shown.textures is None:
-            shown.textures = {name: gpu.texture.from_image(use.image) for name, use in shown.look.images.items()}
+            shown.textures = {
+                name: self._missing if is_missing(use.image) else gpu.texture.from_image(use.image)
+                for name, use in shown.look.images.items()
+            }
         for name in IMAGE_SLOTS:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
+
+
+def has_normals(instances: list[ShownInstance]) -> bool:
+    """True where the diffuse lobe or a horizon has a normal of its own."""
+    return has_bent_lobes(instances) or any(instance.mesh.is_smooth for instance in instances)
+
+
+def has_bent_lobes(instances: list[ShownInstance]) -> bool:
+    """True where a diffuse lobe does not end at its own normal's horizon."""
+    return any(_bends(look) for instance in instances for look in instance.looks)
 
 
 def _bends(shown: ShownLook) -> bool:
@@ -156,7 +174,7 @@ def _shader(outputs):
     info.push_constant("MAT4", "model")
     # What a shader does not use is not there for whom sets it.
     if outputs != EMISSION:
-        info.push_constant("VEC2", "receiver_and_side")
+        info.push_constant("VEC4", "placement")
     images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
     for slot, name in enumerate(("positions",) if outputs == EMISSION else images):
         info.sampler(slot, "FLOAT_2D", name)

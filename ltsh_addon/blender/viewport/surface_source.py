@@ -1,8 +1,6 @@
 """GLSL of the passes that draw surfaces into the G-buffer: what `lobe_samples` does for pixels, for one lobe.
 
 What it reads of images and normals stands in `surface_inputs`, lobes in `surface_lobes`.
-
-The smooth normal stands in for the geometric one: of both horizons Cycles mostly keeps to its own (`specular_horizon`).
 """
 
 VERTEX = """
@@ -19,11 +17,13 @@ void main()
 FRAGMENT = """
 void main()
 {
-  bool backfacing = gl_FrontFacing == (receiver_and_side.y < 0.0);
+  bool backfacing = gl_FrontFacing == (placement.y < 0.0);
   vec3 towards_eye = view.eye.w < 0.5 ? view.eye.xyz : normalize(view.eye.xyz - v_position);
   vec3 smooth_normal = normalize(v_normal) * (backfacing ? -1.0 : 1.0);
   vec3 true_normal = normalize(cross(dFdx(v_position), dFdy(v_position)));
   true_normal *= dot(true_normal, towards_eye) < 0.0 ? -1.0 : 1.0;
+  /* Exact where it can be: derivatives are rounded. */
+  true_normal = placement.z > 0.0 ? true_normal : smooth_normal;
   vec3 diffuse_normal = smooth_normal;
   vec3 specular_normal = smooth_normal;
   float alpha2 = 0.0;
@@ -45,7 +45,7 @@ FRAGMENT_OF_SURFACES = """
   float ior = max(slot_value(ior_image, 3, v_uv).x, 1.0);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
   Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
-  out_position = vec4(v_position, 1.0 + receiver_and_side.x);
+  out_position = vec4(v_position, 1.0 + placement.x);
   out_normal = vec4(specular_normal, roughness);
   out_base = vec4(lobe.diffuse, lobe.ior);
   out_f0 = vec4(lobe.f0, lobe.dip.r);
@@ -55,6 +55,7 @@ FRAGMENT_OF_SURFACES = """
 """
 
 FRAGMENT_OF_NORMALS = """
+  out_geometric_normal = vec4(true_normal, 0.0);
   if (int(look.data[0].x + 0.5) == TRANSLUCENT) {
     diffuse_normal = -specular_normal;
     smooth_normal = -smooth_normal;

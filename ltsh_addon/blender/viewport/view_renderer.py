@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gpu
 import numpy as np
 
 from ..materials.linear_values import Value
 from .gbuffer_textures import GBufferTextures
+from .horizon_pass import HorizonPass
 from .lighting import LightingPass
 from .picture_pass import PicturePass
 from .scene_mirror import SceneMirror
-from .surface_pass import SurfacePass, View
+from .surface_pass import SurfacePass, View, has_bent_lobes
+from .uploaded_lights import UploadedLights, upload_lights
 
 # The lighting pass is fast for so many indices of refraction, and exact for all.
 MOST_IORS = 6
@@ -43,12 +45,18 @@ class ViewRenderer:
         self._picture = PicturePass()
         self._lighting: dict[str, LightingPass] = {}
         self._targets: list = []
+        self._horizons: HorizonPass | None = None
         self._gbuffer: GBufferTextures | None = None
-        self._drawn = None
+        self._lit_gbuffer: GBufferTextures | None = None
+        self._lights: UploadedLights | None = None
+        self._drawn = self._uploaded = None
 
     def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
         """Draw the scene into `frame_buffer`, which has `size` pixels."""
-        self._draw_surfaces(mirror, view, size)
+        surfaces_changed = self._draw_surfaces(mirror, view, size)
+        lights_changed = self._upload_lights(mirror)
+        if surfaces_changed or lights_changed or self._lit_gbuffer is None:
+            self._choose_horizons(mirror, view)
         first = self._lit(0, shown.technique, mirror, view, size, shown)
         second = shown.second_picture
         if shown.mode != "single" and second is None:
@@ -69,22 +77,45 @@ class ViewRenderer:
                 white=shown.white,
             )
 
-    def _draw_surfaces(self, mirror, view: View, size) -> None:
+    def _draw_surfaces(self, mirror, view: View, size) -> bool:
+        """Draw the G-buffer if anything has changed, and tell that."""
         drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), size)
-        if drawn != self._drawn:
-            self._drawn = None
-            self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
-            self._drawn = drawn
+        if drawn == self._drawn:
+            return False
+        self._drawn = None
+        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+        self._drawn = drawn
+        return True
+
+    def _upload_lights(self, mirror) -> bool:
+        """Upload the lights if they have changed, and tell that."""
+        if self._uploaded is mirror.lights:
+            return False
+        self._lights = upload_lights(mirror.lights)
+        self._uploaded = mirror.lights
+        return True
+
+    def _choose_horizons(self, mirror, view: View) -> None:
+        """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
+        gbuffer, self._lit_gbuffer = self._gbuffer, None
+        if gbuffer.geometric_normal is None:
+            self._lit_gbuffer = gbuffer
+            return
+        if self._horizons is None:
+            self._horizons = HorizonPass()
+        horizon = self._horizons.draw(gbuffer, self._lights, (*view.eye, 0.0 if view.is_parallel else 1.0))
+        smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
+        self._lit_gbuffer = replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
     def _lit(self, number: int, technique: str, mirror, view: View, size, shown: ShownPicture):
         lighting = self._lighting.get(technique)
         if lighting is None:
             lighting = self._lighting[technique] = LightingPass(technique)
         lighting.set_iors(common_iors(mirror))
-        lighting.set_lights(mirror.lights)
+        lighting.set_lights(self._lights)
         texture, buffer = self._target(number, size)
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
-        lighting.draw(self._gbuffer, buffer, shown.passes, **place)
+        lighting.draw(self._lit_gbuffer, buffer, shown.passes, **place)
         if shown.passes == "combined" and shown.second_picture is None:
             self._surfaces.add_emission(mirror.instances, view, size, buffer)
         return texture
@@ -112,7 +143,10 @@ class ViewRenderer:
         self._lighting.clear()
         self._targets.clear()
         self._surfaces.free()
-        self._gbuffer = self._drawn = None
+        if self._horizons is not None:
+            self._horizons.free()
+        self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = None
+        self._drawn = self._uploaded = None
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

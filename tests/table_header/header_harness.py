@@ -245,14 +245,14 @@ def compiled_glsl_branch(header: Path, folder: Path, prefix: str, data: np.ndarr
 def preprocessed(header: Path, *definitions: str) -> str:
     """What is left of the header when the preprocessor has run."""
     command = [C_COMPILER, "-E", "-P", *(f"-D{definition}" for definition in definitions), str(header)]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=600).stdout
 
 
 def accepts(compiler: str, source: str, path: Path, *options: str) -> str:
     """What the compiler complains about: "" where it accepts the source."""
     path.write_text(source, encoding="ascii")
     command = [compiler, *options, *WARNINGS, "-fsyntax-only", str(path)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120).stderr
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=600).stderr
 
 
 def _named(text: str, prefix: str) -> str:
@@ -264,7 +264,7 @@ def _build(command, source: str, path: Path) -> Path:
     library = path.with_suffix(".so")
     done = subprocess.run(
         [*command, "-O1", "-shared", "-fPIC", str(path), "-o", str(library), "-lm"],
-        capture_output=True, text=True, check=False, timeout=120,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return library

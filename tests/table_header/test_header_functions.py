@@ -15,17 +15,6 @@ EPS = float(np.finfo(np.float32).eps)
 ROOM = 8
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("headers")
-
-
-@pytest.fixture(scope="module")
-def tables(folder):
-    """The tables by name; their headers lie in `folder`."""
-    return header_harness.export(folder)
-
-
 @pytest.fixture(
     scope="module", params=[(name, branch) for branch in ("c", "glsl") for name in header_harness.TABLES], ids="-".join
 )

@@ -1,0 +1,159 @@
+"""Where specular lobes end in the viewport: at the horizon that numpy takes, as Cycles does."""
+
+from dataclasses import fields, replace
+
+import bpy
+import numpy as np
+import pytest
+import random_surfaces
+import scene_parts as parts
+from graphics_card import Canvas, with_graphics
+from random_surfaces import EYE
+
+from ltsh_addon import shading
+from ltsh_addon.blender.materials.specular_horizon import SMALLEST_ANGLE, end_at_horizons_of_cycles, horizon_excess
+from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.viewport.gbuffer_textures import upload_samples
+from ltsh_addon.blender.viewport.horizon_pass import HorizonPass
+from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
+from ltsh_addon.blender.viewport.surface_pass import View
+from ltsh_addon.blender.viewport.uploaded_lights import upload_lights
+from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+from ltsh_addon.scene import SurfaceSamples
+
+WIDTH, HEIGHT = 32, 16
+SIZE = (80, 60)
+RELATIVE, ABSOLUTE = 1e-3, 1e-5
+# Between estimates that are this close, single precision may choose otherwise.
+TIE = 1e-3
+
+
+def read(texture):
+    """The texture (H W, 4) in double precision, row 0 at the bottom."""
+    values = texture.read()
+    values.dimensions = texture.width * texture.height * 4
+    return np.array(values, np.float32).astype(np.float64).reshape(-1, 4)
+
+
+def is_certain(samples, lights):
+    """Mask (P,) of samples for which rounding cannot turn the choice."""
+    by_lobe, by_light = np.abs(horizon_excess(samples, lights))
+    return np.abs(by_lobe - by_light) >= TIE * (by_lobe + by_light)
+
+
+def chosen(kind, surface="tilted"):
+    """What the card chose (P, 3) among random samples under lights of `kind`, with samples and lights."""
+    random = np.random.default_rng([len(kind), *map(ord, kind)])
+    samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
+    # Apart by as much as meshes are.
+    bent = random_surfaces.unit(samples.smooth_normal + 0.1 * random.normal(size=(len(samples), 3)))
+    samples = replace(samples, geometric_normal=random_surfaces.unit(random_surfaces.rounded(bent)))
+    lights = tuple(random_surfaces.light(kind, number, random) for number in range(4))
+    horizons = HorizonPass()
+    texture = horizons.draw(upload_samples(samples, WIDTH), upload_lights(lights), (*EYE, 1.0))
+    found = read(texture)[:, :3]
+    horizons.free()
+    return found, samples, lights
+
+
+def test_the_card_chooses_the_horizon_that_numpy_chooses():
+    kinds = ("plain", "near", "horizon", "huge", "disk", "polygon", "tiny")
+    results = with_graphics(lambda: [chosen(kind) for kind in kinds])
+    turned = 0
+    for kind, (found, samples, lights) in zip(kinds, results, strict=True):
+        ended = end_at_horizons_of_cycles(samples, lights).geometric_normal
+        by_lobe, by_light = horizon_excess(samples, lights)
+        sure = is_certain(samples, lights) & (by_lobe + by_light != 1.0)
+        wrong = np.abs(found - ended).max(axis=1) > 1e-6
+        assert not wrong[sure].any(), f"{kind}: {wrong[sure].sum()} of {sure.sum()} samples have the other horizon"
+        smooth = np.abs(ended - samples.smooth_normal).max(axis=1) < 1e-6
+        turned += min(smooth[sure].sum(), (~smooth)[sure].sum())
+    # Both choices are there.
+    assert turned > 20
+
+
+def low_poly_sphere():
+    """A rough metal sphere of few faces with interpolated normals, lit from beside; its camera."""
+    parts.empty_scene(*SIZE)
+    material, _ = parts.bsdf_material("ShaderNodeBsdfAnisotropic", Color=(0.9, 0.8, 0.7, 1.0), Roughness=0.45)
+    sphere = parts.add_sphere(material, radius=1.3, segments=12)
+    sphere.rotation_euler = (0.3, 0.2, 0.1)
+    parts.add_plane(parts.principled("Floor", Roughness=0.4)[0], size=8.0, location=(0.0, 0.0, -1.3))
+    parts.add_area_light("Side", location=(2.5, 0.0, 1.0), rotation=(0.0, 1.2, 0.0), size=4.0, size_y=3.0)
+    parts.add_area_light("Far", location=(-4.0, 1.5, 0.5), rotation=(0.0, -1.4, 0.2), size=0.8, size_y=0.5)
+    camera = parts.add_camera((0.0, -4.0, 1.6), (1.2, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    return camera
+
+
+def samples_in(gbuffer, eye):
+    """Samples and pixels of the surfaces in `gbuffer`."""
+    read_textures = {field.name: read(getattr(gbuffer, field.name)) for field in fields(gbuffer)}
+    pixel = np.flatnonzero(read_textures["position"][:, 3] > 0.0)
+    at = {name: values[pixel] for name, values in read_textures.items()}
+    normals = ("geometric_normal", "diffuse_normal", "smooth_normal")
+    unit = {name: random_surfaces.unit(at[name][:, :3]) for name in ("normal", *normals)}
+    return SurfaceSamples(
+        position=at["position"][:, :3],
+        view=random_surfaces.unit(eye - at["position"][:, :3]),
+        roughness=at["normal"][:, 3],
+        diffuse_albedo=at["base"][:, :3],
+        ior=at["base"][:, 3],
+        specular_f0=at["f0"][:, :3],
+        specular_f90=at["f90"][:, :3],
+        dielectric=at["dielectric"][:, :3],
+        **unit,
+    ), pixel
+
+
+def drawn(camera):
+    """Lights, samples, their pixels, and pictures (P, 3) by technique and pass."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
+    mirror.sync(depsgraph)
+    view = View.of(camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False)
+    pictures = {}
+    try:
+        for technique in ("ltc", "ltsh2", "ltsh4"):
+            for name in shading.PASSES:
+                shown = ShownPicture(technique, name, "single", "ltc", 0.5, 1.0, 1.0, True)
+                renderer.draw(mirror, view, SIZE, shown, canvas.buffer)
+                pictures[technique, name] = renderer.read().reshape(-1, 4)[:, :3].astype(np.float64)
+        samples, pixel = samples_in(renderer._gbuffer, view.eye)
+        return mirror.lights, samples, pixel, {key: values[pixel] for key, values in pictures.items()}
+    finally:
+        renderer.free()
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
+    camera = low_poly_sphere()
+    lights, samples, pixel, pictures = with_graphics(lambda: drawn(camera))
+    ended = end_at_horizons_of_cycles(samples, lights)
+    sure = is_certain(samples, lights)
+    assert sure.mean() > 0.99
+    for (technique, name), found in pictures.items():
+        expected = shading.shade(ended, lights, technique, passes=(name,), workers=1, dtype=np.float64).combined
+        times = (np.abs(found - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))).max(axis=1)
+        assert times[sure].max() <= 1.0, f"{technique}, {name}: {times[sure].max():.1f} times as far off as it may be"
+    smooth = replace(samples, geometric_normal=samples.smooth_normal)
+    plain = shading.shade(smooth, lights, "ltsh4", passes=("specular",), workers=1, dtype=np.float64).combined
+    found = pictures["ltsh4", "specular"]
+    wrong = np.abs(found - plain).max(axis=1) > 10.0 * (ABSOLUTE + RELATIVE * np.abs(plain).max(axis=1))
+    # The horizon of the mesh makes a difference.
+    assert wrong.sum() > 20
+    check_against_cycles(tmp_path / "sphere.blend", ended, pixel)
+
+
+def check_against_cycles(path, ended, pixel):
+    """The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    found = child.extract(child.ExtractOptions(scene=path))
+    row, column = np.divmod(found.film.pixel, SIZE[0])
+    place = np.full(SIZE[0] * SIZE[1], -1)
+    place[pixel] = np.arange(len(pixel))
+    match = place[(SIZE[1] - 1 - row) * SIZE[0] + column]
+    theirs, ours = found.samples.take(match >= 0), ended.take(match[match >= 0])
+    for name, share in (("smooth_normal", 0.97), ("normal", 0.95), ("diffuse_normal", 0.97), ("geometric_normal", 0.9)):
+        apart = np.abs(getattr(theirs, name) - getattr(ours, name)).max(axis=1)
+        assert (apart < 1e2 * SMALLEST_ANGLE).mean() > share, f"{name}: {(apart < 1e2 * SMALLEST_ANGLE).mean():.3f}"

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from . import double_precision, light_cone, ridge_table
+from . import double_precision, edge_loop, light_cone, ridge_table
 from .fresnel_kinds import any_component, columns, fresnel_kinds
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .polygon import dot
@@ -68,7 +68,7 @@ def shade_specular(samples, lights, table, radiance, scratch):
 
 
 def _chunks(members):
-    return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
+    return (members[part] for part in edge_loop.pieces(len(members), CHUNK))
 
 
 def _add_double(samples, members, lights, radiance, shade):

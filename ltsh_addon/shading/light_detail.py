@@ -14,8 +14,8 @@ import numpy as np
 from ..scene import AreaLight, SurfaceSamples
 
 # The product of the contrast of a patch (see `_largest_size`) and the square of its size by that length is at most
-# this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: with 0.006 the patches
-# that a sample takes give what the smallest ones do to 0.1 to 0.3 % (relative L2), and they are 150 on average of 1024.
+# this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
+# sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
 PRODUCT = 0.004
 # Half the diagonal of a patch by that length, at most: also where the means of its parts are equal.
 LARGEST = 0.5

@@ -117,7 +117,7 @@ def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
     parser, commands = _parser(program)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
         hint = _similar(arguments[0], commands) or f"expected one of {', '.join(commands)}"
-        raise values.Misuse(f"{program}: command {arguments[0]!r} is unknown; {hint}; see {program} --help")
+        raise values.Misuse(f"{program}: command {arguments[0]!r} is unknown ({hint}); see {program} --help")
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         raise values.Misuse(_unknown_argument(options, unknown, commands))
@@ -129,12 +129,12 @@ def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
     program = commands[options.command].prog
     name = next((word.partition("=")[0] for word in unknown if word.startswith("-")), None)
     if name is None:
-        hint = "; name all files one after another" if getattr(options, "scenes", None) else ""
+        hint = " (name all files one after another)" if getattr(options, "scenes", None) else ""
         return f"{program}: {unknown[0]!r} is not expected here{hint}; see {program} --help"
     known = {command: re.findall(r"--[\w-]+", parser.format_help()) for command, parser in commands.items()}
     owners = [command for command, names in known.items() if name in names]
     hint = f"an option of {', '.join(owners)}" if owners else _similar(name, known[options.command])
-    return "; ".join(filter(None, [f"{program}: option {name} is unknown here", hint, f"see {program} --help"]))
+    return f"{program}: option {name} is unknown here{f' ({hint})' if hint else ''}; see {program} --help"
 
 
 def _similar(name: str, known) -> str:

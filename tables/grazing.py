@@ -42,6 +42,7 @@ class GrazingError:
 
     @property
     def ratio(self) -> float:
+        """Error of the table over that of the lobe solved at the point."""
         return self.table / self.solved
 
 

@@ -41,6 +41,7 @@ class Optimum:
 
     @property
     def mean(self) -> float:
+        """Mean of the errors of all points."""
         return float(self.errors.mean())
 
 

@@ -39,6 +39,7 @@ class TableStatistics:
     negative_mass_maximum: float
 
     def to_dict(self) -> dict:
+        """The figures by name."""
         return asdict(self)
 
 
@@ -134,6 +135,7 @@ class CornerStatistics:
     largest_number: float  # stored
 
     def to_dict(self) -> dict:
+        """The figures by name."""
         return asdict(self)
 
 

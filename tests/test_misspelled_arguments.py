@@ -9,15 +9,16 @@ from ltsh_addon.blender.processes.missing_names import listed
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ("shad room.blend -o out", "ltsh: command 'shad' is unknown; did you mean shade?; see ltsh --help"),
+        ("shad room.blend -o out", "ltsh: command 'shad' is unknown (did you mean shade?); see ltsh --help"),
         ("frobnicate", "expected one of demo, compare, shade, bake, run, merge, tables"),
-        ("shade room.blend -o out --techniqes ltc", "ltsh shade: option --techniqes is unknown here; did you mean "
-         "--techniques?; see ltsh shade --help"),
+        ("shade room.blend -o out --techniqes ltc", "ltsh shade: option --techniqes is unknown here (did you mean "
+         "--techniques?); see ltsh shade --help"),
         ("shade room.blend -o out --techniqes=ltc", "did you mean --techniques?"),
-        ("shade room.blend -o out --cycles-samples 8", "--cycles-samples is unknown here; an option of demo, compare, "
-         "bake"),
+        ("shade room.blend -o out --cycles-samples 8", "--cycles-samples is unknown here (an option of demo, compare, "
+         "bake)"),
         ("shade room.blend -o out --zzz", "option --zzz is unknown here; see ltsh shade --help"),
-        ("shade room.blend -o out hall.blend", "'hall.blend' is not expected here; name all files one after another"),
+        ("shade room.blend -o out hall.blend", "'hall.blend' is not expected here (name all files one "
+         "after another); see"),
         ("demo room.blend -o out", "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
         ("tables export -o out --jsn", "option --jsn is unknown here"),
     ],

@@ -8,12 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from .. import imaging
+from .. import imaging, shading
 from ..comparison import compare
 from ..comparison.compare import Made
 from ..jobs.output_names import file_stems
 from ..jobs.task_records import Records, contents_digest, options_digest
 from ..scene import AreaLight
+from ..shading.workers import cores
 from .bake_object import ObjectBaker, applied_layer, block_rows, shaded_passes
 
 BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
@@ -48,6 +49,7 @@ class BakeOptions:
     resume: bool = False  # keep what the same job has finished
     scripts: bool = False  # run those of the file
     apply: bool = False  # also a texture per object, and a .blend that shows it
+    memory_mib: int = 0  # a bake that needs more is refused; 0: as the environment says, else what is free
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -57,6 +59,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
     but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
     """
+    check_memory(options)
     made = bake_objects(options, progress)
     document = made.report
     if options.apply and document["objects"]:
@@ -106,6 +109,23 @@ def bake_objects(
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
     return Made(document, seconds, tuple(files))
+
+
+def check_memory(options: BakeOptions) -> None:
+    """Raise SceneError where the bake of an object needs more memory than there may be."""
+    from ..blender.processes import memory
+
+    width, height = options.width, options.height
+    reference = shading.REFERENCE in options.techniques
+    shaded = block_rows(options) * width * (1 if reference else cores())
+    written = min(block_rows(options) + 2 * options.margin, height) * width if options.margin else 0
+    parts = memory.BakeParts(
+        texels=min(shaded, width * height),
+        channels=3 * len(options.techniques) * len(options.passes),
+        margin_texels=written,
+        compared=options.cycles_samples > 0,
+    )
+    memory.check_bake(f"{width}x{height} texels", parts, options.memory_mib)
 
 
 class TileRecords:

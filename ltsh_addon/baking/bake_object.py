@@ -23,6 +23,7 @@ BLOCK_TEXELS = 1 << 18
 
 
 def block_rows(options) -> int:
+    """Rows of texels that are baked at a time."""
     return max(1, min(options.height, BLOCK_TEXELS // options.width))
 
 

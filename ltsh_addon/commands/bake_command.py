@@ -66,6 +66,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     options.add_batch(parser)
     options.add_trust(parser)
+    options.add_memory(parser, "bake")
     options.add_talk(parser)
     parser.set_defaults(run=run)
 
@@ -97,6 +98,7 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
         cycles_samples=arguments.cycles_samples if arguments.error else 0,
         apply=arguments.apply,
         scripts=arguments.enable_autoexec,
+        memory_mib=arguments.memory_limit,
     )
     return Job("bake", wanted, scenes, cameras, arguments.frames, arguments.name)
 

@@ -60,6 +60,14 @@ def add_trust(parser) -> None:
     parser.add_argument("--enable-autoexec", action="store_true", help=text)
 
 
+def add_memory(parser, what: str) -> None:
+    """How much memory there may be."""
+    parser.add_argument(
+        "--memory-limit", type=values.memory, default=0, metavar="SIZE",
+        help=f"such as 8G or 500M; a {what} that needs more is refused (default: what is free)",
+    )  # fmt: skip
+
+
 def add_baseline(parser) -> None:
     """Regression of a comparison."""
     parser.add_argument("--baseline", type=Path, metavar="REPORT",

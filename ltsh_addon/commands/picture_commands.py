@@ -82,10 +82,7 @@ def _add_picture(parser, *, cycles, resolution="as in the file"):
         )  # fmt: skip
     options.add_batch(parser)
     options.add_trust(parser)
-    parser.add_argument(
-        "--memory-limit", type=values.memory, default=0, metavar="SIZE",
-        help="such as 8G or 500M; a picture that needs more is refused (default: what is free)",
-    )  # fmt: skip
+    options.add_memory(parser, "picture")
     options.add_talk(parser)
 
 

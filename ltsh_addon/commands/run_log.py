@@ -11,8 +11,8 @@ class RunLog:
 
     def __init__(self, path: Path | None):
         try:
-            # Whole lines at once: several shards may write to one log.
-            self._file = None if path is None else open(path, "a", encoding="utf-8", buffering=1)
+            # Unbuffered, so that a line is one write, however long: several shards may write to one log.
+            self._file = None if path is None else open(path, "ab", buffering=0)
         except OSError as error:
             raise OSError(f"log {path}: cannot be written ({error.strerror}); choose another with --log") from error
 
@@ -27,4 +27,5 @@ class RunLog:
         """Append a line, with the time."""
         if self._file is not None:
             stamp = datetime.now().astimezone().isoformat(timespec="seconds")
-            self._file.write(f"{stamp} {' '.join(text.split())}\n")
+            # Names of files may hold bytes that are no UTF-8.
+            self._file.write(f"{stamp} {' '.join(text.split())}\n".encode(errors="backslashreplace"))

@@ -42,6 +42,7 @@ class RowWriter:
         self._done += rows
 
     def close(self) -> None:
+        """End the file. Raises ValueError where rows are missing."""
         self._file.close()
         if self._done != self._shape[0]:
             raise ValueError(f"{self._done} rows were written, expected {self._shape[0]}")

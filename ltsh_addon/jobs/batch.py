@@ -61,6 +61,8 @@ def run_tasks(
     from ..blender.processes.child import temporary_folder
 
     compare.prepare(job.options)
+    if job.command == "bake":
+        bake.check_memory(job.options)
     with temporary_folder() as folder, kept_blender(folder):
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)

@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import os
+import shutil
 import sys
 import threading
 import time
@@ -21,28 +22,26 @@ from ..comparison import display_layers
 
 MESSAGE = "LTSH "
 REPORT_SECONDS = 0.1
-# The window of the artist comes first.
-NICENESS = 10
 
 
 class LineProgress(ProgressBar):
-    """Progress as messages on a stream, a few per second; stages are numbered across all commands.
+    """Progress as messages on a stream, a few per second.
 
     `notes` are what the commands had to say besides.
     """
 
     def __init__(self, stream):
         super().__init__(None)
-        self._messages, self._step, self._last = stream, 0, 0.0
+        self._messages, self._last = stream, 0.0
         self.notes: list[str] = []
 
     def __call__(self, stage: str, fraction: float) -> bool:
         now = time.monotonic()
         if stage != self._stage:
-            self._stage, self._last, self._step = stage, 0.0, self._step + 1
+            self._stage, self._last = stage, 0.0
         if fraction >= 1.0 or now - self._last >= REPORT_SECONDS:
             self._last = now
-            self.send({"stage": stage, "fraction": fraction, "step": self._step})
+            self.send({"stage": stage, "fraction": fraction})
         return True
 
     def note(self, text: str) -> None:
@@ -56,10 +55,12 @@ class LineProgress(ProgressBar):
 
 
 def perform(job: dict, stream) -> None:
-    """Run the command lines of job["runs"], each {"arguments", "output", "partial"}, until one fails."""
-    _end_with_parent()
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
+    """Run the command lines of job["runs"], each {"arguments", "output", "partial"}, until one fails; job["temporary"]
+    is the folder of the job."""
+    from ..blender.processes.priority import weigh_session
+
+    _end_with_parent(Path(job["temporary"]))
+    weigh_session()
     progress = LineProgress(stream)
     for run in job["runs"]:
         report, complaint = _command(run["arguments"], progress)
@@ -75,12 +76,14 @@ def perform(job: dict, stream) -> None:
         progress.send({"result": str(folder)})
 
 
-def _end_with_parent() -> None:
-    """End this process as soon as the Blender that started it closes our stdin, or is gone."""
+def _end_with_parent(folder: Path) -> None:
+    """End this process as soon as the Blender that started it closes our stdin, or is gone; its temporary `folder` goes
+    too, since one that was killed cannot remove it."""
 
     def watch():
         while sys.stdin.buffer.read(1):
             pass
+        shutil.rmtree(folder, ignore_errors=True)
         os._exit(3)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -22,7 +22,8 @@ DOUBLE_CHUNK = 4096
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
     """The lobe, approximating BRDF times cosine with F = 1, in sr^-1.
 
-    cos_theta_o (P,), roughness (P,), unit directions (P, S, 3) in the local frame -> (P, S); 0 below the horizon.
+    cos_theta_o and roughness (P,) in [0, 1], unit directions (P, S, 3) in the local frame -> (P, S), float32 if the
+    directions are, else float64; 0 below the horizon. Raises ValueError where the shapes do not fit.
     """
     cosine, roughness, directions = _as_float(cos_theta_o, roughness, directions)
     if directions.ndim != 3 or directions.shape[2] != 3 or directions.shape[0] != cosine.shape[0]:
@@ -50,7 +51,8 @@ def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, s
     returns it as it is. Polygons need not be convex. In a self-intersecting one every part counts as often as the
     boundary winds around it, with that sign: of a figure of eight the difference of its halves remains. A polygon whose
     plane goes through the point has the mean of the limits from both sides, or one of them.
-    Absolute error below 2e-5 in float32, where points that need it are computed in float64.
+    Absolute error below 2e-5 in float32, where points that need it are computed in float64. Raises ValueError where the
+    shapes do not fit.
     """
     cosine, roughness, vertices = _as_float(cos_theta_o, roughness, vertices)
     if vertices.ndim != 3 or vertices.shape[2] != 3 or vertices.shape[1] < 3 or len(vertices) != len(cosine):

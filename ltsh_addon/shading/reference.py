@@ -36,11 +36,13 @@ class PolygonBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
+        """Of polygons (3, V, P) in the local frame."""
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
 
     def take(self, index) -> PolygonBoundary:
+        """Those of the points `index` (Q,)."""
         return PolygonBoundary(self.unit[:, :, index])
 
     def apex(self) -> np.ndarray:
@@ -76,6 +78,7 @@ class EllipseBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, center, half_u, half_v) -> EllipseBoundary:
+        """Of ellipses with centers and half axes (3, P) in the local frame."""
         center, half_u, half_v = (warp.to_original_domain(vector) for vector in (center, half_u, half_v))
         swing = np.hypot(half_u[2], half_v[2])
         ratio = np.divide(-center[2], swing, out=np.where(center[2] > 0.0, -1.0, 1.0), where=swing > 0.0)
@@ -84,6 +87,7 @@ class EllipseBoundary:
     pieces = _ELLIPSE_PIECES + 1
 
     def take(self, index) -> EllipseBoundary:
+        """Those of the points `index` (Q,)."""
         vectors = (self.center[:, index], self.half_u[:, index], self.half_v[:, index])
         return EllipseBoundary(*vectors, self.middle[index], self.reach[index])
 
@@ -133,6 +137,7 @@ class Cone:
     at_foot: np.ndarray  # (P,) points whose lights are best integrated around the axis, where the factor has its tip
 
     def take(self, index) -> Cone:
+        """Those of the points `index` (Q,)."""
         return Cone(self.axis[:, index], self.tangent, self.share, self.at_foot[index])
 
     def factor(self, direction: np.ndarray) -> np.ndarray:

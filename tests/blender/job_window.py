@@ -7,7 +7,7 @@ import bpy
 
 from ltsh_addon.blender.interface import operators
 
-SECONDS = 60
+SECONDS = 300
 
 
 def room(path, width=24, height=16):

@@ -63,10 +63,21 @@ def test_the_option_wins_over_the_environment_and_that_over_the_machine(monkeypa
 @pytest.mark.skipif(bool(bpy.app.binary_path), reason="starts this Python")
 @pytest.mark.parametrize("command", ["shade", "compare"])
 def test_the_estimate_is_what_a_picture_takes(room, tmp_path, command):
-    """The peaks of both processes together, which are not at the same time: from a half to 1.3 of the estimate."""
     width, height = 640, 400
     options = [command, str(room), "-o", str(tmp_path / "out"), "--resolution", f"{width}x{height}", "--quiet"]
     options += ["--techniques", "ltc,ltsh4", *(["--cycles-samples", "2"] if command == "compare" else [])]
+    check_estimate(options, memory.estimate(width * height, 1, 2, command == "compare"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc, and ru_maxrss in KiB")
+@pytest.mark.skipif(bool(bpy.app.binary_path), reason="starts this Python")
+def test_the_estimate_is_what_a_bake_takes(room, tmp_path):
+    options = ["bake", str(room), "-o", str(tmp_path / "out"), "--size", "512", "--quiet", "--techniques", "ltsh4"]
+    check_estimate(options, memory.BakeParts(512 * 512, 6, 512 * 512, False).estimate())
+
+
+def check_estimate(options, needed):
+    """The peaks of both processes together, which are not at the same time: from a half to 1.3 of the estimate."""
     code = (
         "import os, resource, sys\nfrom ltsh_addon import cli\n"
         f"assert cli.main({options!r}) == 0\n"
@@ -78,5 +89,4 @@ def test_the_estimate_is_what_a_picture_takes(room, tmp_path, command):
     environment = {**os.environ, "LTSH_CORES": "1"}
     done = subprocess.run(run, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=True)
     taken = sum(int(number) << 10 for number in done.stdout.splitlines()[-1].split())
-    needed = memory.estimate(width * height, 1, 2, command == "compare")
     assert 0.5 * needed < taken < 1.3 * needed, (taken >> 20, needed >> 20)

@@ -1,17 +1,41 @@
 """The operators that run jobs: their pictures, and what happens when something comes in between."""
 
+import json
+import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
-from job_window import Hand, ended, room
+from job_window import SECONDS, Hand, ended, room
 
 import ltsh_addon
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.interface import job_arguments, operators, results
+from ltsh_addon.blender.interface import job_arguments, job_stages, operators, results
 from ltsh_addon.blender.interface.job import Job
+from ltsh_addon.blender.interface.job_plan import Plan
 from ltsh_addon.blender.processes import blender_process
+
+ROOT = Path(__file__).resolve().parents[2]
+# Runs a job until its first stage, and waits to be killed or cancels it and ends.
+OWNER = """
+import json, sys, time
+sys.path.insert(0, sys.argv[1])
+from ltsh_addon.blender.interface.job import Job, new_folder
+from ltsh_addon.blender.interface.job_plan import Plan, Step
+job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder())
+job.start(json.loads(sys.argv[2]), background=False)
+while not job.finished and job.stage == "Starting":
+    job.poll()
+    time.sleep(0.05)
+print(job._process.pid, job.folder, flush=True)
+if sys.argv[3] == "killed":
+    time.sleep(600)
+job.cancel()
+"""
 
 
 @pytest.fixture
@@ -29,6 +53,24 @@ def never_ends(scene):
     return scene
 
 
+@pytest.fixture
+def reported(monkeypatch):
+    """Stages that jobs report, each as often as it begins."""
+    stages, report = [], Plan.report
+
+    def note(plan, stage, fraction):
+        if stages[-1:] != [stage]:
+            stages.append(stage)
+        report(plan, stage, fraction)
+
+    monkeypatch.setattr(Plan, "report", note)
+    return stages
+
+
+def planned(command):
+    return [step.stage for step in job_stages.steps(bpy.context, command)]
+
+
 def image_pixels(name):
     """Pixels (H, W, 3) of an image, row 0 above."""
     image = bpy.data.images[name]
@@ -42,8 +84,9 @@ def command_line(*arguments):
     assert cli.main([*map(str, arguments), "--quiet"]) == 0
 
 
-def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path):
+def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, reported):
     assert bpy.ops.ltsh.compare() == {"FINISHED"}
+    assert [job_stages.STARTING, *reported] == planned("compare")
     command_line("compare", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltc,ltsh4",
                  "--cycles-samples", "4")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "compare.exr")
@@ -59,9 +102,10 @@ def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path):
     assert files[0].read_bytes() == files[1].read_bytes() and operators.running_job() is None
 
 
-def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path):
+def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, reported):
     scene.ltsh.techniques, scene.ltsh.anti_aliasing, scene.ltsh.resolution_percentage = {"ltsh2"}, 2, 50
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
+    assert [job_stages.STARTING, *reported] == planned("shade")
     command_line("shade", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltsh2", "--aa", "2",
                  "--resolution", "12x8")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "shade.exr")["ltsh2.diffuse"]
@@ -69,7 +113,10 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path):
     np.testing.assert_array_equal(image_pixels("LTSH ltsh2.diffuse"), expected)
     bpy.data.objects["Floor"].select_set(True)
     scene.ltsh.bake_view, scene.ltsh.bake_passes = "above", {"specular"}
+    reported.clear()
     assert bpy.ops.ltsh.bake() == {"FINISHED"}
+    # Materials without textures need no maps.
+    assert [job_stages.STARTING, *reported] == [stage for stage in planned("bake") if stage != "bake Floor"]
     command_line("bake", tmp_path / "room.blend", "-o", tmp_path / "out", "--object", "Floor", "--size", "256",
                  "--margin", "2", "--view", "above", "--passes", "specular", "--techniques", "ltsh2")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "Floor.exr")["ltsh2.specular"]
@@ -130,6 +177,40 @@ def test_opening_another_file_ends_the_job(never_ends, tmp_path):
     assert results.result_of(bpy.context.scene) is None
 
 
+@pytest.mark.parametrize("end", ["killed", "quit"])
+def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends, tmp_path, end):
+    """The job belongs to another process here, which stands for that Blender."""
+    runs = job_arguments.runs(bpy.context, "compare", tmp_path / "room.blend")
+    owner = subprocess.Popen(
+        [sys.executable, "-c", OWNER, str(ROOT), json.dumps(runs), end], stdout=subprocess.PIPE, text=True
+    )
+    with owner:
+        pid, folder = owner.stdout.readline().split(" ", 1)
+        if end == "killed":
+            assert Path(folder.strip()).is_dir()
+            owner.kill()
+    # One that quits has waited for it.
+    seconds = SECONDS if end == "killed" else 0.0
+    assert ends(lambda: not Path(folder.strip()).exists(), seconds) and ends(lambda: not is_running(int(pid)), seconds)
+
+
+def ends(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+def is_running(pid):
+    """A process that has ended stays in the list as long as nobody has asked for its exit code."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
 def test_disabling_the_add_on_ends_the_job(never_ends):
     hand = Hand().start()
     job = operators.running_job()
@@ -178,7 +259,7 @@ def test_a_process_that_dies_is_told(scene):
 
 
 def test_a_blender_that_cannot_be_started_is_told(scene, monkeypatch):
-    def fail(*arguments):
+    def fail(*arguments, **options):
         raise OSError("no more processes")
 
     monkeypatch.setattr(blender_process, "start", fail)

@@ -11,6 +11,7 @@ from recorded_layout import FUNCTIONS, Layout, buttons, drawn, texts
 import ltsh_addon
 from ltsh_addon.blender.interface import availability, image_panels, operators, panels, results, viewer
 from ltsh_addon.blender.interface.job import Job
+from ltsh_addon.blender.interface.job_plan import Plan, Step
 from ltsh_addon.comparison import display_layers
 from ltsh_addon.imaging.exr import write_channels
 
@@ -135,7 +136,7 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, width):
                     drawn(panel, function, width)
 
     draw_all()
-    operators._running["job"] = Job("Compare with Cycles", 9, tmp_path, stage="Cycles A", fraction=0.25)
+    operators._running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path)
     draw_all()
     operators._running["job"] = None
     for partial in ("Not complete: without Cycles", ""):
@@ -197,12 +198,15 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
 
 
 def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
-    operators._running["job"] = Job("Compare with Cycles", 9, tmp_path, stage="Cycles A", fraction=0.25, step=3)
+    plan = Plan([Step("samples", 30.0), Step("Cycles A", 100.0)])
+    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path)
+    job._take({"stage": "Cycles A", "fraction": 0.25})
+    plan._share = 0.25
     shown = drawn(MAIN_3D)
     assert buttons(shown) == {"ltsh.cancel": True}
     (progress,) = [item.what for item in shown if item.kind == "progress"]
-    assert progress.startswith("Cycles, First Half  25 %")
-    assert "Compare with Cycles" in texts(shown) and "Step 3 / 9" in texts(shown)
+    assert progress.startswith("25 %")
+    assert {"Compare with Cycles", "Cycles, First Half", "2 / 2"} <= {item.what for item in shown}
 
 
 def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):

@@ -18,7 +18,7 @@ from hands import (
 )
 
 SIZE = "1600x900"
-SECONDS = 600
+SECONDS = 1500
 
 
 def main(rig):
@@ -41,7 +41,7 @@ def cancelled(rig):
     yield from until(lambda: job() is not None)
     rig.check(job() is not None, "a click on Compare with Cycles starts a job")
     pulse = Pulse()
-    yield from until(lambda: job() is None or job().results, 120)
+    yield from until(lambda: job() is None or job().results, 400)
     yield 1.0
     pulse.stop(rig, "until the first pictures are there")
     rig.shot("2_running.png")
@@ -72,7 +72,7 @@ def finished(rig):
     yield from until(lambda: job() is not None)
     rig.check(job() is not None, "a second comparison starts")
     pulse = Pulse()
-    yield from wait_for_job(rig, 400)
+    yield from wait_for_job(rig, 900)
     pulse.stop(rig, "while a comparison runs")
     names = {image.name for image in bpy.data.images}
     rig.check({"LTSH ltsh4.combined", "LTSH cycles.combined", "LTSH error_ltsh4.combined"} <= names,

@@ -34,7 +34,8 @@ def main(rig):
     rig.shot("3_narrow.png")
     settings().mode = "ERROR"
     bpy.context.preferences.view.ui_scale = 2.0
-    yield 2
+    # Panels move to their new places, slowly on a busy machine.
+    yield 6
     rig.shot("4_twice_the_scale.png")
     bpy.context.preferences.view.ui_scale = 1.0
     rig.area("PROPERTIES").spaces.active.context = "RENDER"

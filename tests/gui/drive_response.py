@@ -1,10 +1,12 @@
-"""The window answers while a comparison of 1920 x 1080 pixels runs."""
+"""The window answers while a comparison of 1920 x 1080 pixels is started, runs, and is looked at."""
 
 import bpy
-from hands import Pulse, job, settings, wait_for_job
+from hands import COMPARE, Pulse, click_button, job, keys, over, settings, until, wait_for_job
 
-SECONDS = 900
-LONGEST_WORK = 0.2  # seconds
+SECONDS = 1800
+LONGEST = 0.2  # seconds, beside drawing: the graphics driver may be a program, and the machine may be busy
+
+DRAWINGS = 5
 
 
 def main(rig):
@@ -12,25 +14,51 @@ def main(rig):
     rig.panel()
     yield 1
     rig.tab("LTSH")
-    yield 3
-    idle = Pulse()
-    yield 5
-    idle.stop(rig, "idle")
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 1920, 1080
     settings().techniques, settings().cycles_samples = {"ltc", "ltsh4"}, 4
-    yield 1
-    start = Pulse()
-    with rig.override():
-        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield 2
-    start.stop(rig, "start of the job")
+    yield 4
     pulse = Pulse()
-    yield from wait_for_job(rig, 500)
-    pulse.stop(rig, "1080p")
-    rig.check(job() is None and "LTSH cycles.combined" in bpy.data.images, "the comparison is there")
-    rig.check(pulse.longest_work < LONGEST_WORK, f"the main thread never works for {LONGEST_WORK} s at a stretch")
-    shown = Pulse()
+    yield 5
+    pulse.stop(rig, "idle")
+    drawing = yield from drawn(rig)
+    pulses = []
+    for what in ("click", "click with results of 1080p"):
+        pulse = Pulse()
+        yield from click_button(rig, COMPARE)
+        yield from until(lambda: job() is not None)
+        yield 0.5
+        pulses.append(pulse.stop(rig, what))
+        if pulse is pulses[0]:
+            running = Pulse()
+            yield from wait_for_job(rig, 1200)
+            pulses.append(running.stop(rig, "job"))
+            rig.check(job() is None and "LTSH cycles.combined" in bpy.data.images, "the comparison is there")
+            yield 2
+    yield from over(rig)
+    pulse = Pulse()
+    yield from keys(rig, "Escape")
+    yield from until(lambda: job() is None)
+    pulses.append(pulse.stop(rig, "Esc"))
+    rig.check(job() is None, "Esc ends the job")
+    pulse = Pulse()
     settings().split = 0.3
     yield 3
-    shown.stop(rig, "moving the wipe at 1080p")
+    pulses.append(pulse.stop(rig, "moving the wipe"))
+    rig.check(max(pulse.longest_work for pulse in pulses) < LONGEST, f"the main thread never works for {LONGEST} s")
+    # The last one draws a new picture, in the view and on the graphics card.
+    longest = max(pulse.longest for pulse in pulses[:-1]) - drawing
+    rig.check(longest < LONGEST, f"the window answers within {LONGEST} s and the time to draw it")
     rig.shot("1080p.png")
+
+
+def drawn(rig):
+    """Seconds for which the window does not answer when it is drawn as a whole, the longest of some."""
+    longest = 0.0
+    for _ in range(DRAWINGS):
+        pulse = Pulse()
+        yield 0.2
+        rig.redraw()
+        yield 1.5
+        longest = max(longest, pulse.stop(rig, "").longest)
+    rig.fact("drawing the window: longest pause, s", round(longest, 3))
+    return longest

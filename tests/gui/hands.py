@@ -8,7 +8,7 @@ import bpy
 ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
 CLICK_SECONDS = 0.6
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
-MANUAL, SHADE, COMPARE, PREVIEW, CANCEL = (60, 15), (142, 257), (142, 290), (142, 322), (94, 94)
+MANUAL, SHADE, COMPARE, PREVIEW, CANCEL = (60, 15), (142, 257), (142, 290), (142, 322), (142, 119)
 
 
 def module(name):
@@ -100,23 +100,31 @@ def wait_for_job(rig, seconds, shots=()):
 class Pulse:
     """How long the window did not answer, by a timer of Blender's own event loop.
 
-    `longest` is the longest time between two calls; `longest_work` the most that Blender's main thread itself worked
-    in between, which does not depend on what else the machine does.
+    `longest` is the longest time between two calls and `at` the stage of the job then; `longest_work` is the most that
+    Blender's main thread itself worked in between, which does not depend on what else the machine does.
     """
 
     def __init__(self):
-        self.longest = self.longest_work = 0.0
-        self._on, self._last, self._worked = True, time.monotonic(), time.thread_time()
+        self.longest, self.longest_work, self.at, self._calls, self._on = 0.0, 0.0, "", 0, True
+        self._last, self._worked = time.monotonic(), time.thread_time()
         bpy.app.timers.register(self._tick, first_interval=0.0)
 
     def _tick(self):
         now, worked = time.monotonic(), time.thread_time()
-        self.longest, self._last = max(self.longest, now - self._last), now
-        self.longest_work, self._worked = max(self.longest_work, worked - self._worked), worked
+        self._calls += 1
+        if now - self._last > self.longest:
+            self.longest, self.at = now - self._last, job().stage if job() is not None else ""
+        self.longest_work = max(self.longest_work, worked - self._worked)
+        self._last, self._worked = now, worked
         return 0.01 if self._on else None
 
     def stop(self, rig, what):
-        """Note both as facts."""
+        """Note what was found as facts, but for nameless ones."""
         self._on = False
-        rig.fact(f"{what}: longest pause, s", round(self.longest, 3))
+        if not what:
+            return self
+        rig.check(self._calls > 1, f"{what}: the window answered")
+        at = f" ({self.at})" if self.at else ""
+        rig.fact(f"{what}: longest pause{at}, s", round(self.longest, 3))
         rig.fact(f"{what}: longest work of the main thread, s", round(self.longest_work, 3))
+        return self

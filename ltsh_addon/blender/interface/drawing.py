@@ -8,8 +8,9 @@ from gpu_extras.batch import batch_for_shader
 
 FONT = 0
 TEXT_SIZE = 11.0
-# Readable on any picture and in any theme.
-INK, PAPER, LINE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
+# Readable on any picture and in any theme. Blender blends linear colors: a thinner plate is pale on a white picture.
+INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
+PAPER, LINE = (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
 
 
 def draw_rectangle(left: float, bottom: float, right: float, top: float, color) -> None:
@@ -52,5 +53,5 @@ def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) 
     pad, height = 6.0 * scale, 20.0 * scale
     width = text_width(text, scale) + 2.0 * pad
     left = x - align * width
-    draw_rectangle(left, y, left + width, y + height, PAPER)
+    draw_rectangle(left, y, left + width, y + height, PLATE)
     draw_text(left + pad, y + 6.0 * scale, text, scale)

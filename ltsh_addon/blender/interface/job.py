@@ -18,10 +18,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..processes import blender_process
+from .job_plan import Plan
 
 SCRIPT = Path(__file__).resolve().parents[2] / "jobs" / "job_worker.py"
 MESSAGE = "LTSH "
 ENDING_SECONDS = 10.0
+STARTING = "Starting"
+SURE_SECONDS = 3.0  # before, nobody knows how long it will take
 
 
 @dataclass
@@ -32,24 +35,24 @@ class Job:
     """
 
     title: str
-    steps: int  # as far as can be told before
+    plan: Plan
     folder: Path  # temporary, removed at the end
-    stage: str = "Starting"
-    fraction: float = 0.0
-    step: int = 0
+    stage: str = STARTING
     results: list[Path] = field(default_factory=list)
     error: str = ""
     finished: bool = False
     cancelled: bool = False
     started: float = field(default_factory=time.monotonic)
-    stage_started: float = field(default_factory=time.monotonic)
 
-    def start(self, runs: list[dict]) -> None:
-        """Start the process on command lines (see `job_steps.perform`). Raises SceneError and OSError."""
+    def start(self, runs: list[dict], *, background: bool) -> None:
+        """Start the process on command lines (see `job_steps.perform`); one in the `background` comes after this one.
+        Raises SceneError and OSError."""
         job = self.folder / "job.json"
-        job.write_text(json.dumps({"runs": runs, "path": _library_folders()}), encoding="utf-8")
+        document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
+        job.write_text(json.dumps(document), encoding="utf-8")
         self._messages: queue.SimpleQueue = queue.SimpleQueue()
-        self._process = blender_process.start(blender_process.child_command(job, SCRIPT), self.folder)
+        command = blender_process.child_command(job, SCRIPT)
+        self._process = blender_process.start(command, self.folder, background=background)
         threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
 
     def _listen(self) -> None:
@@ -82,9 +85,8 @@ class Job:
 
     def _take(self, message: dict) -> None:
         if "stage" in message:
-            if message["stage"] != self.stage:
-                self.stage, self.stage_started = message["stage"], time.monotonic()
-            self.fraction, self.step = min(max(float(message["fraction"]), 0.0), 1.0), message["step"]
+            self.stage = message["stage"]
+            self.plan.report(self.stage, float(message["fraction"]))
         elif "result" in message:
             self.results.append(Path(message["result"]))
         elif "error" in message:
@@ -104,7 +106,8 @@ class Job:
         if self.finished:
             return
         self.finished = self.cancelled = True
-        threading.Thread(target=self._end, name="ltsh-job-end", daemon=True).start()
+        # No daemon: a Blender that quits now waits for it.
+        threading.Thread(target=self._end, name="ltsh-job-end").start()
 
     def _end(self) -> None:
         # What the process has started itself ends with it: each of them reads the other end of a pipe.
@@ -130,11 +133,8 @@ class Job:
     # -- what is shown ------------------------------------------------------------------------------------------------
 
     def seconds_left(self) -> float | None:
-        """Of this stage; None where nothing can be said yet."""
-        elapsed = time.monotonic() - self.stage_started
-        if elapsed < 1.0 or not 0.02 <= self.fraction < 1.0:
-            return None
-        return elapsed / self.fraction - elapsed
+        """Until the end; None where nothing can be said yet."""
+        return None if self.seconds() < SURE_SECONDS else self.plan.seconds_left()
 
     def seconds(self) -> float:
         """Since the start."""

@@ -77,17 +77,3 @@ def output_folder(scene, command: str) -> Path:
     if len(bpy.data.scenes) > 1:
         root /= bpy.path.clean_name(scene.name)
     return root / command
-
-
-def step_count(context, command: str) -> int:
-    """How many stages a job has."""
-    settings = context.scene.ltsh
-    techniques = chosen(settings, "techniques")
-    if command == "bake":
-        return 0
-    extraction, ending = 2, 2  # the scene is opened and sampled; files and pictures are written
-    shading = extraction + len(techniques) + ending
-    if command == "shade":
-        return shading
-    early = [name for name in techniques if name != REFERENCE]
-    return shading + 2 + (extraction + len(early) + ending if early else 0)

@@ -10,20 +10,13 @@ import bpy
 from bpy.app.translations import pgettext_iface as translated
 
 from ..processes.blender_process import SceneError
-from . import job_arguments, preflight, results, viewer
+from . import job_arguments, job_stages, preflight, results, viewer
 from .job import Job, clock, new_folder
+from .job_plan import Plan
+from .scene_copy import save_scene_copy
 
 TIMER_SECONDS = 0.1
 PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
-# What stages of the command line are called here; others keep their names.
-STAGES = {
-    "open scene": "Open Scene",
-    "samples": "Sample Surfaces",
-    "Cycles A": "Cycles, First Half",
-    "Cycles B": "Cycles, Second Half",
-    "write": "Write Files",
-    "images": "Make Pictures",
-}
 _running: dict = {"job": None}
 
 
@@ -106,12 +99,13 @@ class _JobOperator:
             self.report({"ERROR"}, reason)
             return False
         folder = new_folder()
-        job = Job(self.bl_label, job_arguments.step_count(context, self.command), folder)
+        job = Job(self.bl_label, Plan(job_stages.steps(context, self.command)), folder)
         try:
             copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
-            bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True, compress=False)
+            save_scene_copy(copy)
             self._output = job_arguments.output_folder(context.scene, self.command)
-            job.start(job_arguments.runs(context, self.command, copy))
+            runs = job_arguments.runs(context, self.command, copy)
+            job.start(runs, background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
             self.report({"ERROR"}, " ".join(str(error).split()))
@@ -122,8 +116,9 @@ class _JobOperator:
 
     def _show_progress(self, context) -> None:
         """Draw progress again where it has changed, at most a few times per second."""
-        text = f"{self._job.title}: {progress_text(self._job)}    {translated('Esc')}: {translated('Cancel')}"
-        shown = text, clock(self._job.seconds())
+        job = self._job
+        text = f"{job.title}: {stage_title(job)}  {progress_text(job)}    {translated('Esc')}: {translated('Cancel')}"
+        shown = text, clock(job.seconds())
         if shown != self._progress:
             self._progress = shown
             context.workspace.status_text_set(text)
@@ -219,9 +214,14 @@ class LTSH_OT_cancel(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def stage_title(job: Job) -> str:
+    """What the job does now."""
+    return translated(job_stages.TITLES.get(job.stage, job.stage))
+
+
 def progress_text(job: Job) -> str:
-    """Stage, percent and time left in a few words."""
-    text = f"{translated(STAGES.get(job.stage, job.stage))}  {100.0 * job.fraction:.0f} %"
+    """Percent and time left of the whole job."""
+    text = f"{100.0 * job.plan.share():.0f} %"
     left = job.seconds_left()
     return text if left is None else f"{text}, {clock(left)} {translated('left')}"
 

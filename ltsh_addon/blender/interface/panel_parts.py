@@ -81,13 +81,12 @@ def draw_job(layout) -> bool:
     row = column.row()
     row.label(text=job.title, icon="RENDER_STILL")
     _draw_right(row, clock(job.seconds()))
-    column.progress(factor=job.fraction, text=operators.progress_text(job))
+    column.progress(factor=job.plan.share(), text=operators.progress_text(job))
     row = column.row()
-    step = row.row()
-    step.active = False
-    of = f" / {job.steps}" if job.steps else ""
-    step.label(text=f"{translated('Step')} {min(job.step, job.steps or job.step)}{of}", translate=False)
-    row.operator("ltsh.cancel", text="Cancel", icon="X")
+    row.active = False
+    row.label(text=operators.stage_title(job), translate=False)
+    _draw_right(row, f"{job.plan.number} / {job.plan.count}")
+    column.operator("ltsh.cancel", text="Cancel", icon="X")
     return True
 
 

@@ -91,8 +91,8 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
         if missing:
             layout.label(text=missing, icon="ERROR", translate=False)
         limits = layout.column(align=True)
-        limits.prop(self, "cores")
-        limits.prop(self, "memory_mib", text="Memory Limit (MiB)")
+        limits.prop(self, "cores", text="Processor Cores (0: All)")
+        limits.prop(self, "memory_mib", text="Memory Limit, MiB (0: All Free)")
         layout.prop(self, "output_folder", placeholder=str(default_output_folder()))
         layout.prop(self, "log_level")
 

@@ -5,6 +5,7 @@ It is an image like any other, so that exposure, view transform, zoom and scopes
 
 from __future__ import annotations
 
+import contextlib
 import logging
 
 import bpy
@@ -17,7 +18,7 @@ from . import results
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set()}
+_state = {"lookup": None, "settling": set(), "kept": False}
 
 
 def changed(settings, context) -> None:
@@ -159,10 +160,20 @@ def redraw_image_editors() -> None:
                 area.tag_redraw()
 
 
+@contextlib.contextmanager
+def kept_as_it_is():
+    """Meanwhile saving leaves the images alone: for a copy that no artist opens, in which they do not matter."""
+    _state["kept"] = True
+    try:
+        yield
+    finally:
+        _state["kept"] = False
+
+
 @bpy.app.handlers.persistent
 def _shrink(*_):
     """Before saving: pixels that can be made again have no place in the file."""
-    for scene in bpy.data.scenes:
+    for scene in bpy.data.scenes if not _state["kept"] else ():
         for image in results.our_images(scene):
             if is_viewer(image) and results.result_of(scene) is not None:
                 _store(image, np.zeros((4, 4, 4), dtype=np.float32), image.use_view_as_render)
@@ -172,6 +183,8 @@ def _shrink(*_):
 @bpy.app.handlers.persistent
 def _restore(*_):
     """After saving and loading."""
+    if _state["kept"]:
+        return
     for scene in bpy.data.scenes:
         if any(is_viewer(image) for image in results.our_images(scene)):
             refresh(scene)

@@ -19,6 +19,7 @@ from contextvars import ContextVar
 from pathlib import Path
 
 from ...scene import Cancelled
+from . import priority
 
 WORKER = Path(__file__).with_name("worker.py")
 OUTPUT_LINES_KEPT = 12
@@ -59,9 +60,12 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
     return [sys.executable, str(script), str(job)]
 
 
-def start(command: list[str], folder: Path) -> subprocess.Popen:
-    """`command` as a process whose own files go to `folder`; the end of its stdin tells it that we are gone."""
-    return subprocess.Popen(
+def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
+    """`command` as a process whose own files go to `folder`; the end of its stdin tells it that we are gone.
+
+    One in the `background` comes after this process wherever both want the processor.
+    """
+    process = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -80,7 +84,11 @@ def start(command: list[str], folder: Path) -> subprocess.Popen:
         },
         # Ctrl-C goes to the parent alone, which ends the child.
         start_new_session=True,
+        **(priority.background_options() if background else {}),
     )
+    if background:
+        priority.yield_to_us(process.pid)
+    return process
 
 
 class BlenderProcess:

@@ -1,8 +1,9 @@
-"""How much memory a picture takes, estimated before it is begun, and how much there may be. Needs no bpy."""
+"""How much memory a picture or a bake takes, estimated before it is begun, and how much there may be. Needs no bpy."""
 
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 from .blender_process import SceneError
@@ -13,6 +14,9 @@ MIB = 1 << 20
 # Measured on 4.5 and 5.2 at 1280 x 800: bytes per pixel of this process and of Blender together.
 _PIXEL, _SUB_SAMPLE, _TECHNIQUE = 1000, 400, 40
 _COMPARED, _COMPARED_TECHNIQUE = 110, 130
+# Of a bake, at 512 x 512: bytes per texel of a block, of each of its channels, beside Cycles, and of the rows between
+# which margins are filled.
+_TEXEL, _CHANNEL, _COMPARED_TEXEL, _MARGIN_TEXEL = 620, 15, 370, 40
 # Numpy, Blender and the loaded libraries.
 _PROCESSES = 400 * MIB
 
@@ -23,6 +27,28 @@ def estimate(pixels: int, sub_samples: int, techniques: int, compared: bool) -> 
     if compared:
         each += _COMPARED + _COMPARED_TECHNIQUE * techniques
     return _PROCESSES + pixels * each
+
+
+@dataclass(frozen=True)
+class BakeParts:
+    """What of a bake is in memory at a time."""
+
+    texels: int  # that are shaded, by all cores
+    channels: int  # of the techniques
+    margin_texels: int  # between whose rows margins are filled
+    compared: bool  # beside Cycles
+
+    def shading(self) -> int:
+        """Bytes of what is shaded."""
+        return self.texels * (_TEXEL + _CHANNEL * self.channels + _COMPARED_TEXEL * self.compared)
+
+    def margin(self) -> int:
+        """Bytes of what is written."""
+        return self.margin_texels * _MARGIN_TEXEL
+
+    def estimate(self) -> int:
+        """Bytes that the bake takes at least: surfaces of one lobe, no geometry, no textures."""
+        return _PROCESSES + max(self.shading(), self.margin())
 
 
 def limit(wanted_mib: int = 0) -> int | None:
@@ -53,6 +79,18 @@ def check(width: int, height: int, sub_samples: int, techniques: int, compared: 
     raise SceneError(
         f"a picture of {width}x{height} pixels{points} takes about {size(needed)} of memory, {size(allowed)} may be "
         f"used: reduce --resolution{' or --aa' if sub_samples > 1 else ''}, or raise --memory-limit"
+    )
+
+
+def check_bake(what: str, parts: BakeParts, wanted_mib: int = 0) -> None:
+    """Raise SceneError where a bake of `what` needs more than there may be."""
+    needed, allowed = parts.estimate(), limit(wanted_mib)
+    if allowed is None or needed <= allowed:
+        return
+    remedy = "--margin" if parts.margin() > parts.shading() else "--size below 512, or the cores (LTSH_CORES)"
+    raise SceneError(
+        f"a bake of {what} takes about {size(needed)} of memory, {size(allowed)} may be used: reduce {remedy}, or "
+        "raise --memory-limit"
     )
 
 

@@ -97,6 +97,7 @@ def main() -> int:
     job_path = Path(sys.argv[-1])
     # Running a script puts its own folder first, where `lights` and others would be found as top-level modules.
     sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
+    _module("processes.priority").weigh_session()
     jobs: queue.SimpleQueue = queue.SimpleQueue()
     temporary: list[Path] = []
     job = json.loads(job_path.read_text(encoding="utf-8"))

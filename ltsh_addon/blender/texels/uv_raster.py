@@ -234,7 +234,8 @@ def _nearest_on_sides(corners, points):
     return best
 
 
-def cross(u, v):
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Cross products (...) of vectors (..., 2) in a plane."""
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 

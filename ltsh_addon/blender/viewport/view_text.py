@@ -9,7 +9,7 @@ import blf
 import bpy
 
 from ..engine.view_properties import ENGINE
-from ..interface.drawing import PAPER, draw_rectangle
+from ..interface.drawing import PLATE, draw_rectangle
 
 MOST_NOTES = 4
 FEWEST_LETTERS = 20  # no line is broken into shorter ones
@@ -117,7 +117,7 @@ def _write(font: int, text: str, x: float, y: float, size: float, color) -> None
     if not text:
         return
     width = blf.dimensions(font, text)[0]
-    draw_rectangle(x - 0.5 * size, y - 0.35 * size, x + width + 0.5 * size, y + 1.05 * size, PAPER)
+    draw_rectangle(x - 0.5 * size, y - 0.35 * size, x + width + 0.5 * size, y + 1.05 * size, PLATE)
     blf.color(font, *color)
     blf.position(font, round(x), round(y), 0.0)
     blf.draw(font, text)

@@ -1,0 +1,93 @@
+"""How far a job is as a whole, by the stages that it reports, with a clock that the tests turn."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ltsh_addon.blender.interface.job_plan import MOST, PRIOR_SECONDS, Plan, Step
+
+STAGES = ("open", "samples", "A", "B", "images")
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+def plan_of(*costs, stages=STAGES):
+    clock = Clock()
+    return Plan([Step(stage, cost) for stage, cost in zip(stages, costs, strict=False)], clock), clock
+
+
+@given(
+    costs=st.lists(st.floats(0.0, 1e3), min_size=5, max_size=5),
+    reports=st.lists(
+        st.tuples(st.sampled_from([*STAGES, "?"]), st.floats(-0.5, 1.5), st.floats(0.0, 1e3)), max_size=30
+    ),
+)
+def test_the_share_that_is_done_never_falls_whatever_is_reported(costs, reports):
+    plan, clock = plan_of(*costs)
+    shares, numbers = [0.0], [1]
+    for stage, fraction, seconds in reports:
+        plan.report(stage, fraction)
+        shares.append(plan.share())
+        clock.now += seconds
+        shares.append(plan.share())
+        numbers.append(plan.number)
+        assert 0.0 <= plan.seconds_left() < float("inf")
+    assert shares == sorted(shares) and shares[-1] <= MOST
+    assert numbers == sorted(numbers) and numbers[-1] <= plan.count == 5
+
+
+def test_a_job_that_takes_what_was_expected_goes_on_evenly():
+    plan, clock = plan_of(10.0, 30.0, 40.0, 20.0)
+    for stage, cost in zip(STAGES, (10.0, 30.0, 40.0, 20.0), strict=False):
+        plan.report(stage, 0.0)
+        for tenth in range(1, 10):
+            clock.now += cost / 10.0
+            plan.report(stage, tenth / 10.0)
+            done = clock.now - 100.0
+            assert plan.share() == pytest.approx(done / 100.0, abs=1e-9)
+            assert plan.seconds_left() == pytest.approx(100.0 - done, abs=1e-9)
+        clock.now += cost / 10.0
+
+
+def test_a_stage_that_reports_nothing_goes_on_and_does_not_end():
+    plan, clock = plan_of(10.0, 10.0)
+    plan.report("open", 0.0)
+    shares = []
+    for clock.now in range(101, 200):
+        shares.append(plan.share())
+    assert all(later > earlier for earlier, later in itertools.pairwise(shares))
+    assert shares[4] > 0.2 and plan.seconds_left() > 10.0
+
+
+def test_a_machine_that_is_slower_makes_the_rest_longer():
+    plan, clock = plan_of(10.0, 10.0, 10.0)
+    clock.now += 40.0
+    plan.report("samples", 0.0)
+    pace = (40.0 + PRIOR_SECONDS) / (10.0 + PRIOR_SECONDS)
+    assert plan.seconds_left() == pytest.approx(20.0 * pace)
+
+
+def test_a_stage_that_comes_again_is_expected_to_take_as_long_again():
+    plan, clock = plan_of(1.0, 5.0, 1.0, 5.0, stages=("open", "samples", "open", "samples"))
+    clock.now += 2.0
+    plan.report("samples", 0.0)
+    clock.now += 30.0
+    plan.report("open", 0.0)
+    assert plan.number == 3 and plan.seconds_left() == pytest.approx(32.0)
+
+
+def test_stages_that_are_left_out_are_passed_over_and_unknown_ones_change_nothing():
+    plan, _ = plan_of(1.0, 1.0, 1.0, 1.0, 1.0)
+    plan.report("B", 0.0)
+    assert plan.number == 4
+    for stage in ("samples", "something else"):
+        plan.report(stage, 0.5)
+        assert plan.number == 4

@@ -45,6 +45,7 @@ class AreaLight:
     corners: np.ndarray | None = None  # (V, 3) m, a simple polygon, either way around; POLYGON only
     spread: float = np.pi  # rad, full angle of the cone into which the light shines
     receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
+    detail: tuple[AreaLight, ...] = ()
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -71,6 +72,13 @@ class AreaLight:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape POLYGON")
         if self.receivers is not None:
             object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
+        detail = tuple(part if isinstance(part, AreaLight) else AreaLight(**part) for part in self.detail)
+        object.__setattr__(self, "detail", detail)
+
+    @property
+    def patches(self) -> tuple[AreaLight, ...]:
+        """The lights without a detail that together are this one; itself where it has none."""
+        return tuple(patch for part in self.detail for patch in part.patches) if self.detail else (self,)
 
     @property
     def is_round(self) -> bool:

@@ -61,7 +61,7 @@ def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("spe
     assert all(isinstance(version, str) and version for version in report["versions"].values())
     assert set(report["tables"]) == set(techniques)
     for light in report["lights"]:
-        assert set(light) == {"name", "shape", "group", "radiance"} and len(light["radiance"]) == 3
+        assert set(light) == {"name", "shape", "group", "radiance", "patches"} and len(light["radiance"]) == 3
     assert list(report["passes"]) == list(passes)
     for figures in report["passes"].values():
         assert list(figures["techniques"]) == list(techniques)
@@ -89,7 +89,7 @@ def test_the_report_has_its_schema_and_is_the_file(child, tmp_path):
     assert on_disk["warnings"] == [fake_scene.WARNING] and on_disk["sub_samples"] == 2
     assert on_disk["surface_samples"] == 35 and on_disk["cycles_samples"] == 64
     assert on_disk["lights"][1] == {
-        "name": "Light 1", "shape": "SQUARE", "group": "Fill.001", "radiance": [3.0, 3.0, 1.0]
+        "name": "Light 1", "shape": "SQUARE", "group": "Fill.001", "radiance": [3.0, 3.0, 1.0], "patches": 1
     }  # fmt: skip
     asked = child.asked[0]
     assert (asked.frame, asked.camera, asked.sub_samples, asked.cycles_samples) == (3, "Side", 2, 64)

@@ -94,10 +94,7 @@ class Comparison:
             "sub_samples": self.film.sub_samples,
             "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
-            "lights": [
-                {"name": light.name, "shape": light.shape, "group": light.group, "radiance": light.radiance.tolist()}
-                for light in extraction.lights
-            ],
+            "lights": [_light_report(light) for light in extraction.lights],
             "versions": compare.versions(extraction.blender_version),
             "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
@@ -258,3 +255,14 @@ def _caption(report: dict) -> list[str]:
     if "against_reference" in report:
         lines.append(f"against reference {percent(report['against_reference']['relative_l2'])}")
     return lines
+
+
+def _light_report(light) -> dict:
+    """What report.json says about `light`; `radiance` is the mean of its patches."""
+    return {
+        "name": light.name,
+        "shape": light.shape,
+        "group": light.group,
+        "radiance": light.radiance.tolist(),
+        "patches": len(light.patches),
+    }

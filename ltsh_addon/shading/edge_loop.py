@@ -1,17 +1,18 @@
 """The edge loop of the hot path: integrals of degree 1 to 4 over spherical polygons, in preallocated float32 arrays.
 
-The same moments as `edge_integrals.moments`, from the cosines of the edges instead of the sums of their ends, and
-without any branch. Points where that is not accurate in single precision are reported: the caller computes them again
-in double precision.
+The moments of `edge_integrals`, as coefficients of forms, from the cosines of the edges instead of the sums of their
+ends, and without any branch. Points where that is not accurate in single precision are reported: the caller computes
+them again in double precision.
 """
 
 from __future__ import annotations
 
-from functools import cache
 from math import prod
 
 import numpy as np
 
+from .arc_polynomials import ArcFactors, phi_of
+from .edge_integrals import RIDGE_DIRECTIONS
 from .spherical_harmonics import coefficient_count
 
 MAX_DEGREE = 4
@@ -25,9 +26,10 @@ NEAREST_SAFE = 0.01
 LARGEST_SAFE_ANGLE = 5.9
 # Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
 MANY_CORNERS = 64
+# Corners of the polygons whose moments are computed at a time: their arrays stay in a second-level cache of 1 MiB.
+PIECE_CORNERS = 24624
 VIEWS_KEPT = 1000
 _TINY = np.float32(1e-30)
-_PHI_DEGREE, _PSI_DEGREE = 7, 8
 
 
 class Scratch:
@@ -52,44 +54,6 @@ class Scratch:
             self._views.clear()
         view = self._views[name, shape] = array[:size].reshape(shape)
         return view
-
-
-@cache
-def _arc_polynomials() -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients in s = sqrt(1 + cos theta), highest power first, of s theta / sin(theta) and of s psi.
-
-    psi = (theta / sin(theta) - 1) / (1 - cos theta). Interpolated at Chebyshev points; relative errors 8e-7 and 6e-7.
-    """
-
-    def phi(s):
-        return s * _phi(s)
-
-    def psi(s):
-        rest = 2.0 - s * s
-        small = rest < 1e-3
-        return s * np.where(small, 1.0 / 3.0 + 2.0 / 15.0 * rest, (_phi(s) - 1.0) / np.where(small, 1.0, rest))
-
-    domain = [0.0, np.sqrt(2.0)]
-    fits = [
-        np.polynomial.Chebyshev.interpolate(function, degree, domain=domain).convert(kind=np.polynomial.Polynomial)
-        for function, degree in ((phi, _PHI_DEGREE), (psi, _PSI_DEGREE))
-    ]
-    return tuple(fit.coef[::-1].astype(np.float32) for fit in fits)
-
-
-def _phi(s):
-    cosine = np.clip(s * s - 1.0, -1.0, 1.0)
-    theta = 2.0 * np.arctan2(np.sqrt(1.0 - cosine), np.sqrt(1.0 + cosine))
-    return np.where(theta > 0.0, theta / np.where(theta > 0.0, np.sin(theta), 1.0), 1.0)
-
-
-def _horner(coefficients, variable, out):
-    np.multiply(variable, coefficients[0], out=out)
-    for coefficient in coefficients[1:-1]:
-        out += coefficient
-        out *= variable
-    out += coefficients[-1]
-    return out
 
 
 def project(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
@@ -142,7 +106,7 @@ def cosine_integral(
     shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
     normal = _cross_component(unit, 0, 1, scratch, scratch("normal", shifted.shape))
-    normal *= _phi_of(shifted, scratch)
+    normal *= phi_of(shifted, scratch)
     integral = np.add.reduce(normal, axis=0)
     integral *= np.float32(0.5)
     return integral, fragile
@@ -155,7 +119,7 @@ def vector_irradiance(
     unit, near = project(corners, scratch)
     shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
-    phi = _phi_of(shifted, scratch)
+    phi = phi_of(shifted, scratch)
     integrals = np.empty((3, corners.shape[2]), dtype=np.float32)
     for axis in range(3):
         out = scratch("normal", shifted.shape)
@@ -166,98 +130,113 @@ def vector_irradiance(
     return integrals, fragile
 
 
-def _phi_of(shifted, scratch):
-    root = np.sqrt(shifted, out=scratch("root", shifted.shape))
-    phi = _horner(_arc_polynomials()[0], root, scratch("phi", shifted.shape))
-    phi /= root
-    return phi
+def form_matrix(degree: int) -> np.ndarray:
+    """Matrix (K, K) from the `moments` here to those of `edge_integrals.moments`.
+
+    The sum of (u.X) K_k over the edges is a form in u, homogeneous of degree k + 1. Here are the coefficients of
+    u_x^(k+1), u_x^k u_z, ..., u_z^(k+1), there the values for the first k + 2 directions.
+    """
+    matrix = np.zeros((coefficient_count(degree),) * 2)
+    matrix[0, 0] = 1.0
+    for k in range(degree):
+        rows = slice(1 + k * (k + 3) // 2, 1 + (k + 1) * (k + 4) // 2)
+        power = np.arange(k + 2)
+        matrix[rows, rows] = [u_x ** power[::-1] * u_z**power for u_x, u_z in RIDGE_DIRECTIONS[: k + 2]]
+    return matrix
 
 
 def moments(
     corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moments (K, P) in the order of `edge_integrals.moments` of polygons (>= 3 rows, V, P) in z >= 0 that need not be
-    unit, and the mask (P,) of fragile points. `degree` 1 to 4. The result is overwritten by the next call."""
+    """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0 that need not be unit, in the order of `form_matrix`, and
+    the mask (P,) of fragile points. `degree` 1 to 4. The result is overwritten by the next call."""
     unit, near = project(corners, scratch)
     shifted, fragile = shifted_cosines(unit, scratch, smallest)
     fragile |= near
-    result = scratch("moments", (coefficient_count(degree), shifted.shape[1]))
-    normal, total, start, end = _along_ridges(unit, degree, scratch)
+    shape = shifted.shape
+    result = scratch("moments", (coefficient_count(degree), shape[1]))
+    normal = scratch("normal", (2, *shape))
+    for row, (first, second) in zip(normal, ((1, 2), (0, 1)), strict=True):
+        _cross_component(unit, first, second, scratch, row)
+    total = np.add(unit[::2, :-1], unit[::2, 1:], out=scratch("total", normal.shape))
     result[0] = angle = _solid_angle(shifted, total[1], normal[1], scratch)
     fragile |= np.abs(angle) > np.float32(LARGEST_SAFE_ANGLE)
-    factors = _Factors(degree, shifted, scratch)
-    one, two = scratch("ridge_one", normal.shape), scratch("ridge_two", normal.shape)
-    _sum_edges(np.multiply(normal[:2], factors.phi, out=one[:2]), result[1:3])
+    factors = ArcFactors(degree, shifted, scratch)
+    pair = scratch("pair", normal.shape)
+    _sum_edges(np.multiply(normal, factors.phi, out=pair), result[1:3])
     if degree == 1:
         return result, fragile
-    linear = np.multiply(normal, factors.q, out=one)
-    linear *= total
-    _sum_edges(linear[:3], result[3:6])
+    np.multiply(normal, factors.q, out=pair)
+    linear = _product(pair, total, scratch("linear", (3, *shape)), scratch)
+    _sum_edges(linear, result[3:6])
     if degree == 2:
         return result, fragile
-    product = np.multiply(start, end, out=start)
-    squared = np.multiply(total, total, out=total)
+    product = _product(unit[::2, :-1], unit[::2, 1:], scratch("product", linear.shape), scratch)
+    squared = _product(total, total, scratch("squared", linear.shape), scratch)
     if degree == 4:
-        cubic = np.multiply(squared, factors.cube, out=two)
-        cubic -= product
-        cubic *= linear
-        _sum_edges(cubic, result[10:15])
-    squared, product = squared[:4], product[:4]
+        _sum_edges(_quartic(linear, product, squared, factors.cube, pair, scratch), result[10:15])
     squared *= factors.square
     product *= factors.psi
     squared -= product
-    squared *= normal[:4]
-    _sum_edges(squared, result[6:10])
+    cubic = scratch("cubic", (4, *shape))
+    np.multiply(normal, squared[::2], out=cubic[::3])
+    np.multiply(normal, squared[1], out=cubic[1:3])
+    cubic[1:3] += np.multiply(normal[::-1], squared[::2], out=pair)
+    _sum_edges(cubic, result[6:10])
     return result, fragile
+
+
+def _product(a, b, out, scratch):
+    """Coefficients (3, V, P) of the product of linear forms a and b (2, V, P): x x, x z + z x, z z."""
+    np.multiply(a, b, out=out[::2])
+    np.multiply(a[0], b[1], out=out[1])
+    out[1] += np.multiply(a[1], b[0], out=scratch("one", out.shape[1:]))
+    return out
+
+
+def _quartic(linear, product, squared, cube, pair, scratch):
+    """Coefficients (5, V, P) of (u.X) K_3 for a quadratic form `linear` (3, V, P), q (u.X) (u.c) with c = a + b, and
+    those of (u.a) (u.b) and (u.c)^2; `pair` (2, V, P) is overwritten."""
+    inner = np.multiply(squared, cube, out=scratch("inner", linear.shape))
+    inner -= product
+    result = scratch("quartic", (5, *cube.shape))
+    np.multiply(linear[::2], inner[::2], out=result[::4])
+    np.multiply(linear[::2], inner[1], out=result[1::2])
+    result[1::2] += np.multiply(inner[::2], linear[1], out=pair)
+    np.multiply(linear[1], inner[1], out=result[2])
+    np.multiply(linear[::2], inner[::-2], out=pair)
+    result[2] += pair[0]
+    result[2] += pair[1]
+    return result
+
+
+def weighted_moments(
+    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
+    in sr, and the mask (P,) of fragile points. `degree` 1 to 4."""
+    vectors, _, points = weights.shape
+    sums = np.empty((vectors, points), np.float32)
+    angle, fragile = np.empty(points, np.float32), np.empty(points, bool)
+    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
+        found, fragile[part] = moments(corners[:, :, part], degree, scratch, smallest)
+        weight = weights[:, :, part]
+        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
+        np.add.reduce(products, axis=1, out=sums[:, part])
+        angle[part] = found[0]
+    return sums, angle, fragile
+
+
+def pieces(count: int, most: int) -> list[slice]:
+    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
+    number = max(-(-count // max(most, 512)), 1)
+    size = max(-(-count // number), 1)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
 def _sum_edges(values, out):
     """Sum (D, P) over the edges of values (D, V, P)."""
     np.add.reduce(values, axis=1, out=out)
-
-
-def _along_ridges(unit, degree, scratch):
-    """Arrays (4, D, V, P): edge normal, a + b, a and b along the ridge directions x, z, x + z, x - z, x + 2 z."""
-    _, count, points = unit.shape
-    directions = degree + 1
-    values = scratch("ridges", (4, directions, count - 1, points))
-    for direction, axis in ((0, 0), (1, 2)):
-        if degree > 2:
-            values[2, direction], values[3, direction] = unit[axis, :-1], unit[axis, 1:]
-        np.add(unit[axis, :-1], unit[axis, 1:], out=values[1, direction])
-    _cross_component(unit, 1, 2, scratch, values[0, 0])
-    _cross_component(unit, 0, 1, scratch, values[0, 1])
-    # Up to degree 2 the products a b are not needed.
-    used = values if degree > 2 else values[:2]
-    for direction, (operation, first) in enumerate(((np.add, 0), (np.subtract, 0), (np.add, 2))[: degree - 1], 2):
-        operation(used[:, first], used[:, 1], out=used[:, direction])
-    return values
-
-
-class _Factors:
-    """What all directions share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None where unused."""
-
-    def __init__(self, degree, shifted, scratch):
-        shape = shifted.shape
-        self.q = self.psi = self.square = self.cube = None
-        if degree < 3:
-            self.phi = _phi_of(shifted, scratch)
-        else:
-            root = np.sqrt(shifted, out=scratch("root", shape))
-            self.psi = _horner(_arc_polynomials()[1], root, scratch("psi", shape))
-            self.psi /= root
-            self.phi = np.subtract(np.float32(2.0), shifted, out=scratch("phi", shape))
-            self.phi *= self.psi
-            self.phi += np.float32(1.0)
-        if degree > 1:
-            self.q = np.divide(np.float32(1.0), shifted, out=scratch("q", shape))
-        if degree > 2:
-            self.square = np.add(self.psi, np.float32(1.0), out=scratch("square", shape))
-            self.square *= self.q
-            self.square *= np.float32(0.5)
-        if degree > 3:
-            self.cube = np.add(self.q, np.float32(1.0), out=scratch("cube", shape))
-            self.cube *= np.float32(1.0 / 3.0)
 
 
 def _normalize(real, imaginary, scratch):

@@ -16,11 +16,9 @@ from .lookup_table import LookupTable, load_table
 from .task import Task
 
 PASSES = ("specular", "diffuse")
-# A block is what one process takes at a time, and what is shaded between two calls of `progress`: a share of the
-# samples, within these limits.
-BLOCKS = 16
-# At most two chunks: processes end at about the same time only where blocks are short.
-BLOCK_LIMITS = (32768, 49184)
+# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
+# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
+BLOCK_LIMITS = (24592, 49184)
 REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 
@@ -71,11 +69,21 @@ def shade(
         if error is not None:
             error[block] = estimates
 
-    least, most = REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS
-    size = min(max(-(-count // BLOCKS), least), most)
-    blocks = [slice(start, min(start + size, count)) for start in range(0, count, size)]
+    blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
     worker_processes.run(task, samples, blocks, workers, keep, progress)
     return Shading(task.groups, radiance.get("specular"), radiance.get("diffuse"), error)
+
+
+def _blocks(count: int, least: int, most: int) -> list[slice]:
+    """Slices that make up `count` samples: `most` long, and half of that, down to `least`, where fewer than four such
+    blocks are left. They do not depend on how many processes there are."""
+    blocks, start, size = [], 0, most
+    while start < count:
+        while size // 2 >= least and 4 * size > count - start:
+            size //= 2
+        blocks.append(slice(start, min(start + size, count)))
+        start += size
+    return blocks
 
 
 def _task(lights, technique, passes, dtype) -> Task:

@@ -11,12 +11,14 @@ from .polygon import split_at_horizon
 
 def local_frames(normal, view):
     """Local frames (3, 3, P): rows tangent, bitangent, normal; the view has y = 0 and x >= 0."""
-    cosine = (normal * view).sum(axis=1, keepdims=True)
-    tangent = view - cosine * normal
+    # The difference of vectors that are close is exact. The length of a normal from single precision is not quite 1.
+    across = view - normal
+    squared = (normal * normal).sum(axis=1, keepdims=True)
+    tangent = across - (across * normal).sum(axis=1, keepdims=True) / squared * normal
     length = np.sqrt((tangent * tangent).sum(axis=1, keepdims=True))
     # Where view and normal coincide any tangent serves: take the axis that the normal is farthest from.
     axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    other = axis - (axis * normal).sum(axis=1, keepdims=True) * normal
+    other = axis - (axis * normal).sum(axis=1, keepdims=True) / squared * normal
     tangent = np.where(length > 1e-7, tangent, other)
     tangent = tangent / np.sqrt((tangent * tangent).sum(axis=1, keepdims=True))
     bitangent = np.cross(normal, tangent)

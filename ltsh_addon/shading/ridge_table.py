@@ -79,27 +79,41 @@ class RidgeTable:
 
 
 def prepare(table: LookupTable) -> RidgeTable:
-    """The table for the hot path, made once per table. Degrees above `edge_loop.MAX_DEGREE` have none: ValueError."""
+    """The table for the hot path, with weights of the moments of `edge_loop`, made once per table. Degrees above
+    `edge_loop.MAX_DEGREE` have none: ValueError."""
+    return _kept(table, "_ridge_table", lambda: _product(table.ridge_weights, edge_loop.form_matrix(table.degree)))
+
+
+def along_directions(table: LookupTable) -> RidgeTable:
+    """As `prepare`, with weights of the moments of `edge_integrals`, which shaders use."""
+    return _kept(table, "_direction_table", lambda: table.ridge_weights)
+
+
+def _kept(table, name, matrix):
+    """The table made once, weights of moments by matrix() (K, K)."""
     if table.degree > edge_loop.MAX_DEGREE:
         raise ValueError(
             f"table {table.name} has degree {table.degree}, the single precision path goes up to "
             f"{edge_loop.MAX_DEGREE}: use float64"
         )
     # Stored with the table, which is frozen but for what it caches, so that both end together.
-    ridges = table.__dict__.get("_ridge_table")
+    ridges = table.__dict__.get(name)
     if ridges is None:
-        ridges = table.__dict__["_ridge_table"] = _build(table)
+        ridges = table.__dict__[name] = _build(table, matrix)
     return ridges
 
 
-def _build(table):
+def _build(table, matrix):
     rows, columns, curves, count = table.coefficients.shape
     flat = table.coefficients.reshape(rows * columns, curves, count)
     if table.family == "ltsh":
-        # A plain loop, not a matrix product: the same bits on every machine.
-        ridge = table.ridge_weights
-        flat = sum(flat[:, :, k, None] * ridge[k] for k in range(count))
+        flat = _product(flat, matrix())
     return RidgeTable(table, table.warp.reshape(rows * columns, -1).T, flat.transpose(1, 2, 0))
+
+
+def _product(vectors, matrix):
+    """Vectors (..., K) times a matrix (K, K). Not a matrix product of numpy's: the same bits on every machine."""
+    return sum(vectors[..., k, None] * row for k, row in enumerate(matrix))
 
 
 def _bilinear(channels, shape, roughness, coordinate, scratch):

@@ -104,8 +104,7 @@ class LobeIntegral:
             values = weights[:, 0] * integral
             values *= np.float32(-1.0 / np.pi)
         else:
-            moments, fragile = edge_loop.moments(corners, self.ridges.degree, self.scratch, smallest)
-            products = np.multiply(weights, moments, out=self.scratch("weighted", weights.shape))
-            values = np.add.reduce(products, axis=1)
+            degree = self.ridges.degree
+            values, _, fragile = edge_loop.weighted_moments(corners, weights, degree, self.scratch, smallest)
             np.negative(values, out=values)
         return np.maximum(values, np.float32(0.0), out=values), fragile

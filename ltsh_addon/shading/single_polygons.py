@@ -68,9 +68,8 @@ def _integral(weights, ridges, signed, scratch, corners, index):
         values *= np.float32(1.0 / np.pi)
         # The clamped cosine is not negative: its integral has the sign of the solid angle.
         return (values if signed else np.abs(values, out=values))[None], fragile
-    moments, fragile = edge_loop.moments(corners, ridges.degree, scratch)
-    values = np.add.reduce(np.multiply(weights, moments, out=scratch("weighted", weights.shape)), axis=0)
+    values, angle, fragile = edge_loop.weighted_moments(corners, weights[None], ridges.degree, scratch)
     if not signed:
-        values *= np.sign(moments[0])
+        values *= np.sign(angle)
         np.maximum(values, np.float32(0.0), out=values)
-    return values[None], fragile
+    return values, fragile

@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from . import double_precision, light_cone, ridge_table
+from . import double_precision, edge_loop, light_cone, ridge_table
 from .fresnel_kinds import any_component, columns, fresnel_kinds
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .polygon import dot
@@ -68,7 +68,7 @@ def shade_specular(samples, lights, table, radiance, scratch):
 
 
 def _chunks(members):
-    return (members[start : start + CHUNK] for start in range(0, len(members), CHUNK))
+    return (members[part] for part in edge_loop.pieces(len(members), CHUNK))
 
 
 def _add_double(samples, members, lights, radiance, shade):
@@ -175,7 +175,9 @@ def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
     normal, view = columns(samples.normal, index), columns(samples.view, index)
     cosine = dot(normal, view)
-    tangent = view - cosine * normal
+    # The difference of vectors that are close is exact, so that nothing of it runs along the normal.
+    tangent = view - normal
+    tangent -= dot(normal, tangent) * normal
     sine = np.sqrt(dot(tangent, tangent))
     straight = np.nonzero(sine < 1e-6)[0]
     if len(straight):

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
 from . import double_precision, light_cone, single_precision
+from .light_detail import fitting_patches
 from .lookup_table import LookupTable
 
 # Double precision arrays of this many samples stay in the cache.
@@ -16,6 +17,8 @@ DOUBLE_CHUNK = 4096
 # In single precision for degree 0, and that for every degree more.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
 _DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
+# About how many patches of a light a sample takes at most.
+PATCHES = 60
 
 
 @dataclass(frozen=True)
@@ -55,15 +58,37 @@ class Task:
 
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
-        prepared = [(light, self.groups.index(light.group), light.polygon()) for light in self.lights]
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
+        plain = self._prepared(light for light in self.lights if not light.detail)
+        self._add(samples, plain, radiance, error, scratch)
+        for light in self.lights:
+            if light.detail:
+                for name in self.passes:
+                    self._add_detailed(samples, light, name, radiance[name], error, scratch)
+        return radiance, error
+
+    def _prepared(self, lights):
+        return [(light, self.groups.index(light.group), light.polygon()) for light in lights]
+
+    def _add_detailed(self, samples, light, name, radiance, error, scratch) -> None:
+        """Add the light of a light with a `detail` to one pass."""
+        for index, patches in fitting_patches(light, samples, name == "specular"):
+            own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
+            own_error = None if error is None else np.zeros(len(index))
+            self._add(samples.take(index), self._prepared(patches), own, own_error, scratch)
+            radiance[:, index] += own[name]
+            if error is not None:
+                error[index] += own_error
+
+    def _add(self, samples, prepared, radiance, error, scratch) -> None:
+        """Add the light of the `prepared` lights to the passes in `radiance`."""
         if self.single:
             if "diffuse" in radiance:
                 single_precision.shade_diffuse(samples, prepared, radiance["diffuse"], scratch)
             if "specular" in radiance:
                 single_precision.shade_specular(samples, prepared, self.table, radiance["specular"], scratch)
-            return radiance, error
+            return
         for start in range(0, len(samples), DOUBLE_CHUNK):
             chunk = slice(start, start + DOUBLE_CHUNK)
             part = samples.take(chunk)
@@ -73,12 +98,11 @@ class Task:
             if "specular" in views:
                 estimates = None if error is None else error[chunk]
                 double_precision.shade_specular(part, prepared, self.table, views["specular"], estimates)
-        return radiance, error
 
 
 def _corners_integrated(light, is_reference):
     """About how many corners the integrals over a light have."""
-    count = len(light.polygon())
+    count = len(light.polygon()) * min(len(light.patches), PATCHES)
     if light.is_focused:
         effort = light_cone.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)

@@ -30,9 +30,10 @@ def compare(folder, samples=256, count=24):
     assert unusable == 0 and len(surface) > 0
     images = scene_parts.reference(folder, prepared, samples)
     errors = {}
+    lights = [patch for light in prepared[2].lights for patch in light.patches]
     for lobe, brdf in BRDFS.items():
         halves = images[lobe].reshape(2, -1, 3)[:, pixel].astype(np.float64)
-        expected = quadrature.radiance(surface, prepared[2].lights, brdf, count=count)
+        expected = quadrature.radiance(surface, lights, brdf, count=count)
         errors[lobe] = quadrature.relative_l2(expected, halves), quadrature.bias(expected, halves)
     return errors, prepared
 

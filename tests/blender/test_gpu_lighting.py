@@ -138,6 +138,23 @@ def test_a_pass_draws_where_it_is_told_and_adds_to_what_is_there():
     assert (picture == 7.0).all()
 
 
+def test_a_thousand_lights_add_up():
+    """More than one draw call takes."""
+
+    def draw():
+        random = np.random.default_rng(17)
+        samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
+        lights = [random_surfaces.light("plain", number, random) for number in range(1100)]
+        lighting = LightingPass("ltsh2")
+        lighting.set_lights(lights)
+        assert len(lighting._shares) > 1
+        return samples, lights, drawn(lighting, samples, Canvas(WIDTH, HEIGHT), "specular")
+
+    samples, lights, found = with_graphics(draw)
+    shaded = shading.shade(samples, lights, "ltsh2", passes=("specular",), workers=1, dtype=np.float64).combined
+    assert excess(found, shaded, RELATIVE).max() <= 1.0
+
+
 def test_pixels_without_a_surface_stay_dark():
     def draw():
         random = np.random.default_rng(13)

@@ -7,6 +7,7 @@ import quadrature
 import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
+from ltsh_addon.blender.materials.bsdf_lobes import note_unsupported
 from ltsh_addon.blender.materials.material_outputs import MaterialReport, inject_aovs
 from ltsh_addon.blender.pixels import gbuffer, render_settings
 
@@ -263,6 +264,42 @@ def test_every_unsupported_input_is_named_once(tmp_path, plane_scene):
         assert sum(f"{name} of 'Principled BSDF'" in line for line in warnings) == 1, (name, warnings)
     assert all(line.startswith("material 'Rich': ") for line in warnings)
     assert not any("emission" in line for line in warnings)  # it is a light
+
+
+@pytest.mark.parametrize(
+    "edge, base, named", [(0.0, 0.5, True), (0.1, 0.5, False), (0.3, 0.02, True), (0.0, 0.95, False), (1.0, 0.0, False)]
+)
+def test_metals_that_cycles_clips_at_black_are_named(edge, base, named):
+    found = []
+    for kind, tint in (("ShaderNodeBsdfMetallic", "Edge_Tint"), ("ShaderNodeBsdfPrincipled", "Specular_Tint")):
+        _, node = bsdf_material(kind, Base_Color=(base, base, base, 1.0), **{tint: (edge, edge, edge, 1.0)})
+        if "Metallic" in node.inputs:
+            note_unsupported(node, found.append)  # no metal yet
+            node.inputs["Metallic"].default_value = 1.0
+        note_unsupported(node, found.append)
+    assert len(found) == (2 if named else 0) and all("Tint of '" in line for line in found)
+
+
+@pytest.mark.parametrize("kind", ["AmbientOcclusion", "Bevel"])
+def test_nodes_that_send_rays_are_named(kind):
+    material, node = principled("Worn")
+    tree = material.node_tree
+    unused, used = (tree.nodes.new(f"ShaderNode{kind}") for _ in range(2))
+    tree.links.new(used.outputs[0], node.inputs["Base Color"])
+    report = MaterialReport()
+    inject_aovs([material], report)
+    assert len(report.lines()) == 1 and repr(used.name) in report.lines()[0]
+    assert report.lines()[0].startswith(f"material {material.name!r}: ") and unused.name != used.name
+
+
+def test_an_index_of_refraction_that_varies_is_named():
+    found = []
+    for kind in ("ShaderNodeBsdfGlass", "ShaderNodeBsdfPrincipled"):
+        material, node = bsdf_material(kind)
+        value = material.node_tree.nodes.new("ShaderNodeTexCoord").outputs["UV"]
+        material.node_tree.links.new(value, node.inputs["IOR"])
+        note_unsupported(node, found.append)
+    assert sum("IOR of '" in line and "varies" in line for line in found) == 2
 
 
 def test_other_shaders_are_named_and_shaded_as_the_nearest(tmp_path, plane_scene):

@@ -84,7 +84,8 @@ def test_a_textured_screen_becomes_patches(tmp_path):
     tree.links.new(add_image(tree, pixels).outputs["Color"], node.inputs["Color"])
     add_lamp_plane(material)
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8)
-    assert warnings == [] and 32 <= len(inventory.lights) <= 64
+    assert warnings == [] and len(inventory.lights) == 2
+    assert 32 <= sum(len(light.patches) for light in inventory.lights) <= 64
     total = sum(
         4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * light.radiance for light in inventory.lights
     )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.blender.lights.patches import (
+    CUTS,
     ERROR,
     GRID,
     clip_to_cell,
@@ -29,18 +30,19 @@ def everywhere(image):
 def painted(patches, shape):
     """The image that patches make."""
     image = np.zeros((*shape, 3))
-    for (left, right, bottom, top), radiance in zip(patches.cells, patches.radiance, strict=True):
+    for patch in patches.smallest:
+        left, right, bottom, top = patch.cell
         columns = [round((side + 1.0) / 2.0 * shape[1]) for side in (left, right)]
         rows = [round((1.0 - side) / 2.0 * shape[0]) for side in (top, bottom)]
-        image[slice(*rows), slice(*columns)] += radiance
+        image[slice(*rows), slice(*columns)] += patch.radiance
     return image
 
 
 def test_a_constant_image_is_one_patch():
     image = np.full((32, 16, 3), 2.5)
     patches = cut_into_patches(image, everywhere(image))
-    assert patches.cells.tolist() == [[-1.0, 1.0, -1.0, 1.0]] and np.allclose(patches.radiance, 2.5)
-    assert patches.error == 0.0
+    assert patches.whole.cell == (-1.0, 1.0, -1.0, 1.0) and np.allclose(patches.whole.radiance, 2.5)
+    assert patches.whole.parts == () and patches.error == 0.0
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (256, 32), (100, 60), (1, 256)])
@@ -51,14 +53,14 @@ def test_the_stated_error_is_that_of_the_patches(shape):
     difference = np.abs(painted(patches, shape) - image).sum() / image.sum()
     assert difference == pytest.approx(patches.error, rel=1e-6) and patches.error <= ERROR
     # One patch of the mean would not do, and means keep the sum.
-    assert len(patches.cells) >= 8 and painted(patches, shape).sum() == pytest.approx(image.sum())
+    assert len(patches.smallest) >= 8 and painted(patches, shape).sum() == pytest.approx(image.sum())
 
 
 def test_noise_ends_at_the_finest_grid_and_says_so():
     image = np.random.default_rng(2).random((256, 256, 3))
     patches = cut_into_patches(image, everywhere(image))
-    assert len(patches.cells) == GRID * GRID and patches.error > ERROR
-    assert len(cut_into_patches(image, everywhere(image), most=10).cells) == 10
+    assert len(patches.smallest) == GRID * GRID and patches.error > ERROR
+    assert len(cut_into_patches(image, everywhere(image), most=10).smallest) == 10
 
 
 def test_pixels_that_are_not_covered_do_not_count():
@@ -66,14 +68,30 @@ def test_pixels_that_are_not_covered_do_not_count():
     covered = np.hypot(*np.meshgrid(np.linspace(-1, 1, 64), np.linspace(-1, 1, 64))) < 1.0
     image[~covered] = 1e6
     patches = cut_into_patches(image, covered)
-    assert len(patches.cells) == 1 and np.allclose(patches.radiance, 3.0)
+    assert len(patches.smallest) == 1 and np.allclose(patches.whole.radiance, 3.0)
 
 
 def test_dark_patches_are_left_out_and_a_dark_image_has_none():
     image = np.zeros((64, 64, 3))
-    assert len(cut_into_patches(image, everywhere(image)).cells) == 0
+    assert cut_into_patches(image, everywhere(image)).whole is None
     image[:32] = 1.0
-    assert cut_into_patches(image, everywhere(image)).cells.tolist() == [[-1.0, 1.0, 0.0, 1.0]]
+    assert [patch.cell for patch in cut_into_patches(image, everywhere(image)).smallest] == [(-1.0, 1.0, 0.0, 1.0)]
+
+
+def test_a_patch_that_was_cut_has_the_mean_of_its_parts():
+    image = np.random.default_rng(4).random((64, 64, 3)) ** 2
+    open_patches, seen = [cut_into_patches(image, everywhere(image), most=300).whole], 0
+    while open_patches:
+        patch = open_patches.pop()
+        areas = [(part.cell[1] - part.cell[0]) * (part.cell[3] - part.cell[2]) for part in patch.parts]
+        if patch.parts:
+            assert len(areas) <= 2**CUTS
+            assert np.allclose(
+                np.average([part.radiance for part in patch.parts], axis=0, weights=areas), patch.radiance
+            )
+            seen += 1
+        open_patches += patch.parts
+    assert seen > 300 / 2**CUTS
 
 
 def test_clipping_to_the_cells_of_a_grid_loses_no_area():
@@ -105,7 +123,8 @@ def test_the_parts_of_a_light_have_its_power(shape, spread, direction):
     whole = np.ones((64, 64, 3))
     parts = split_light(light, cut_into_patches(whole, everywhere(whole), most=1))
     cut = cut_into_patches(image, everywhere(image), most=100)
-    for lights, mean in ((parts, 1.0), (split_light(light, cut), None)):
+    for (whole_light,), mean in ((parts, 1.0), (split_light(light, cut), None)):
+        lights = whole_light.patches
         powers = [area_of(part) * part.radiance for part in lights]
         expected = 4.0 * 0.6 * 0.4 * (np.pi / 4.0 if shape == "ELLIPSE" else 1.0)
         # Counterclockwise around the direction: all areas are positive.
@@ -116,5 +135,5 @@ def test_the_parts_of_a_light_have_its_power(shape, spread, direction):
             # The mean of the image inside the ellipse is not known better than by its pixels.
             assert np.allclose(sum(powers), expected * 0.5, rtol=0.03)
         assert {part.spread for part in lights} == {spread}
-        if spread < np.pi:
+        if spread < np.pi and mean is None:
             assert {part.shape for part in lights} == {"RECTANGLE"}

@@ -8,6 +8,7 @@ import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
 
 from ltsh_addon.blender.materials.specular_horizon import end_at_horizons_of_cycles
+from ltsh_addon.blender.processes.child import note_coarse_meshes
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading import shade
@@ -91,3 +92,12 @@ def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, sides, tu
     # Measured: up to 0.7 %, noise included; the other horizon is wrong by 3 to 47 %.
     assert chosen < 8e-3
     assert 1.5e-2 < max(error(samples.geometric_normal), error(samples.smooth_normal))
+
+
+def test_coarse_meshes_are_named_where_they_fill_the_picture():
+    fine = samples_near_the_horizon(0.5, count=100)
+    assert note_coarse_meshes(fine) == []
+    normal = fine.geometric_normal.copy()
+    normal[:50] = (np.sin(0.7), 0.0, np.cos(0.7))
+    (line,) = note_coarse_meshes(replace(fine, geometric_normal=normal))
+    assert "50 of 100 samples" in line and "35 degrees" in line

@@ -3,7 +3,7 @@
 import bpy
 from hands import COMPARE, Pulse, click_button, job, keys, over, settings, until, wait_for_job
 
-SECONDS = 900
+SECONDS = 1800
 LONGEST = 0.2  # seconds, beside drawing: the graphics driver may be a program, and the machine may be busy
 
 DRAWINGS = 5
@@ -30,7 +30,7 @@ def main(rig):
         pulses.append(pulse.stop(rig, what))
         if pulse is pulses[0]:
             running = Pulse()
-            yield from wait_for_job(rig, 600)
+            yield from wait_for_job(rig, 1200)
             pulses.append(running.stop(rig, "job"))
             rig.check(job() is None and "LTSH cycles.combined" in bpy.data.images, "the comparison is there")
             yield 2
@@ -45,7 +45,8 @@ def main(rig):
     yield 3
     pulses.append(pulse.stop(rig, "moving the wipe"))
     rig.check(max(pulse.longest_work for pulse in pulses) < LONGEST, f"the main thread never works for {LONGEST} s")
-    longest = max(pulse.longest for pulse in pulses) - drawing
+    # The last one draws a new picture, in the view and on the graphics card.
+    longest = max(pulse.longest for pulse in pulses[:-1]) - drawing
     rig.check(longest < LONGEST, f"the window answers within {LONGEST} s and the time to draw it")
     rig.shot("1080p.png")
 

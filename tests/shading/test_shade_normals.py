@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 import textbook
-from surface_scenes import area_light, single_sample
+from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
 
 from ltsh_addon import shading
 
@@ -70,3 +70,20 @@ def test_each_pass_has_its_own_normal():
     factor = textbook.lambert_form_factor(light.polygon() @ turn.T)
     assert bumped.diffuse[0, 0] == pytest.approx(abs(factor) * light.radiance, rel=1e-9)
     assert not np.allclose(bumped.diffuse, plain.diffuse, rtol=0.01)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_normals_from_single_precision_near_the_view_direction_shade_like_exact_ones(dtype):
+    """Their length is off by 6e-8, which tilts the frame where what the view has across the normal is as small.
+
+    Cosines are then off by as much and angles near zero by 3e-4, of which lobes as wide as these hardly notice.
+    """
+    generator, count = np.random.default_rng(1), 400
+    samples = random_samples(count, lowest_roughness=0.1)
+    offset = 10.0 ** generator.uniform(-7.5, -3.0, (count, 1)) * generator.normal(size=(count, 3))
+    normal = unit(samples.view + offset).astype(np.float32).astype(np.float64)
+    rounded = replace(samples, normal=normal, geometric_normal=normal)
+    exact = replace(samples, normal=unit(normal), geometric_normal=unit(normal))
+    expected = shade(exact, four_lights()).specular
+    error = np.linalg.norm(shading.shade(rounded, four_lights(), dtype=dtype).specular - expected)
+    assert error < 1e-3 * np.linalg.norm(expected)

@@ -115,10 +115,33 @@ def test_edge_loop_gives_the_moments(degree, corners):
     """Regular polygons around random directions: rounding of 6e-8 per edge, of moments up to 20."""
     polygons = regular_polygons(corners, 300, seed=degree)
     moments, fragile = edge_loop.moments(polygons, degree, edge_loop.Scratch())
-    expected = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), degree)
+    along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), degree)
+    expected = np.linalg.solve(edge_loop.form_matrix(degree), along_directions)
     assert moments.dtype == np.float32
     assert fragile.mean() < 0.2
     assert np.abs(moments - expected)[:, ~fragile].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
+
+
+@pytest.mark.parametrize("most", [1, 513, 1000, 5000])
+def test_pieces_of_a_batch_have_the_sums_of_the_whole(most, monkeypatch):
+    """1500 polygons in pieces of at least 512, against their moments at once."""
+    monkeypatch.setattr(edge_loop, "PIECE_CORNERS", 4 * most)
+    polygons = regular_polygons(4, 1500, seed=5)
+    weights = np.random.default_rng(6).normal(size=(2, 15, 1500)).astype(np.float32)
+    moments, expected_mask = edge_loop.moments(polygons, 4, edge_loop.Scratch())
+    sums, angle, fragile = edge_loop.weighted_moments(polygons, weights, 4, edge_loop.Scratch())
+    expected = np.einsum("fkp,kp->fp", weights.astype(float), moments.astype(float))
+    assert np.abs(sums - expected).max() < 15 * 1e-7 * np.abs(weights * moments).max()
+    assert np.abs(angle - moments[0]).max() < 1e-6 and np.array_equal(fragile, expected_mask)
+
+
+@pytest.mark.parametrize(("count", "most"), [(0, 600), (1, 600), (512, 1), (1200, 600), (1201, 600), (100_000, 4111)])
+def test_pieces_make_up_the_whole_and_are_about_equal(count, most):
+    parts = edge_loop.pieces(count, most)
+    assert [index for part in parts for index in range(count)[part]] == list(range(count))
+    lengths = [part.stop - part.start for part in parts]
+    assert max(lengths, default=0) <= max(most, 512)
+    assert max(lengths, default=0) - min(lengths, default=0) <= len(lengths)
 
 
 def test_edge_loop_gives_the_integrals_of_the_direction():
@@ -173,11 +196,25 @@ def test_premultiplied_weights_are_the_coefficients_lobe_integrals_use(name):
         assert np.abs(row - expected).max() < 3e-6 * np.abs(expected).max()
     expected = lobe.coefficients
     if tilt is None:
-        expected = np.einsum("fkp,kr->frp", expected, table.ridge_weights)
+        matrix = table.ridge_weights @ edge_loop.form_matrix(table.degree)
+        expected = np.einsum("fkp,kr->frp", expected, matrix)
     else:
         assert np.abs(tilt - lobe.tilt).max() < 1e-5
     assert np.abs(weights - expected).max() < 1e-5 * np.abs(expected).max()
     assert isinstance(table, LookupTable) and ridge_table.prepare(table) is ridge_table.prepare(table)
+
+
+@pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])
+def test_shaders_and_the_edge_loop_weigh_their_moments_alike(name):
+    """One node of the table for 300 polygons."""
+    table, node = shading.load_table(name), 40 * 64 + 20
+    polygons = regular_polygons(4, 300, seed=8)
+    moments, fragile = edge_loop.moments(polygons, table.degree, edge_loop.Scratch())
+    along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), table.degree)
+    found = ridge_table.prepare(table).weights[..., node] @ moments
+    expected = ridge_table.along_directions(table).weights[..., node] @ along_directions
+    assert np.abs(expected).max() > 0.1
+    assert np.abs(found - expected)[:, ~fragile].max() < 2e-6
 
 
 def test_degrees_beyond_the_fast_path_are_shaded_in_double():

@@ -95,6 +95,17 @@ def test_single_passes_travel_too(part, started, children_only):
     assert np.array_equal(getattr(one, part), getattr(two, part))
 
 
+@pytest.mark.parametrize("count", [0, 1, 1023, 1024, 5000, 123_457])
+def test_blocks_make_up_the_samples_and_are_short_at_the_end(count):
+    """Whoever ends first waits for the other's last block."""
+    blocks = integrator._blocks(count, 256, 2048)
+    assert [block.start for block in blocks] + [count] == [0] + [block.stop for block in blocks]
+    lengths = [block.stop - block.start for block in blocks]
+    assert lengths == sorted(lengths, reverse=True)
+    assert all(length <= max(256, (count - block.start) // 4) for block, length in zip(blocks, lengths, strict=True))
+    assert max(lengths, default=0) <= 2048 and all(length >= 256 for length in lengths[:-1])
+
+
 def test_progress_is_reported_from_this_thread_and_reaches_one(started):
     seen, threads = [], set()
 
@@ -219,7 +230,7 @@ def test_shared_blocks_hold_arrays_side_by_side():
 
 def test_a_normal_that_stands_for_another_is_sent_once():
     samples = random_samples(20)
-    task = integrator._task(samples, tuple(four_lights()), "ltc", ("specular",), np.float32)
+    task = integrator._task(tuple(four_lights()), "ltc", ("specular",), np.float32)
     side = block_exchange.ParentSide(task, samples, 20)
     assert side.same == {"geometric_normal": "normal"}
     assert not {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"} & set(side.sent)

@@ -80,6 +80,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         if np.any(light.radiance != 0.0):
             placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
             note_unsupported(ob, matrix, inventory)
+            if light.affects_diffuse != light.affects_specular:
+                inventory.warn(half_hidden(light))
             _note_instancer(instance, inventory)
     # One unusable instance takes all instances of the object along: the reference can only drop the object.
     for name, light, unseen in placed:
@@ -89,8 +91,19 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             inventory.lights.append(light)
     inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, inventory.warn)
     for mesh in inventory.meshes:
+        if mesh.light.affects_diffuse != mesh.light.affects_specular:
+            inventory.warn(half_hidden(mesh.light))
         inventory.instancers.update(mesh.instancers)
     return inventory
+
+
+def half_hidden(light: AreaLight) -> str:
+    """The warning about a light that is hidden from diffuse or from glossy rays, but not from both."""
+    kind = "glossy" if light.affects_diffuse else "diffuse"
+    return (
+        f"light {light.name!r}: it is hidden from {kind} rays; Cycles still lets up to 3 % of it through on surfaces "
+        "that are both diffuse and glossy, the techniques let none"
+    )
 
 
 def _note_instancer(instance, inventory: LightInventory) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -82,9 +82,7 @@ def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn
     patches = cut_into_patches(factor * light.radiance, covered)
     if patches.error > ERROR:
         warn(
-            f"light {light.name!r}: its texture is shaded as {len(patches.cells)} patches of constant radiance, "
+            f"light {light.name!r}: its texture is shaded as {len(patches.smallest)} patches of constant radiance, "
             f"which differ from it by {100.0 * patches.error:.0f} % on average"
         )
-    if len(patches.cells) == 1 and np.ptp(patches.cells[0][:2]) == 2.0 and np.ptp(patches.cells[0][2:]) == 2.0:
-        return [replace(light, radiance=patches.radiance[0])]
     return split_light(light, patches)

@@ -226,8 +226,9 @@ def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, wa
                     lights.extend(split_light(light, patches))
                     errors.append(patches.error)
     if max(errors) > ERROR:
+        patches = sum(len(light.patches) for light in lights)
         warn(
-            f"object {mesh_light.ob.name!r}: its texture is shaded as {len(lights)} patches of constant radiance, "
+            f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
             f"which differ from it by {100.0 * max(errors):.0f} % on average"
         )
     return lights

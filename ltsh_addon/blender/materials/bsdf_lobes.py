@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import bpy
+import numpy as np
 
+from ...shading.brdf import schlick_curve
 from .aovs import LOBE_AOVS, LOBE_KINDS
+from .reflectance import f82_dip
 from .shader_graph import cut, is_constant, is_socket, live_link, product, value_of
 
 PRINCIPLED = "ShaderNodeBsdfPrincipled"
@@ -52,11 +55,13 @@ SHEEN = "ShaderNodeBsdfSheen"
 MICROFIBER_SOCKETS = "sheen", {"color": "Color", "roughness": "Roughness"}
 # Node -> what is said of it.
 NEAREST = {
-    "ShaderNodeBsdfGlass": "lets no light through, only its reflection is shaded",
+    "ShaderNodeBsdfGlass": "lets no light through, only its reflection is shaded, of back faces about",
     "ShaderNodeBsdfSheen": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
     "ShaderNodeSubsurfaceScattering": "is not supported, it is shaded as a Diffuse BSDF",
     "ShaderNodeBsdfToon": "is not supported, it is shaded as a Diffuse BSDF of the same albedo",
 }
+# Metals that are darker than minus this are worth a warning.
+NEGLIGIBLE_REFLECTANCE = -1e-3
 NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> {socket: (value at which it changes nothing, what is done)}; sockets absent in a version are skipped.
 NOT_SHADED = {
@@ -64,7 +69,7 @@ NOT_SHADED = {
         "Diffuse Roughness": (0.0, "is shaded as 0"),
         "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
         "Anisotropic": (0.0, "is shaded as 0"),
-        "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
+        "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded, of back faces about"),
         "Sheen Weight": (0.0, "adds diffuse reflection of the same albedo"),
         "Thin Wall": (0.0, "is shaded as off"),
         "Thin Film Thickness": (0.0, "is shaded as 0"),
@@ -167,11 +172,35 @@ def note_unsupported(node, warn: Callable[[str], None]) -> None:
     for name, (neutral, done) in NOT_SHADED.get(kind, {}).items():
         if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
             warn(f"{name} of {node.name!r} {done}")
-    if kind == PRINCIPLED:
-        ior = value_of(node.inputs["IOR"])
-        if not is_socket(ior) and ior < 1.0:
-            warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
+    _note_reflectance(node, warn)
     distribution = getattr(node, "distribution", "")
     if distribution in NEAREST_ALPHA:
         alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
         warn(f"distribution {distribution} of {node.name!r} is shaded as GGX of {alpha}")
+
+
+def _note_reflectance(node, warn) -> None:
+    """Name indices of refraction below 1, and metals whose reflectance Cycles clips."""
+    if node.bl_idname in (PRINCIPLED, "ShaderNodeBsdfGlass"):
+        ior = value_of(node.inputs["IOR"])
+        if is_socket(ior):
+            warn(f"IOR of {node.name!r} varies: where it is below 1, the reflectance is that for the mirror direction")
+        elif ior < 1.0:
+            warn(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
+    if node.bl_idname == PRINCIPLED:
+        tint = "" if is_constant(value_of(node.inputs["Metallic"]), 0.0) else "Specular Tint"
+    else:
+        tint = "Edge Tint" if node.bl_idname == METALLIC and node.fresnel_type == "F82" else ""
+    if tint and may_be_negative(value_of(node.inputs["Base Color"]), value_of(node.inputs[tint])):
+        warn(f"{tint} of {node.name!r} is so dark that the reflectance of the metal, as shaded, falls below 0")
+
+
+def may_be_negative(color, tint) -> bool:
+    """True if the F82 reflectance of a metal of these colors (of `shader_graph.value_of`) may fall below 0."""
+    if is_constant(tint, (1.0, 1.0, 1.0)):
+        return False
+    # The darker both are, the lower is the curve.
+    f0, edge = (np.zeros(3) if is_socket(value) else np.clip(value[:3], 0.0, 1.0) for value in (color, tint))
+    c = np.linspace(0.0, 1.0, 101)[:, None]
+    curve = f0 + (1.0 - f0) * schlick_curve(c) - f82_dip(f0, edge) * c * (1.0 - c) ** 6
+    return bool(curve.min() < NEGLIGIBLE_REFLECTANCE)

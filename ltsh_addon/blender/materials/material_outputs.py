@@ -12,11 +12,16 @@ import bpy
 
 from .aov_injection import write_aov, write_lobe
 from .aovs import MAX_LOBES
-from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves
+from .bsdf_leaves import TRANSPARENT_NODES, Leaf, bsdf_leaves, is_group
 from .bsdf_lobes import cut_alpha, emits, is_emission, lobe_of
 from .hair import bends_normals
 from .shader_graph import ensure_nodes, fill_with_bsdf, is_constant, live_link, material_output
 
+# Nodes that send rays from where they are evaluated, and what is said of them.
+TRACING_NODES = {
+    "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
+    "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
+}
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
 RECEIVER_PROPERTY = "ltsh_receiver"
 
@@ -124,6 +129,8 @@ def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes |
     if volume is not None:
         tree.links.remove(volume)
         warn("its volume is not shaded; left out of the Cycles reference as well")
+    for node in _tracing_nodes(tree):
+        warn(f"node {node.name!r} {TRACING_NODES[node.bl_idname]}")
     leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
     if not leaves:
         # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
@@ -145,6 +152,17 @@ def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes |
             pairs.append((leaf, {**values, **share}))
     pairs = _largest(pairs, warn)
     return MaterialLobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
+
+
+def _tracing_nodes(tree) -> list:
+    """Nodes of TRACING_NODES in `tree` and its groups that feed something."""
+    found = []
+    for node in tree.nodes:
+        if is_group(node) and node.node_tree is not None:
+            found += _tracing_nodes(node.node_tree)
+        elif node.bl_idname in TRACING_NODES and not node.mute and any(socket.is_linked for socket in node.outputs):
+            found.append(node)
+    return found
 
 
 def _largest(pairs: list, warn) -> list:

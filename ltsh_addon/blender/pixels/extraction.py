@@ -171,4 +171,5 @@ def _picture(scene, job: dict) -> dict:
 
 def light_record(light) -> dict:
     """`light` as JSON has it; AreaLight(**record) reads it back."""
-    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}
+    record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}
+    return {**record, "detail": [light_record(part) for part in light.detail]}

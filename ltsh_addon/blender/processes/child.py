@@ -7,6 +7,7 @@ and the data of a running Blender stay untouched.
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import threading
 from dataclasses import asdict, dataclass
@@ -20,6 +21,10 @@ from ..pixels import gbuffer
 from . import blend_header
 from .blender_process import Progress, SceneError, disk_is_full, no_room, run_child
 from .temporary_folders import locked_folder
+
+# Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
+# on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
+COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
 
 
 @dataclass(frozen=True)
@@ -188,9 +193,24 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
         warnings.append(f"{unusable} samples are not shaded: {what}")
     if unnamed:
         warnings.append(f"{unnamed} pixels show a surface whose material could not be read: not shaded")
+    warnings += note_coarse_meshes(samples)
     if len(samples) == 0:
         warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
     return samples, film, warnings
+
+
+def note_coarse_meshes(samples: SurfaceSamples) -> list[str]:
+    """The warning about smooth-shaded meshes so coarse that Cycles' own sampling decides about their light."""
+    cosine = np.abs(np.sum(samples.smooth_normal * samples.geometric_normal, axis=-1))
+    count = np.count_nonzero(cosine < math.cos(COARSE_ANGLE))
+    if count <= COARSE_SHARE * len(samples):
+        return []
+    degrees = math.degrees(COARSE_ANGLE)
+    return [
+        f"{count} of {len(samples)} samples lie on faces whose smooth normals are more than {degrees:.0f} degrees from "
+        "their own: there it depends on how Cycles samples how much light comes from between both horizons (2 %); "
+        "more faces help"
+    ]
 
 
 def _read_emission(manifest: dict, folder: Path) -> np.ndarray:

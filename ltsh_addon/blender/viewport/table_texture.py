@@ -1,8 +1,8 @@
 """A lookup table as textures: the warp and the weights of the moments of every Fresnel curve.
 
 The first layer holds the warp, then each curve takes as many layers as its weights need, four in each. The weights are
-those of `ridge_table`, so that an integral over a polygon is their product with its moments. After the curves of the
-table come those of dielectrics of a few known indices of refraction, summed up beforehand.
+those of `ridge_table.along_directions`, so that an integral over a polygon is their product with its moments. After the
+curves of the table come those of dielectrics of a few known indices of refraction, summed up beforehand.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ IOR_STEPS = 200
 
 def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
     """Texels (N, R, T, 4) in float32, with one more curve for every index of refraction of `iors`."""
-    ridges = ridge_table.prepare(table)
+    ridges = ridge_table.along_directions(table)
     rows, columns, parameters = table.warp.shape
     vectors = (*range(len(ridges.weights)), *(("dielectric", float(ior)) for ior in iors))
     channels = ridges.channels(vectors)

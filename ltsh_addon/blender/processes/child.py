@@ -25,6 +25,7 @@ from .temporary_folders import locked_folder
 # Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
 # on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
 COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
+RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
 
 
 @dataclass(frozen=True)
@@ -202,7 +203,9 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
 def note_coarse_meshes(samples: SurfaceSamples) -> list[str]:
     """The warning about smooth-shaded meshes so coarse that Cycles' own sampling decides about their light."""
     cosine = np.abs(np.sum(samples.smooth_normal * samples.geometric_normal, axis=-1))
-    count = np.count_nonzero(cosine < math.cos(COARSE_ANGLE))
+    # The geometric normal of ribbons that pretend to be round hair is the view direction.
+    is_ribbon = np.abs(np.sum(samples.view * samples.geometric_normal, axis=-1)) > 1.0 - RIBBON_TOLERANCE
+    count = np.count_nonzero((cosine < math.cos(COARSE_ANGLE)) & ~is_ribbon)
     if count <= COARSE_SHARE * len(samples):
         return []
     degrees = math.degrees(COARSE_ANGLE)

@@ -76,7 +76,8 @@ def test_an_image_on_a_light_becomes_patches_of_its_power(shape):
     parts.add_camera()
     bpy.context.view_layer.update()
     lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
-    expected = parts.prepare()[2].lights
+    (textured,) = parts.prepare()[2].lights
+    expected = textured.patches
 
     def power(many):
         return sum(np.linalg.norm(one.area_vector) * one.radiance for one in many)

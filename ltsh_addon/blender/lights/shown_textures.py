@@ -5,6 +5,8 @@ Cycles is not asked, as `light_textures` does: that takes longer than a frame.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ...scene import AreaLight
@@ -36,10 +38,11 @@ class ShownTextures:
             return None
         if patches.error > ERROR:
             notes.append(
-                f"{light.name}: its texture is shown as {len(patches.cells)} patches, "
+                f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
                 f"{100.0 * patches.error:.0f} % off on average"
             )
-        return split_light(light, Patches(patches.cells, patches.radiance * light.radiance, patches.error))
+        shown = (patch for whole in split_light(light, patches) for patch in whole.patches)
+        return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
 
     def _patches_of(self, light: AreaLight, factor: Value) -> Patches | None:
         use = factor.image

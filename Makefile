@@ -3,7 +3,7 @@ SHELL := /bin/bash
 SETUP := bash requirements/setup.sh
 
 # One pytest run may take this many seconds: bpy 4.5 can hang when the interpreter ends. Needs GNU timeout.
-PYTEST_SECONDS ?= 2400
+PYTEST_SECONDS ?= 4800
 LIMIT := $(if $(shell command -v timeout),timeout -k 30 $(PYTEST_SECONDS))
 PYTEST_OPTIONS ?=
 

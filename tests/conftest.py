@@ -46,3 +46,19 @@ def pytest_unconfigure(config):
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(config.stash[EXIT_STATUS])
+
+
+@pytest.fixture
+def child(monkeypatch):
+    """In place of the second Blender one that is none."""
+    import fake_scene
+
+    return fake_scene.FakeChild().install(monkeypatch)
+
+
+@pytest.fixture
+def room(tmp_path):
+    """A file that looks like a .blend, for those who never open it."""
+    path = tmp_path / "room.blend"
+    path.write_bytes(b"BLENDER")
+    return path

@@ -21,18 +21,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
-
-
-@pytest.fixture
-def room(tmp_path):
-    path = tmp_path / "room.blend"
-    path.write_bytes(b"BLENDER")
-    return str(path)
-
-
-@pytest.fixture
 def out(tmp_path):
     return tmp_path / "out"
 
@@ -92,7 +80,7 @@ def test_what_stands_on_stdout_does_not_hang_on_its_encoding(monkeypatch, room, 
         stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii", write_through=True)
         monkeypatch.setattr(sys, "stdout", stdout)
         folder = out / "Bücher"
-        assert cli.main(["compare", room, "-o", str(folder), "--techniques", "ltc", "--quiet", *arguments]) == 0
+        assert cli.main(["compare", str(room), "-o", str(folder), "--techniques", "ltc", "--quiet", *arguments]) == 0
         text = stdout.buffer.getvalue().decode("ascii")
         assert "B\\xfccher" in text or json.loads(text)["lights"][1]["group"] == "鍵"
 
@@ -227,7 +215,7 @@ import importlib.util as util, sys
 find = util.find_spec
 util.find_spec = lambda name, *rest: None if name == "bpy" else find(name, *rest)
 from ltsh_addon import cli
-sys.exit(cli.main(["compare", {room!r}, "-o", {str(out)!r}, "--quiet"]))
+sys.exit(cli.main(["compare", {str(room)!r}, "-o", {str(out)!r}, "--quiet"]))
 """
     done = run_python(code)
     assert (done.returncode, done.stdout) == (1, "") and len(done.stderr.splitlines()) == 1

@@ -3,23 +3,10 @@
 import json
 from pathlib import Path
 
-import fake_scene
 import pytest
 
 from ltsh_addon import __version__, cli, shading
 from ltsh_addon.commands import argument_values, tables_command
-
-
-@pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
-
-
-@pytest.fixture
-def room(tmp_path):
-    path = tmp_path / "room.blend"
-    path.write_bytes(b"BLENDER")
-    return str(path)
 
 
 @pytest.fixture

@@ -3,33 +3,15 @@
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import fake_scene
 import numpy as np
 import pytest
+from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
 from ltsh_addon import imaging, shading
 from ltsh_addon.comparison import compare
-from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
-
-TECHNIQUES = ("ltc", "ltsh4", "reference")
-# Images pass through float32 once; sums of a few of them differ by a few roundings.
-FLOAT32 = 4 * float(np.finfo(np.float32).eps)
-
-
-@pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
-
-
-def options(folder, **changes):
-    given = {"scene": Path("room.blend"), "techniques": TECHNIQUES, "cycles_samples": 64, **changes}
-    return Options(output=folder / "out", **given)
-
-
-def written(folder, name="compare.exr"):
-    return imaging.read_layers(folder / "out" / name)
+from ltsh_addon.comparison.compare import compare_scene, shade_scene
 
 
 def without_seconds(report):

@@ -3,16 +3,10 @@
 import json
 import tomllib
 
-import fake_scene
 import pytest
 
 from ltsh_addon import cli
 from ltsh_addon.jobs.toml_lines import key_lines
-
-
-@pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
 
 
 @pytest.fixture

@@ -12,13 +12,6 @@ from ltsh_addon.jobs import job_steps
 SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
 
 
-@pytest.fixture
-def room(tmp_path):
-    path = tmp_path / "room.blend"
-    path.write_bytes(b"BLENDER")
-    return path
-
-
 def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, room, tmp_path):
     fake_scene.FakeChild().install(monkeypatch)
     messages = io.StringIO()

@@ -17,18 +17,6 @@ from ltsh_addon.jobs.tasks import Job
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
 
-@pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
-
-
-@pytest.fixture
-def room(tmp_path):
-    path = tmp_path / "room.blend"
-    path.write_bytes(b"BLENDER")
-    return path
-
-
 def job(room, output, command="shade", **changes):
     options = Options(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
     return Job(command, options, **{"scenes": (room,), **changes})

@@ -3,7 +3,6 @@
 import shutil
 from pathlib import Path
 
-import fake_scene
 import pytest
 
 from ltsh_addon import cli
@@ -13,18 +12,6 @@ from ltsh_addon.jobs import output_names
 from ltsh_addon.jobs.tasks import Job, shard_of, tasks_of
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
-
-
-@pytest.fixture
-def child(monkeypatch):
-    return fake_scene.FakeChild().install(monkeypatch)
-
-
-@pytest.fixture
-def room(tmp_path):
-    path = tmp_path / "room.blend"
-    path.write_bytes(b"BLENDER")
-    return path
 
 
 def job(room, output, command="shade", **changes):

@@ -106,9 +106,13 @@ def camera_like_view(rig, name):
     view = rig.space.region_3d
     data = bpy.data.cameras.new(name)
     data.sensor_fit, data.sensor_width = "HORIZONTAL", 36.0
-    matrix = view.window_matrix
-    data.lens = 0.5 * data.sensor_width * matrix[0][0]
-    data.shift_x, data.shift_y = 0.5 * matrix[0][2], 0.5 * matrix[1][2] * region.height / region.width
+    matrix, aspect = view.window_matrix, region.height / region.width
+    if view.is_perspective:
+        data.lens = 0.5 * data.sensor_width * matrix[0][0]
+        data.shift_x, data.shift_y = 0.5 * matrix[0][2], 0.5 * matrix[1][2] * aspect
+    else:
+        data.type, data.ortho_scale = "ORTHO", 2.0 / matrix[0][0]
+        data.shift_x, data.shift_y = -0.5 * matrix[0][3], -0.5 * matrix[1][3] * aspect
     data.clip_start, data.clip_end = 0.01, 1000.0
     camera = bpy.data.objects.new(name, data)
     scene.collection.objects.link(camera)

@@ -1,0 +1,282 @@
+"""The engine LTSH while the scene changes under it: shifted and orthographic cameras, deleting and undo, edit mode, images
+that are removed, two windows, another scene, another file.
+
+To be opened with the example scene.
+"""
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+from eyes import (
+    F12,
+    bare_view,
+    camera_like_view,
+    free_view,
+    inside,
+    linear,
+    passes_of,
+    plain_colors,
+    relative_l2,
+    settled,
+    unclipped,
+    view_pixels,
+    without_edges,
+)
+from hands import keys, over, until
+
+SECONDS = 1500
+EXPOSURE = -1.5
+AGREEMENT = 0.01
+RENDER_SECONDS = 240
+OBJECT = "steel sphere"
+
+
+def main(rig):
+    scene = bpy.context.scene
+    scene.render.engine = "LTSH"
+    scene.ltsh_view.technique, scene.ltsh_view.render_samples = "ltsh4", 1
+    bpy.context.preferences.view.render_display_type = "NONE"
+    rig.camera_view()
+    yield 1
+    rig.space.shading.type = "RENDERED"
+    bare_view(rig)
+    plain_colors(scene, EXPOSURE)
+    yield from cameras(rig)
+    whole = yield from settled(rig, "changes_2_whole.png")
+    yield from deleted_and_undone(rig, whole)
+    yield from edited(rig, whole)
+    yield from removed_image(rig)
+    yield from two_windows(rig)
+    yield from another_scene(rig)
+    yield from another_file(rig)
+
+
+def cameras(rig):
+    """The view through a shifted and an orthographic lens is the final render of the same camera."""
+    scene = bpy.context.scene
+    camera, size = scene.camera, (scene.render.resolution_x, scene.render.resolution_y)
+    shift, kind = camera.data.shift_x, camera.data.type
+    for name, values in {
+        "shifted": {"shift_x": 0.2, "shift_y": -0.1},
+        "orthographic": {"type": "ORTHO", "ortho_scale": 6.0},
+    }.items():
+        for key, value in values.items():
+            setattr(camera.data, key, value)
+        rig.camera_view()
+        seen = yield from settled(rig, f"changes_1_{name}.png")
+        scene.camera = camera_like_view(rig, f"Like the view, {name}")
+        found = yield from rendered(rig)
+        scene.camera = camera
+        scene.render.resolution_x, scene.render.resolution_y = size
+        expected = inside(found["LTSH Specular"] + found["LTSH Diffuse"])
+        shown = linear(seen, EXPOSURE)
+        usable = unclipped(seen) & (expected < linear(254.0 / 255.0, EXPOSURE)).all(axis=-1)
+        usable &= frame_of_camera(rig)
+        error = relative_l2(shown, expected, without_edges(shown, expected, usable))
+        rig.fact(f"{name}: relative L2 of the screen against numpy", round(error, 5))
+        rig.check(error < AGREEMENT, f"{name}: the view shows what numpy renders, within {AGREEMENT}")
+    camera.data.shift_x, camera.data.shift_y, camera.data.type = shift, 0.0, kind
+    free_view(rig, camera)
+
+
+def frame_of_camera(rig):
+    """Pixels (H, W) of the view inside the camera's frame: outside Blender draws it darker."""
+    region, data = rig.region(), rig.space.region_3d
+    corners = bpy.context.scene.camera.data.view_frame(scene=bpy.context.scene)
+    matrix = np.array(data.perspective_matrix) @ np.array(bpy.context.scene.camera.matrix_world)
+    at = np.array([[*corner, 1.0] for corner in corners]) @ matrix.T
+    at = (at[:, :2] / at[:, 3:] * 0.5 + 0.5) * (region.width, region.height)
+    (left, low), (right, high) = at.min(axis=0) + 2.0, at.max(axis=0) - 2.0
+    x, y = np.arange(region.width) + 0.5, region.height - np.arange(region.height) - 0.5
+    return inside(((x > left) & (x < right))[None, :] & ((y > low) & (y < high))[:, None])
+
+
+def rendered(rig):
+    """The passes of F12 through the scene's camera."""
+    scene, ended = bpy.context.scene, []
+    complete, cancel = (lambda *_: ended.append("complete")), (lambda *_: ended.append("cancel"))
+    bpy.app.handlers.render_complete.append(complete)
+    bpy.app.handlers.render_cancel.append(cancel)
+    yield from over(rig)
+    rig.xdo("key", F12)
+    yield from until(lambda: ended, RENDER_SECONDS)
+    bpy.app.handlers.render_complete.remove(complete)
+    bpy.app.handlers.render_cancel.remove(cancel)
+    rig.check(ended == ["complete"], f"F12 ends well: {ended}")
+    settings, path = scene.render.image_settings, rig.out / "changes.exr"
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
+    found = passes_of(path)
+    path.unlink()
+    return found
+
+
+def deleted_and_undone(rig, whole):
+    """By the keyboard: what is deleted is gone, what is undone is back."""
+    target = biggest_object_in_view(rig)
+    with rig.override():
+        bpy.ops.object.select_all(action="DESELECT")
+        target.select_set(True)
+        bpy.context.view_layer.objects.active = target
+        bpy.ops.ed.undo_push(message="Selected")
+    name = target.name
+    yield from over(rig)
+    yield from keys(rig, "Delete")
+    yield from until(lambda: name not in bpy.data.objects)
+    without = yield from settled(rig, "changes_3_deleted.png")
+    rig.check(name not in bpy.data.objects, f"Delete removes {name}")
+    rig.check(np.abs(without - whole).mean() > 1e-3, "and the view no longer shows it")
+    yield from over(rig)
+    yield from keys(rig, "ctrl+z")
+    yield from until(lambda: name in bpy.data.objects)
+    again = yield from settled(rig, "changes_3_undone.png")
+    rig.check(name in bpy.data.objects, "Ctrl Z brings it back")
+    rig.check(np.array_equal(again, whole), "and the picture is what it was")
+
+
+def biggest_object_in_view(rig):
+    """The mesh object, no glowing one, on most of some rays through the view."""
+    from bpy_extras import view3d_utils
+
+    region, data, count = rig.region(), rig.space.region_3d, {}
+    graph = bpy.context.evaluated_depsgraph_get()
+    for x in np.linspace(0.3, 0.7, 9):
+        for y in np.linspace(0.2, 0.6, 9):
+            point = x * region.width, y * region.height
+            start = view3d_utils.region_2d_to_origin_3d(region, data, point)
+            hit = bpy.context.scene.ray_cast(graph, start, view3d_utils.region_2d_to_vector_3d(region, data, point))
+            if hit[0]:
+                count[hit[4].original] = count.get(hit[4].original, 0) + 1
+    return max(count, key=count.get)
+
+
+def edited(rig, whole):
+    """Edit mode, a modifier, a new object and a glowing one change the picture and give it back."""
+    target = biggest_object_in_view(rig)
+    with rig.override():
+        bpy.context.view_layer.objects.active = target
+        target.select_set(True)
+        bpy.ops.object.mode_set(mode="EDIT")
+        bpy.ops.mesh.select_all(action="SELECT")
+    yield from settled(rig, "changes_4_edit_mode.png")
+    with rig.override():
+        bpy.ops.transform.translate(value=(0.0, 0.0, 0.3))
+    moved = yield from settled(rig, "changes_4_edited.png")
+    rig.check(np.abs(moved - whole).mean() > 1e-3, "vertices moved in edit mode are seen at once")
+    with rig.override():
+        bpy.ops.transform.translate(value=(0.0, 0.0, -0.3))
+        bpy.ops.object.mode_set(mode="OBJECT")
+    modifier = target.modifiers.new("Array", "ARRAY")
+    modifier.count = 3
+    many = yield from settled(rig, "changes_4_modifier.png")
+    rig.check(np.abs(many - whole).mean() > 1e-3, "a modifier is seen at once")
+    target.modifiers.remove(modifier)
+    before = yield from settled(rig, "changes_4_back.png")
+    error = relative_l2(before, whole, np.ones(whole.shape[:2], bool))
+    rig.check(error < AGREEMENT, f"all taken back the picture is what it was: {error:.5f}")
+    with rig.override():
+        bpy.ops.mesh.primitive_plane_add(size=0.5, location=target.matrix_world.translation)
+    plane = bpy.context.view_layer.objects.active
+    plane.location.z += 1.0
+    material = bpy.data.materials.new("Glow")
+    if not material.node_tree:
+        material.use_nodes = True
+    nodes = material.node_tree.nodes
+    glow = nodes.new("ShaderNodeEmission")
+    glow.inputs["Strength"].default_value = 30.0
+    output = next(node for node in nodes if node.bl_idname == "ShaderNodeOutputMaterial")
+    material.node_tree.links.new(glow.outputs[0], output.inputs[0])
+    plane.data.materials.append(material)
+    lit = yield from settled(rig, "changes_4_glow.png")
+    rig.check(lit.mean() > before.mean() + 1e-3, "a glowing plane lights its surroundings")
+    bpy.data.objects.remove(plane)
+    bpy.data.materials.remove(material)
+    after = yield from settled(rig, "changes_4_no_glow.png")
+    rig.check(np.array_equal(after, before), "removed, it lights nothing")
+
+
+def removed_image(rig):
+    """An image that a material shows is removed from the file while it is seen."""
+    image = bpy.data.images.new("Checks", 8, 8, alpha=False, float_buffer=True)
+    checks = np.indices((8, 8)).sum(axis=0) % 2
+    image.pixels.foreach_set(np.repeat(checks.astype(np.float32).ravel(), 4))
+    image.update()
+    target = biggest_object_in_view(rig)
+    material, slot = bpy.data.materials.new("Checked"), target.material_slots[0]
+    former, slot.material = slot.material, material
+    if not material.node_tree:
+        material.use_nodes = True
+    nodes = material.node_tree.nodes
+    shader = next(node for node in nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
+    texture = nodes.new("ShaderNodeTexImage")
+    texture.image = image
+    material.node_tree.links.new(texture.outputs["Color"], shader.inputs["Base Color"])
+    shown = yield from settled(rig, "changes_5_image.png")
+    image.pixels.foreach_set(np.repeat(1.0 - checks.astype(np.float32).ravel(), 4))
+    image.update()
+    painted = yield from settled(rig, "changes_5_painted.png")
+    rig.check(np.abs(painted - shown).max() > 0.02, "what is painted on an image is seen at once")
+    bpy.data.images.remove(image)
+    gone = yield from settled(rig, "changes_5_removed.png")
+    rig.check(gone.std() > 0.02, "without the image there is still a picture")
+    slot.material = former
+    bpy.data.materials.remove(material)
+
+
+def two_windows(rig):
+    """A light that moves is seen in both windows, and closing one leaves the other as it is."""
+    with rig.override():
+        bpy.ops.screen.area_dupli("INVOKE_DEFAULT")
+    yield 4
+    windows = bpy.context.window_manager.windows
+    rig.check(len(windows) == 2, "there are two windows")
+    second = windows[-1]
+    area = next(area for area in second.screen.areas if area.type == "VIEW_3D")
+    rig.check(area.spaces.active.shading.type == "RENDERED", "both show Rendered shading")
+    rig.shot("changes_6_two_windows.png")
+    light = bpy.data.objects["Neon"]
+    before = light.data.energy
+    light.data.energy = 20.0 * before
+    yield 6
+    rig.shot("changes_6_brighter.png")
+    with bpy.context.temp_override(window=second):
+        bpy.ops.wm.window_close()
+    yield 2
+    brighter = yield from settled(rig, "changes_6_one_window.png")
+    light.data.energy = before
+    darker = yield from settled(rig, "changes_6_back.png")
+    rig.check(brighter.mean() > darker.mean() + 1e-3, "after a window is closed the other follows the lights")
+
+
+def another_scene(rig):
+    """The window shows another scene, which is removed while it is seen."""
+    former = bpy.context.scene
+    before = view_pixels(rig, "changes_7_before.png")
+    empty = bpy.data.scenes.new("Empty")
+    empty.render.engine = "LTSH"
+    plain_colors(empty, EXPOSURE)
+    bpy.context.window.scene = empty
+    pixels = yield from settled(rig, "changes_7_empty.png")
+    rig.check(pixels.std() < 0.1 and np.abs(pixels - before).mean() > 1e-3, "the empty scene shows no surfaces")
+    bpy.data.scenes.remove(empty)
+    rig.check(bpy.context.window.scene == former, "Blender goes back to the first one")
+    pixels = yield from settled(rig, "changes_7_back.png")
+    rig.check(np.array_equal(pixels, before), "whose picture is what it was")
+
+
+def another_file(rig):
+    """A file is opened, and a new one begun, while the engine draws."""
+    other = str(Path(bpy.data.filepath).with_name("changes.blend"))
+    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    before = view_pixels(rig, "changes_8_before.png")
+    for number in (1, 2):
+        bpy.ops.wm.open_mainfile(filepath=other)
+        yield 2
+        pixels = yield from settled(rig, f"changes_8_opened_{number}.png")
+        rig.check(np.array_equal(pixels, before), f"opened, the file shows the same picture ({number})")
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    yield 2
+    rig.check(bpy.context.scene.render.engine != "LTSH", "a new file has its own engine")

@@ -1,0 +1,137 @@
+"""Jobs with several windows and scenes: results go to the scene they were made of, whichever window is closed meanwhile."""
+
+import bpy
+from hands import COMPARE, click_button, job, keys, module, over, settings, until, wait_for_job
+
+SIZE = "1600x900"
+SECONDS = 1500
+
+
+def main(rig):
+    rig.camera_view()
+    rig.panel()
+    yield 1
+    rig.tab("LTSH")
+    settings().techniques, settings().cycles_samples = {"ltc"}, 16
+    yield 3
+    yield from other_window_closed(rig)
+    yield from undone_while_it_runs(rig)
+    yield from own_window_closed(rig)
+    yield from scene_removed(rig)
+
+
+def results_of(scene):
+    return module("interface.results").result_of(scene)
+
+
+def second_window(rig):
+    """A window of its own for the 3D view, with another scene."""
+    with rig.override():
+        bpy.ops.wm.window_new()
+    window = bpy.context.window_manager.windows[-1]
+    return window
+
+
+def starts(rig):
+    yield from click_button(rig, COMPARE)
+    yield from until(lambda: job() is not None)
+    rig.check(job() is not None, "a click on Compare with Cycles starts a job")
+
+
+def other_window_closed(rig):
+    """A second window with a second scene is there while the job runs, and is closed."""
+    first = bpy.context.scene
+    second = second_window(rig)
+    other = first.copy()
+    other.name = "Other"
+    second.scene = other
+    yield 3
+    rig.shot("1_two_windows.png")
+    # The second window lies over the first one until the first is raised.
+    window_raised(rig)
+    yield 2
+    yield from starts(rig)
+    yield 4
+    rig.shot("2_job_in_the_first.png")
+    with bpy.context.temp_override(window=second):
+        bpy.ops.wm.window_close()
+    yield 1
+    rig.check(job() is not None, "closing another window leaves the job alone")
+    yield from wait_for_job(rig, 600)
+    yield 1
+    rig.check(results_of(first) is not None, "the results are those of the scene of the job")
+    rig.check(not other.ltsh.result_folder or other.ltsh.result_folder != first.ltsh.result_folder,
+              "the other scene has none of them")  # fmt: skip
+    rig.shot("3_done.png")
+    bpy.data.scenes.remove(other)
+
+
+def window_raised(rig):
+    rig.xdo("search", "--name", "Blender", "windowraise", "%1")
+
+
+def undone_while_it_runs(rig):
+    """Ctrl Z during a job undoes what the artist did and not the job."""
+    yield 3
+    light = bpy.data.objects["Neon"]
+    name, energy = light.name, light.data.energy
+    with rig.override():
+        bpy.ops.ed.undo_push(message="Before")
+        light.data.energy = 3.0 * energy
+        bpy.ops.ed.undo_push(message="Brighter")
+    yield from starts(rig)
+    yield from over(rig)
+    yield from keys(rig, "ctrl+z")
+    yield from until(lambda: bpy.data.objects[name].data.energy == energy)
+    rig.check(bpy.data.objects[name].data.energy == energy, "Ctrl Z undoes the change of the light")
+    rig.check(job() is not None, "and the job goes on")
+    yield from wait_for_job(rig, 600)
+    yield 1
+    rig.check(results_of(bpy.context.scene) is not None, "its results are shown")
+    rig.check("LTSH cycles.combined" in bpy.data.images, "as images")
+    rig.check(bpy.data.objects[name].data.energy == energy, "and the light stays as the artist left it")
+    rig.shot("4_undone.png")
+
+
+def own_window_closed(rig):
+    """The window in which a job was started is closed: nothing of the job stays, and the next one can start."""
+    second = second_window(rig)
+    yield 3
+    area = next(area for area in second.screen.areas if area.type == "VIEW_3D") if second.screen else None
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    with bpy.context.temp_override(window=second, screen=second.screen, area=area, region=region):
+        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
+    yield from until(lambda: job() is not None)
+    started = job()
+    rig.check(started is not None, "a job starts in the second window")
+    yield 3
+    rig.shot("5_job_in_the_second.png")
+    with bpy.context.temp_override(window=second):
+        bpy.ops.wm.window_close()
+    yield 2
+    rig.check(job() is None or job() is started, "there is at most the job that was started")
+    yield from wait_for_job(rig, 600)
+    yield from until(lambda: not started.folder.exists())
+    rig.check(not started.folder.exists(), "its files are gone")
+    rig.fact("the job of a closed window was", "cancelled" if started.cancelled else "finished")
+    rig.shot("6_closed.png")
+
+
+def scene_removed(rig):
+    """The scene of a job is removed while it runs."""
+    former = bpy.context.scene
+    doomed = former.copy()
+    doomed.name = "Doomed"
+    bpy.context.window.scene = doomed
+    yield 3
+    doomed.ltsh.techniques, doomed.ltsh.cycles_samples = {"ltc"}, 16
+    yield from starts(rig)
+    started = job()
+    yield 3
+    bpy.data.scenes.remove(doomed)
+    yield 1
+    rig.check(bpy.context.scene == former, "the window shows the other scene")
+    yield from wait_for_job(rig, 600)
+    rig.check(not started.error, f"the job ends without an error: {started.error}")
+    yield 1
+    rig.shot("7_scene_removed.png")

@@ -26,7 +26,7 @@ import json, sys, time
 sys.path.insert(0, sys.argv[1])
 from ltsh_addon.blender.interface.job import Job, new_folder
 from ltsh_addon.blender.interface.job_plan import Plan, Step
-job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder())
+job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
 job.start(json.loads(sys.argv[2]), background=False)
 while not job.finished and job.stage == "Starting":
     job.poll()
@@ -146,6 +146,25 @@ def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
     assert image_pixels("LTSH ltsh4.combined").max() > 0.0
     # The choice is there again when Cycles is.
     assert never_ends.ltsh.second == "cycles"
+
+
+class Watcher(Hand):
+    """The window that goes on with a job whose own window was closed."""
+
+    _begin = operators.LTSH_OT_watch._begin
+
+
+def test_a_job_whose_window_is_closed_goes_on_in_another(never_ends):
+    hand = Hand().start()
+    hand.until(lambda: operators.running_job().stage == "Cycles A")
+    job = operators.running_job()
+    hand.cancel(hand.context)
+    assert hand.context.timers == [] and operators.running_job() is job and not job.cancelled
+    other = Watcher().start()
+    assert other.context.status.startswith("Compare with Cycles: ")
+    other.send("ESC", "PRESS")
+    assert other.outcome == {"FINISHED"} and operators.running_job() is None and ended(job)
+    assert other.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
 
 
 def test_cancelling_before_anything_is_finished_says_so(never_ends):

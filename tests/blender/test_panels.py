@@ -136,7 +136,7 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, width):
                     drawn(panel, function, width)
 
     draw_all()
-    operators._running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path)
+    operators._running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
     draw_all()
     operators._running["job"] = None
     for partial in ("Not complete: without Cycles", ""):
@@ -199,7 +199,7 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
 
 def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
     plan = Plan([Step("samples", 30.0), Step("Cycles A", 100.0)])
-    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path)
+    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path, "compare", 0)
     job._take({"stage": "Cycles A", "fraction": 0.25})
     plan._share = 0.25
     shown = drawn(MAIN_3D)

@@ -4,23 +4,20 @@ To be opened with the example scene. The pictures on the screen are compared wit
 same view, whose passes hold what every technique makes of it.
 """
 
-import time
-
 import bpy
 import numpy as np
 from eyes import (
-    F12,
+    AGREEMENT,
     bare_view,
     camera_like_view,
+    check_against_numpy,
+    final_render,
     free_view,
-    inside,
     linear,
-    passes_of,
     plain_colors,
     relative_l2,
     settled,
     unclipped,
-    without_edges,
 )
 from hands import CLICK_SECONDS, drag
 
@@ -28,9 +25,6 @@ SECONDS = 900
 # Dark enough that next to nothing is clipped.
 EXPOSURE = -1.5
 LABELS = {"ltc": "LTC", "ltsh2": "LTSH 2", "ltsh4": "LTSH 4"}
-# Of this the 256 steps of the screen take 0.004.
-AGREEMENT = 0.01
-RENDER_SECONDS = 240
 
 
 def main(rig):
@@ -165,53 +159,19 @@ def difference(rig, seen):
 
 def rendered(rig, seen):
     """F12 through a camera that sees what the view shows."""
-    scene, ended = bpy.context.scene, []
+    scene = bpy.context.scene
     camera, resolution = scene.camera, (scene.render.resolution_x, scene.render.resolution_y)
     scene.camera = camera_like_view(rig, "Like the view")
     view().render_samples, view().technique_passes, view().technique = 1, True, "ltsh4"
-    bpy.context.preferences.view.render_display_type = "SCREEN"
-    bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
-    bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancel"))
-    region = rig.region()
-    rig.xdo("mousemove", region.x + region.width // 2, rig.size[1] - region.y - region.height // 2)
-    yield CLICK_SECONDS
-    start = time.monotonic()
-    rig.xdo("key", F12)
-    while not ended and time.monotonic() < start + RENDER_SECONDS:
-        yield 0.5
-    rig.fact("F12, s", round(time.monotonic() - start, 1))
-    rig.check(ended == ["complete"], f"F12 ends well: {ended}")
-    yield 2
+    found = yield from final_render(rig)
     rig.shot("engine_7_f12.png")
-    compare_with_numpy(rig, seen, saved_passes(rig))
+    for name, label in LABELS.items():
+        picture = found[f"{label} Specular"] + found[f"{label} Diffuse"]
+        usable = check_against_numpy(rig, name, seen[name], picture, EXPOSURE)
+        rig.check(usable.mean() > 0.97, f"{name}: next to nothing of the view is clipped")
     rig.xdo("key", "Escape")
     yield 2
     scene.camera, (scene.render.resolution_x, scene.render.resolution_y) = camera, resolution
-
-
-def saved_passes(rig):
-    """The passes of the last render."""
-    scene, path = bpy.context.scene, rig.out / "engine_f12.exr"
-    settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0, 0):
-        settings.media_type = "MULTI_LAYER_IMAGE"
-    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
-    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
-    found = passes_of(path)
-    path.unlink()
-    return found
-
-
-def compare_with_numpy(rig, seen, found):
-    for name, label in LABELS.items():
-        expected = inside(found[f"{label} Specular"] + found[f"{label} Diffuse"])
-        shown = linear(seen[name], EXPOSURE)
-        usable = unclipped(seen[name]) & (expected < linear(254.0 / 255.0, EXPOSURE)).all(axis=-1)
-        rig.fact(f"{name}: share of clipped pixels", round(1.0 - float(usable.mean()), 4))
-        rig.fact(f"{name}: relative L2 with edges", round(relative_l2(shown, expected, usable), 5))
-        error = relative_l2(shown, expected, without_edges(shown, expected, usable))
-        rig.fact(f"{name}: relative L2 of the screen against numpy", round(error, 5))
-        rig.check(error < AGREEMENT and usable.mean() > 0.97, f"the view shows the {name} of numpy within {AGREEMENT}")
 
 
 def back_to_cycles(rig):

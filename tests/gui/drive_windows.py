@@ -1,4 +1,4 @@
-"""Jobs with several windows and scenes: results go to the scene they were made of, whichever window is closed meanwhile."""
+"""Jobs with several windows and scenes: results go to the scene they were made of, whatever is closed meanwhile."""
 
 import bpy
 from hands import COMPARE, click_button, job, keys, module, over, settings, until, wait_for_job
@@ -27,7 +27,7 @@ def results_of(scene):
 def second_window(rig):
     """A window of its own for the 3D view, with another scene."""
     with rig.override():
-        bpy.ops.wm.window_new()
+        bpy.ops.wm.window_new_main()
     window = bpy.context.window_manager.windows[-1]
     return window
 
@@ -94,27 +94,36 @@ def undone_while_it_runs(rig):
 
 
 def own_window_closed(rig):
-    """The window in which a job was started is closed: nothing of the job stays, and the next one can start."""
-    second = second_window(rig)
-    yield 3
-    area = next(area for area in second.screen.areas if area.type == "VIEW_3D") if second.screen else None
-    region = next(region for region in area.regions if region.type == "WINDOW")
-    with bpy.context.temp_override(window=second, screen=second.screen, area=area, region=region):
-        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield from until(lambda: job() is not None)
-    started = job()
-    rig.check(started is not None, "a job starts in the second window")
-    yield 3
-    rig.shot("5_job_in_the_second.png")
-    with bpy.context.temp_override(window=second):
-        bpy.ops.wm.window_close()
-    yield 2
-    rig.check(job() is None or job() is started, "there is at most the job that was started")
-    yield from wait_for_job(rig, 600)
-    yield from until(lambda: not started.folder.exists())
-    rig.check(not started.folder.exists(), "its files are gone")
-    rig.fact("the job of a closed window was", "cancelled" if started.cancelled else "finished")
-    rig.shot("6_closed.png")
+    """The window in which a job was started is closed: the other one goes on with it, to its end or to Escape."""
+    for end in ("to its end", "to Escape"):
+        second = second_window(rig)
+        yield 3
+        area = next(area for area in second.screen.areas if area.type == "VIEW_3D")
+        region = next(region for region in area.regions if region.type == "WINDOW")
+        with bpy.context.temp_override(window=second, screen=second.screen, area=area, region=region):
+            bpy.ops.ltsh.compare("INVOKE_DEFAULT")
+        yield from until(lambda: job() is not None)
+        started = job()
+        rig.check(started is not None, "a job starts in the second window")
+        yield 3
+        rig.shot("5_job_in_the_second.png")
+        with bpy.context.temp_override(window=second):
+            bpy.ops.wm.window_close()
+        yield 2
+        rig.shot("5_job_in_the_first.png")
+        rig.check(job() is started, f"the window that is left goes on with it {end}")
+        if end == "to Escape":
+            yield from over(rig)
+            yield from keys(rig, "Escape")
+            yield from until(lambda: job() is None)
+            rig.check(started.cancelled, "Escape ends it there")
+        else:
+            yield from wait_for_job(rig, 600)
+            rig.check(not started.cancelled and started.shown == 2, f"{started.shown} of its results are shown")
+        yield from until(lambda folder=started.folder: not folder.exists())
+        rig.check(not started.folder.exists(), "its files are gone")
+        yield 1
+        rig.shot("6_closed.png")
 
 
 def scene_removed(rig):

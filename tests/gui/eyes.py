@@ -1,10 +1,11 @@
 """What the drivers see: the pixels of the 3D view as the screen has them, in linear colors where that is wanted."""
 
 import importlib
+import time
 
 import bpy
 import numpy as np
-from hands import ADDON
+from hands import ADDON, over, until
 
 # Pixels at the edge of a region, over which Blender draws the rounded corners of its areas.
 EDGE = 12
@@ -13,6 +14,9 @@ SETTLE_SECONDS = 0.7
 F12 = 96
 # Graphics cards round corners to 1/256 pixel: at an edge they may see the other surface at a pixel's center.
 EDGE_SHARE = 1e-3
+# Of this the 256 steps of the screen take 0.004.
+AGREEMENT = 0.01
+RENDER_SECONDS = 240
 
 
 def bare_view(rig):
@@ -120,6 +124,49 @@ def camera_like_view(rig, name):
     render = scene.render
     render.resolution_x, render.resolution_y, render.resolution_percentage = region.width, region.height, 100
     return camera
+
+
+def final_render(rig):
+    """Press F12 and wait; the passes of the picture as `passes_of` has them. To be used with `yield from`."""
+    scene, ended = bpy.context.scene, []
+    handlers = {
+        bpy.app.handlers.render_complete: lambda *_: ended.append("complete"),
+        bpy.app.handlers.render_cancel: lambda *_: ended.append("cancel"),
+    }
+    bpy.context.preferences.view.render_display_type = "SCREEN"
+    for event, handler in handlers.items():
+        event.append(handler)
+    yield from over(rig)
+    start = time.monotonic()
+    rig.xdo("key", F12)
+    yield from until(lambda: ended, RENDER_SECONDS)
+    rig.fact("F12, s", round(time.monotonic() - start, 1))
+    rig.check(ended == ["complete"], f"F12 ends well: {ended}")
+    for event, handler in handlers.items():
+        event.remove(handler)
+    yield 2
+    settings, path = scene.render.image_settings, rig.out / "final.exr"
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
+    found = passes_of(path)
+    path.unlink()
+    return found
+
+
+def check_against_numpy(rig, name, seen, expected, exposure, where=True):
+    """Check that the pixels `seen` of the view show `expected`, the final render of the same view with its edge, within
+    `AGREEMENT` in relative L2, over the pixels `where` (H, W) that are not clipped."""
+    expected, shown = inside(expected), linear(seen, exposure)
+    usable = unclipped(seen) & (expected < linear(254.0 / 255.0, exposure)).all(axis=-1)
+    rig.fact(f"{name}: share of clipped pixels", round(1.0 - float(usable.mean()), 4))
+    usable &= where
+    rig.fact(f"{name}: relative L2 with edges", round(relative_l2(shown, expected, usable), 5))
+    error = relative_l2(shown, expected, without_edges(shown, expected, usable))
+    rig.fact(f"{name}: relative L2 of the screen against numpy", round(error, 5))
+    rig.check(error < AGREEMENT, f"{name}: the view shows what numpy renders, within {AGREEMENT}")
+    return usable
 
 
 def passes_of(path):

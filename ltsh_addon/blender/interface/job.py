@@ -31,12 +31,17 @@ SURE_SECONDS = 3.0  # before, nobody knows how long it will take
 class Job:
     """A job that runs, has ended (`finished`), or was `cancelled`.
 
-    `results` are the folders of pictures so far, `error` is "" or one line that says why there are no more.
+    `results` are the folders of pictures so far, `error` is "" or one line that says why there are no more. Of the
+    results the window has `shown` so many; they belong to the scene with the session uid `scene`.
     """
 
     title: str
     plan: Plan
     folder: Path  # temporary, removed at the end
+    command: str  # shade, compare or bake
+    scene: int
+    shown: int = 0
+    output: Path | None = None  # where files for the user go
     stage: str = STARTING
     results: list[Path] = field(default_factory=list)
     error: str = ""

@@ -42,6 +42,7 @@ class _JobOperator:
     def invoke(self, context, event):
         if not self._begin(context):
             return {"CANCELLED"}
+        self._progress = None
         manager = context.window_manager
         self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
         manager.modal_handler_add(self)
@@ -82,15 +83,17 @@ class _JobOperator:
         return {"PASS_THROUGH"}
 
     def cancel(self, context):
-        """Blender ends the operator: its window was closed."""
-        self._job.cancel()
-        self._finish(context)
+        """Blender ends the operator, for its window was closed: another one watches the job from now on."""
+        self._end_timer(context)
+        job = self._job
+        # Only once this window is gone; a Blender that quits calls no timers any more.
+        bpy.app.timers.register(lambda: _watch_elsewhere(job), first_interval=0.0)
 
     def _fail(self, context, error: Exception):
         """End the job with one line, whatever happened here; preferences say whether the console gets more."""
         logging.getLogger(__name__).info("unexpected error", exc_info=error)
         self._job.cancel()
-        self._job.error = f"{self.bl_label} failed: {' '.join(str(error).split()) or type(error).__name__}"
+        self._job.error = f"{self._job.title} failed: {' '.join(str(error).split()) or type(error).__name__}"
         return self._finish(context)
 
     def _begin(self, context) -> bool:
@@ -99,19 +102,19 @@ class _JobOperator:
             self.report({"ERROR"}, reason)
             return False
         folder = new_folder()
-        job = Job(self.bl_label, Plan(job_stages.steps(context, self.command)), folder)
+        plan = Plan(job_stages.steps(context, self.command))
+        job = Job(self.bl_label, plan, folder, self.command, context.scene.session_uid)
         try:
             copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
             save_scene_copy(copy)
-            self._output = job_arguments.output_folder(context.scene, self.command)
+            job.output = job_arguments.output_folder(context.scene, self.command)
             runs = job_arguments.runs(context, self.command, copy)
             job.start(runs, background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
             self.report({"ERROR"}, " ".join(str(error).split()))
             return False
-        self._job, self._scene_uid, self._shown, self._progress = job, context.scene.session_uid, 0, None
-        _running["job"] = job
+        self._job = _running["job"] = job
         return True
 
     def _show_progress(self, context) -> None:
@@ -125,18 +128,21 @@ class _JobOperator:
             redraw_panels()
 
     def _show_results(self, context) -> None:
-        scene = self._scene()
-        while scene is not None and self._shown < len(self._job.results):
-            results.show(scene, self._job.results[self._shown])
+        scene, job = self._scene(), self._job
+        while scene is not None and job.shown < len(job.results):
+            results.show(scene, job.results[job.shown])
             viewer.refresh(scene)
             viewer.put_in_editor(context, scene)
-            self._shown += 1
+            job.shown += 1
 
-    def _finish(self, context):
-        job = self._job
+    def _end_timer(self, context) -> None:
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
+
+    def _finish(self, context):
+        job = self._job
+        self._end_timer(context)
         if running_job() is job:
             _running["job"] = None
         for workspace in bpy.data.workspaces:
@@ -149,19 +155,19 @@ class _JobOperator:
             self.report({"WARNING"}, f"{job.title} was cancelled; {kept}")
         else:
             self._report_success()
-        return {"FINISHED"} if self._shown else {"CANCELLED"}
+        return {"FINISHED"} if job.shown else {"CANCELLED"}
 
     def _kept(self) -> str:
-        scene = self._scene()
-        result = results.result_of(scene) if scene is not None and self._shown else None
+        scene, job = self._scene(), self._job
+        result = results.result_of(scene) if scene is not None and job.shown else None
         if result is None:
-            return f"what was finished is in {self._output}" if self.command == "bake" else "nothing was finished yet"
+            return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
         return f"kept: {', '.join(names)}"
 
     def _scene(self):
         """The scene of the job, also after it was renamed; None where it was removed."""
-        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
+        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._job.scene), None)
 
     def _report_success(self) -> None:
         result = results.result_in(str(self._job.results[-1])) if self._job.results else None
@@ -198,6 +204,22 @@ class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
     command = "bake"
 
 
+class LTSH_OT_watch(_JobOperator, bpy.types.Operator):
+    """Watch the job that runs, whose own window was closed"""
+
+    bl_idname = "ltsh.watch"
+    bl_label = "Watch Job"
+    bl_options = {"UNDO", "INTERNAL"}
+
+    @classmethod
+    def poll(cls, context):
+        return running_job() is not None
+
+    def _begin(self, context) -> bool:
+        self._job = running_job()
+        return True
+
+
 class LTSH_OT_cancel(bpy.types.Operator):
     """Stop the job; pictures that are finished are kept"""
 
@@ -212,6 +234,14 @@ class LTSH_OT_cancel(bpy.types.Operator):
         running_job().cancel()
         redraw_panels()
         return {"FINISHED"}
+
+
+def _watch_elsewhere(job: Job) -> None:
+    """Let the first window that is left watch `job`."""
+    windows = bpy.context.window_manager.windows
+    if running_job() is job and windows:
+        with bpy.context.temp_override(window=windows[0]):
+            bpy.ops.ltsh.watch("INVOKE_DEFAULT")
 
 
 def stage_title(job: Job) -> str:
@@ -252,7 +282,7 @@ def _end_now() -> None:
         job.end_now()
 
 
-CLASSES = (LTSH_OT_shade, LTSH_OT_compare, LTSH_OT_bake, LTSH_OT_cancel)
+CLASSES = (LTSH_OT_shade, LTSH_OT_compare, LTSH_OT_bake, LTSH_OT_watch, LTSH_OT_cancel)
 _register, _unregister = bpy.utils.register_classes_factory(CLASSES)
 
 

@@ -62,16 +62,16 @@ def mesh_batches(ob) -> MeshBatches | None:
         if count == 0:
             return None
         triangles = _get(mesh.loop_triangles, "loops", (count, 3), np.int32)
-        material = _get(mesh.loop_triangles, "material_index", (count,), np.int32)
+        slots = _slots(mesh, count, max(len(ob.material_slots), 1))
         corners = len(mesh.loops)
-        vertex = _get(mesh.loops, "vertex_index", (corners,), np.int32)
-        place = _get(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)[vertex]
+        # Attributes are copied as they lie in memory, `mesh.loops` and `mesh.vertices` one by one.
+        vertex = _get(mesh.attributes[".corner_vert"].data, "value", (corners,), np.int32)
+        place = _get(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
         normal = _get(mesh.corner_normals, "vector", (corners, 3), np.float32)
         uv = _uv_maps(mesh, corners)
         is_smooth = mesh.normals_domain != "FACE"
     finally:
         ob.to_mesh_clear()
-    slots = np.clip(material, 0, max(len(ob.material_slots) - 1, 0))
     used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
     indices = {
         slot: gpu.types.GPUIndexBuf(
@@ -79,9 +79,16 @@ def mesh_batches(ob) -> MeshBatches | None:
         )
         for slot in used
     }
-    buffer = _vertex_buffer({"position": place, "normal": normal})
+    buffer = _vertex_buffer({"position": place[vertex], "normal": normal})
     middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
     return MeshBatches(used, count, indices, buffer, corners, uv, middle, is_smooth)
+
+
+def _slots(mesh, count: int, slots: int) -> np.ndarray:
+    """The material slot (count,) of every triangle."""
+    if slots == 1:
+        return np.zeros(count, np.int32)
+    return np.clip(_get(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
 
 
 def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:

@@ -129,12 +129,12 @@ def camera_like_view(rig, name):
 def final_render(rig):
     """Press F12 and wait; the passes of the picture as `passes_of` has them. To be used with `yield from`."""
     scene, ended = bpy.context.scene, []
-    handlers = {
-        bpy.app.handlers.render_complete: lambda *_: ended.append("complete"),
-        bpy.app.handlers.render_cancel: lambda *_: ended.append("cancel"),
-    }
+    handlers = [
+        (bpy.app.handlers.render_complete, lambda *_: ended.append("complete")),
+        (bpy.app.handlers.render_cancel, lambda *_: ended.append("cancel")),
+    ]
     bpy.context.preferences.view.render_display_type = "SCREEN"
-    for event, handler in handlers.items():
+    for event, handler in handlers:
         event.append(handler)
     yield from over(rig)
     start = time.monotonic()
@@ -142,7 +142,7 @@ def final_render(rig):
     yield from until(lambda: ended, RENDER_SECONDS)
     rig.fact("F12, s", round(time.monotonic() - start, 1))
     rig.check(ended == ["complete"], f"F12 ends well: {ended}")
-    for event, handler in handlers.items():
+    for event, handler in handlers:
         event.remove(handler)
     yield 2
     settings, path = scene.render.image_settings, rig.out / "final.exr"

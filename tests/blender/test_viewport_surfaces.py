@@ -5,16 +5,11 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from graphics_card import with_graphics
-from view_pictures import SIZE, away_from_edges, viewport_picture
+from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon import shading
 from ltsh_addon.blender.materials.surface_looks import look_of
-from ltsh_addon.blender.processes import child
 from ltsh_addon.blender.viewport import view_text
-
-COLUMNS = 4
-# Mesa's llvmpipe decodes the colors of sRGB images by a polynomial, up to 0.7 % off; without them 5e-3 would do.
-RELATIVE, ABSOLUTE = 1e-2, 1e-4
 
 
 def image(name, is_data=False, shape=(8, 8)):
@@ -181,20 +176,6 @@ def patches_of(materials):
     return scene, camera
 
 
-def sampled_pictures(path, passes, rows):
-    """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
-    sees, or -1."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = child.extract(child.ExtractOptions(scene=path))
-    shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
-    square = np.full(SIZE[0] * SIZE[1], -1)
-    column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)
-                   for axis, count in enumerate((COLUMNS, rows)))  # fmt: skip
-    square[found.film.pixel] = COLUMNS * row + column
-    pictures = {name: found.film.image(getattr(shaded, name).sum(axis=0)) for name in passes}
-    return pictures, square.reshape(SIZE[1], SIZE[0])
-
-
 @pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
 @pytest.mark.parametrize(
     ("materials", "kind", "passes"),
@@ -210,7 +191,7 @@ def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind, passe
     failures = []
     for name, (picture, notes) in zip(passes, seen, strict=True):
         assert notes == []
-        times = np.abs(picture - expected[name]) / (ABSOLUTE + RELATIVE * np.abs(expected[name]))
+        times = times_too_far(picture, expected[name])
         for number in range(len(materials)):
             pixels = usable & (square == number)
             assert pixels.sum() > 50

@@ -6,11 +6,16 @@ import bpy
 import numpy as np
 from graphics_card import Canvas
 
+from ltsh_addon import shading
+from ltsh_addon.blender.processes import child
 from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
 from ltsh_addon.blender.viewport.surface_pass import View
 from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
 
 SIZE = (96, 72)
+COLUMNS = 4
+# Mesa's llvmpipe decodes the colors of sRGB images by a polynomial, up to 0.7 % off; without them 5e-3 would do.
+RELATIVE, ABSOLUTE = 1e-2, 1e-4
 
 
 def viewport_picture(camera, shown, is_parallel):
@@ -36,3 +41,22 @@ def away_from_edges(square):
             same &= np.roll(square, step, axis) == square
     same[0] = same[-1] = same[:, 0] = same[:, -1] = False
     return same
+
+
+def sampled_pictures(path, passes, rows):
+    """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
+    sees, or -1."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    found = child.extract(child.ExtractOptions(scene=path))
+    shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
+    square = np.full(SIZE[0] * SIZE[1], -1)
+    column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)
+                   for axis, count in enumerate((COLUMNS, rows)))  # fmt: skip
+    square[found.film.pixel] = COLUMNS * row + column
+    pictures = {name: found.film.image(getattr(shaded, name).sum(axis=0)) for name in passes}
+    return pictures, square.reshape(SIZE[1], SIZE[0])
+
+
+def times_too_far(picture, expected):
+    """How many times as far `picture` is from what is expected as it may be, by number."""
+    return np.abs(picture - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))

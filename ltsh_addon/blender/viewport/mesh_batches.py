@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import gpu
 import numpy as np
 
+from .mesh_normals import interpolated_normals, own_normals, read
+
 
 @dataclass
 class MeshBatches:
@@ -61,15 +63,20 @@ def mesh_batches(ob) -> MeshBatches | None:
         count = len(mesh.loop_triangles)
         if count == 0:
             return None
-        triangles = _get(mesh.loop_triangles, "loops", (count, 3), np.int32)
+        triangles = read(mesh.loop_triangles, "loops", (count, 3), np.int32)
         slots = _slots(mesh, count, max(len(ob.material_slots), 1))
-        corners = len(mesh.loops)
         # Attributes are copied as they lie in memory, `mesh.loops` and `mesh.vertices` one by one.
-        vertex = _get(mesh.attributes[".corner_vert"].data, "value", (corners,), np.int32)
-        place = _get(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
-        normal = _get(mesh.corner_normals, "vector", (corners, 3), np.float32)
-        uv = _uv_maps(mesh, corners)
-        is_smooth = mesh.normals_domain != "FACE"
+        vertex = read(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
+        place = read(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
+        middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
+        place, uv = place[vertex], _uv_maps(mesh, len(vertex))
+        normal, flat = interpolated_normals(mesh, vertex)
+        if flat.any():
+            chosen, own = own_normals(mesh, flat, triangles, place, normal)
+            corners = triangles[chosen].ravel()
+            triangles[chosen] = len(vertex) + np.arange(len(corners)).reshape(-1, 3)
+            place, normal = np.concatenate([place, place[corners]]), np.concatenate([normal, own.repeat(3, axis=0)])
+            uv = {name: np.concatenate([values, values[corners]]) for name, values in uv.items()}
     finally:
         ob.to_mesh_clear()
     used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
@@ -79,28 +86,21 @@ def mesh_batches(ob) -> MeshBatches | None:
         )
         for slot in used
     }
-    buffer = _vertex_buffer({"position": place[vertex], "normal": normal})
-    middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
-    return MeshBatches(used, count, indices, buffer, corners, uv, middle, is_smooth)
+    buffer = _vertex_buffer({"position": place, "normal": normal})
+    return MeshBatches(used, count, indices, buffer, len(place), uv, middle, not flat.all())
 
 
 def _slots(mesh, count: int, slots: int) -> np.ndarray:
     """The material slot (count,) of every triangle."""
     if slots == 1:
         return np.zeros(count, np.int32)
-    return np.clip(_get(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
+    return np.clip(read(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
 
 
 def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:
     maps = {}
     for layer in mesh.uv_layers:
-        maps[layer.name] = _get(layer.uv, "vector", (corners, 2), np.float32)
+        maps[layer.name] = read(layer.uv, "vector", (corners, 2), np.float32)
         if layer.active_render:
             maps[""] = maps[layer.name]
     return maps
-
-
-def _get(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
-    values = np.empty(int(np.prod(shape)), dtype)
-    collection.foreach_get(name, values)
-    return values.reshape(shape)

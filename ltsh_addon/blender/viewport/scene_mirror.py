@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import bpy
@@ -38,6 +39,7 @@ class ShownInstance:
     receiver: int
     side: float  # -1 where the transform mirrors
     center: np.ndarray  # (4,) of the bounding box in the world
+    is_only_user: bool  # of the mesh
 
 
 @dataclass
@@ -146,9 +148,10 @@ class SceneMirror:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
         instances, meshes, looks = [], {}, {}
+        users = _users(depsgraph)
         for instance in depsgraph.object_instances:
             ob = instance.object
-            if ob.type not in SURFACE_TYPES or not instance.show_self or not in_view(instance):
+            if not _is_surface(instance) or not in_view(instance):
                 continue
             key = _mesh_key(instance)
             if key not in meshes:
@@ -169,7 +172,8 @@ class SceneMirror:
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            instances.append(ShownInstance(mesh, model, shown, receiver, side, center))
+            is_only_user = users[_data_pointer(ob)] == 1
+            instances.append(ShownInstance(mesh, model, shown, receiver, side, center, is_only_user))
         self.instances, self._meshes, self._looks = instances, meshes, looks
 
     def _read_world(self, scene) -> None:
@@ -187,6 +191,19 @@ def _originals(depsgraph) -> list:
     return [ob.original for ob in depsgraph.objects]
 
 
+def _is_surface(instance) -> bool:
+    return instance.object.type in SURFACE_TYPES and instance.show_self
+
+
+def _users(depsgraph) -> Counter:
+    """How many instances show the same evaluated data, by `_data_pointer`."""
+    return Counter(_data_pointer(found.object) for found in depsgraph.object_instances if _is_surface(found))
+
+
+def _data_pointer(ob) -> int:
+    return ob.data.as_pointer() if ob.data is not None else 0
+
+
 def _mesh_key(instance) -> tuple:
     """What tells evaluated meshes apart: object, data and instancer, then the evaluated data itself.
 
@@ -196,7 +213,7 @@ def _mesh_key(instance) -> tuple:
     data = ob.data
     parent = instance.parent.original.session_uid if instance.is_instance and instance.parent else 0
     original = data.original.session_uid if data is not None and data.original is not None else 0
-    pointer = data.as_pointer() if data is not None else 0
+    pointer = _data_pointer(ob)
     shared = isinstance(data, bpy.types.Mesh) and not ob.modifiers and not instance.is_instance
     return (0 if shared else ob.original.session_uid, original, parent, pointer)
 

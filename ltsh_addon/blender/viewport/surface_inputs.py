@@ -85,11 +85,13 @@ vec3 slot_value(sampler2D image, int slot, vec2 uv)
 """
 
 NORMALS = """
-/* Normal of a tangent space normal map; tangents follow from the derivatives of position and UV. */
+/* Normal of a tangent space normal map, which bends the normal of the object before that is transformed, as in Cycles;
+ * tangents follow from the derivatives of position and UV. */
 vec3 mapped_normal(vec3 normal, bool backfacing)
 {
-  vec3 along_x = dFdx(v_position);
-  vec3 along_y = dFdy(v_position);
+  mat3 to_object = inverse(mat3(model));
+  vec3 along_x = to_object * dFdx(v_position);
+  vec3 along_y = to_object * dFdy(v_position);
   vec2 uv_x = dFdx(v_uv);
   vec2 uv_y = dFdy(v_uv);
   vec3 towards_u = along_x * uv_y.y - along_y * uv_x.y;
@@ -98,16 +100,17 @@ vec3 mapped_normal(vec3 normal, bool backfacing)
   if (turn == 0.0) {
     return normal;
   }
-  vec3 smooth_normal = backfacing ? -normal : normal;
+  vec3 unbent = v_object_normal;
   towards_u *= sign(turn);
   towards_v *= sign(turn);
-  vec3 tangent = normalize(towards_u - dot(towards_u, smooth_normal) * smooth_normal);
-  vec3 bitangent = cross(smooth_normal, tangent);
+  vec3 tangent = normalize(towards_u - dot(towards_u, unbent) / dot(unbent, unbent) * unbent);
+  vec3 bitangent = cross(unbent, tangent);
   bitangent *= dot(bitangent, towards_v) < 0.0 ? -1.0 : 1.0;
   vec3 color = 2.0 * slot_value(normal_image, 4, v_uv) - 1.0;
   float strength = look.data[0].w;
   color = vec3(color.xy * strength, mix(1.0, color.z, clamp(strength, 0.0, 1.0)));
-  vec3 bent = normalize(color.x * tangent + color.y * bitangent + color.z * smooth_normal);
+  vec3 bent = color.x * tangent + color.y * bitangent + color.z * unbent;
+  bent = normalize(transpose(to_object) * bent);
   return backfacing ? -bent : bent;
 }
 

@@ -130,7 +130,8 @@ class SurfacePass:
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             shader.uniform_float("model", instance.model)
             if with_images:
-                shader.uniform_float("placement", (instance.receiver, instance.side, instance.mesh.is_smooth, 0.0))
+                marks = instance.mesh.is_smooth, instance.is_only_user
+                shader.uniform_float("placement", (instance.receiver, instance.side, *marks))
             for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
                 shader.uniform_block("look", look.uniforms)
                 if with_images:
@@ -175,6 +176,7 @@ def _shader(outputs):
     # What a shader does not use is not there for whom sets it.
     if outputs != EMISSION:
         info.push_constant("VEC4", "placement")
+    info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
     images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
     for slot, name in enumerate(("positions",) if outputs == EMISSION else images):
         info.sampler(slot, "FLOAT_2D", name)
@@ -184,6 +186,7 @@ def _shader(outputs):
     passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}")
     passed.smooth("VEC3", "v_position")
     passed.smooth("VEC3", "v_normal")
+    passed.smooth("VEC3", "v_object_normal")
     passed.smooth("VEC2", "v_uv")
     info.vertex_out(passed)
     for slot, name in enumerate(outputs):

@@ -1,0 +1,62 @@
+"""Which normals Cycles gives the triangles of an evaluated mesh: interpolated ones, or the triangle's own."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+# Before, Cycles did not take corner normals where only faces are sharp.
+_CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
+# Between the normals of a face and of its triangles, where they count as one.
+_SAME = 1e-5
+
+
+def read(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
+    """An array of `shape` of a property of all items of one of Blender's collections."""
+    values = np.empty(int(np.prod(shape)), dtype)
+    collection.foreach_get(name, values)
+    return values.reshape(shape)
+
+
+def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (C, 3) at the corners, which stand at the vertices `vertex` (C,), and the mask (F,) of the faces whose
+    triangles are flat: there Cycles interpolates nothing.
+
+    Faces count as flat as far as Cycles says so, which is not always how Blender's solid view shows them: with normals
+    at all corners none are, and edges that are all sharp make none.
+    """
+    faces = len(mesh.polygons)
+    sharp = _marks(mesh, "sharp_face", faces)
+    by_vertex = not mesh.has_custom_normals and not sharp.all() and _edges_do_not_count(mesh, sharp)
+    if by_vertex:
+        normal = read(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32)[vertex]
+    else:
+        normal = read(mesh.corner_normals, "vector", (len(vertex), 3), np.float32)
+    flat = sharp if by_vertex or mesh.normals_domain == "FACE" else np.zeros(faces, bool)
+    return normal, flat
+
+
+def _edges_do_not_count(mesh, sharp_faces: np.ndarray) -> bool:
+    """True where Cycles takes normals of vertices, with sharp faces apart."""
+    edges = _marks(mesh, "sharp_edge", len(mesh.edges))
+    return bool(edges.all() if edges.any() else not _CORNERS_OF_SHARP_FACES or not sharp_faces.any())
+
+
+def _marks(mesh, name: str, count: int) -> np.ndarray:
+    attribute = mesh.attributes.get(name)
+    return np.zeros(count, bool) if attribute is None else read(attribute.data, "value", (count,), bool)
+
+
+def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray, normal: np.ndarray):
+    """Triangles (K,) that need corners of their own, and their normals (K, 3): those of faces `flat` (F,) that are not
+    plane. `triangles` (T, 3) are corners with places and normals (C, 3)."""
+    candidates = np.arange(len(triangles))
+    if not flat.all():
+        face = read(mesh.loop_triangle_polygons, "value", (len(triangles),), np.int32)
+        candidates = np.nonzero(flat[face])[0]
+    first, second, third = (place[triangles[candidates, corner]] for corner in range(3))
+    own = np.cross(second - first, third - first)
+    length = np.sqrt((own * own).sum(axis=1, keepdims=True))
+    own = np.divide(own, length, out=np.zeros_like(own), where=length > 0.0)
+    differs = (np.abs(normal[triangles[candidates]] - own[:, None]) > _SAME).any(axis=(1, 2)) & (length[:, 0] > 0.0)
+    return candidates[differs], own[differs]

@@ -1,5 +1,5 @@
-"""Normals of the viewport against those of Cycles: flat, smooth and mixed faces, sharp edges, normals of
-their own, and what becomes of them where objects are stretched."""
+"""Normals of the viewport against those of Cycles: flat, smooth and mixed faces, sharp edges, custom normals, stretched
+objects, normal maps."""
 
 import bpy
 import numpy as np
@@ -9,7 +9,7 @@ from graphics_card import with_graphics
 from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.viewport import mesh_normals
+from ltsh_addon.blender.viewport import mesh_normals, mesh_tangents
 
 # Heights of two quads side by side, neither of them plane.
 HEIGHTS = (0.0, 0.1, 0.0, 0.1, 0.0, 0.15)
@@ -141,8 +141,33 @@ def test_stretched_objects_shine_as_in_cycles(tmp_path):
     assert notes == [] and flat.data.normals_domain == "FACE"
     times = times_too_far(picture, expected["specular"]).max(axis=-1)
     usable = away_from_edges(square)
-    # At the edges between faces a pixel may see the one or the other; with a normal map, whose tangents the viewport
-    # takes by triangle, radiance jumps there.
-    shares = {number: (times[usable & (square == number)] > 1.0).mean() for number in range(2 * COLUMNS)}
-    print({k: round(float(v), 3) for k, v in shares.items()}, [times[usable & (square == n)].max() for n in range(8)])
-    assert all(share < (0.05 if number < 6 else 0.3) for number, share in shares.items()), shares
+    worst = {number: times[usable & (square == number)].max() for number in range(2 * COLUMNS)}
+    # Beside pixels on the edges between flat faces, which may see the one or the other.
+    assert max(worst.values()) < 1.0, worst
+
+
+def test_tangents_are_those_of_mikktspace():
+    """Blender's own are for quads where there are some: the mesh is of triangles, some of them mirrored in UV."""
+    parts.empty_scene()
+    mesh = dome("Dome", parts.principled("Metal")[0], 0, 0).data
+    triangles = [order for a, b, c, d in (face.vertices for face in mesh.polygons) for order in ((a, b, c), (a, c, d))]
+    place = np.array([vertex.co for vertex in mesh.vertices])
+    mesh = parts.add_mesh("Triangles", place.tolist(), triangles).data
+    corner = np.array([loop.vertex_index for loop in mesh.loops])
+    x, y = place[corner, :2].T
+    uv = np.stack([np.abs(x - 0.1), y + 0.3 * x * x], axis=-1).astype(np.float32)
+    mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.ravel())
+    mesh.calc_tangents()
+    expected = np.array([[*loop.tangent, loop.bitangent_sign] for loop in mesh.loops])
+    normal = np.array([loop.normal for loop in mesh.loops], np.float32)
+    triangles = np.arange(len(corner)).reshape(-1, 3)
+    found = mesh_tangents.corner_tangents(place[corner].astype(np.float32), normal, uv, triangles)
+    assert set(expected[:, 3]) == {-1.0, 1.0}
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+
+
+def test_without_area_in_uv_tangents_are_those_of_nothing():
+    place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+    up, uv = np.tile(np.float32([0, 0, 1]), (3, 1)), np.full((3, 2), 0.5, np.float32)
+    found = mesh_tangents.corner_tangents(place, up, uv, np.array([[0, 1, 2]]))
+    np.testing.assert_array_equal(found, np.tile([1.0, 0.0, 0.0, -1.0], (3, 1)))

@@ -8,6 +8,7 @@ import gpu
 import numpy as np
 
 from .mesh_normals import interpolated_normals, own_normals, read
+from .mesh_tangents import corner_tangents
 
 
 @dataclass
@@ -23,6 +24,7 @@ class MeshBatches:
     middle: np.ndarray  # (3,) of the bounding box
     is_smooth: bool  # do normals differ from those of the faces?
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
+    _tangents: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
 
     def batch(self, slot: int, uv_map: str) -> gpu.types.GPUBatch:
@@ -31,8 +33,19 @@ class MeshBatches:
         if key not in self._batches:
             batch = gpu.types.GPUBatch(type="TRIS", buf=self.corners, elem=self.indices[slot])
             batch.vertbuf_add(self._uv_buffer(uv_map))
+            if uv_map in self._tangents:
+                batch.vertbuf_add(self._tangents[uv_map])
             self._batches[key] = batch
         return self._batches[key]
+
+    def add_tangents(self, ob, uv_map: str) -> None:
+        """Make sure that normal maps on `uv_map` have tangents; `ob` is an evaluated object with this mesh."""
+        if uv_map in self._tangents or uv_map not in self.uv:
+            return
+        found = _arrays(ob)
+        tangents = corner_tangents(found.place, found.normal, found.uv[uv_map], found.triangles)
+        self._tangents[uv_map] = _vertex_buffer({"tangent": tangents})
+        self._batches.clear()
 
     def _uv_buffer(self, uv_map: str) -> gpu.types.GPUVertBuf:
         if uv_map not in self._uv_buffers:
@@ -53,8 +66,37 @@ def _vertex_buffer(attributes: dict[str, np.ndarray]) -> gpu.types.GPUVertBuf:
     return buffer
 
 
+@dataclass
+class _Arrays:
+    """Corners and triangles of an evaluated mesh; flat faces that are not plane have corners of their own."""
+
+    triangles: np.ndarray  # (T, 3) of corners
+    slots: np.ndarray  # (T,)
+    place: np.ndarray  # (C, 3)
+    normal: np.ndarray  # (C, 3)
+    uv: dict[str, np.ndarray]
+    middle: np.ndarray  # (3,)
+    is_smooth: bool
+
+
 def mesh_batches(ob) -> MeshBatches | None:
     """Those of the evaluated object `ob`; None where it has no faces."""
+    found = _arrays(ob)
+    if found is None:
+        return None
+    triangles, slots = found.triangles, found.slots
+    used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
+    indices = {
+        slot: gpu.types.GPUIndexBuf(
+            type="TRIS", seq=triangles if len(used) == 1 else np.ascontiguousarray(triangles[slots == slot])
+        )
+        for slot in used
+    }
+    buffer = _vertex_buffer({"position": found.place, "normal": found.normal})
+    return MeshBatches(used, len(triangles), indices, buffer, len(found.place), found.uv, found.middle, found.is_smooth)
+
+
+def _arrays(ob) -> _Arrays | None:
     mesh = ob.to_mesh()
     if mesh is None:
         return None
@@ -79,15 +121,7 @@ def mesh_batches(ob) -> MeshBatches | None:
             uv = {name: np.concatenate([values, values[corners]]) for name, values in uv.items()}
     finally:
         ob.to_mesh_clear()
-    used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
-    indices = {
-        slot: gpu.types.GPUIndexBuf(
-            type="TRIS", seq=triangles if len(used) == 1 else np.ascontiguousarray(triangles[slots == slot])
-        )
-        for slot in used
-    }
-    buffer = _vertex_buffer({"position": place, "normal": normal})
-    return MeshBatches(used, count, indices, buffer, len(place), uv, middle, not flat.all())
+    return _Arrays(triangles, slots, place, normal, uv, middle, not flat.all())
 
 
 def _slots(mesh, count: int, slots: int) -> np.ndarray:

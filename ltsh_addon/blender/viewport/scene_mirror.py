@@ -169,6 +169,9 @@ class SceneMirror:
             parent = instance.parent.original.name_full if instance.is_instance and instance.parent else ""
             receiver = receivers.numbers.get(parent, receivers.numbers.get(ob.original.name_full, 0))
             shown = tuple(looks[material.name_full if material else ""] for material in materials)
+            for look in shown:
+                if look.look.normal is not None:
+                    mesh.add_tangents(ob, look.look.uv_map)
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]

@@ -85,32 +85,20 @@ vec3 slot_value(sampler2D image, int slot, vec2 uv)
 """
 
 NORMALS = """
-/* Normal of a tangent space normal map, which bends the normal of the object before that is transformed, as in Cycles;
- * tangents follow from the derivatives of position and UV. */
+/* Normal of a tangent space normal map. As in Cycles it bends the normal of the object before that is transformed, and
+ * interpolated tangents are not made unit vectors. */
 vec3 mapped_normal(vec3 normal, bool backfacing)
 {
-  mat3 to_object = inverse(mat3(model));
-  vec3 along_x = to_object * dFdx(v_position);
-  vec3 along_y = to_object * dFdy(v_position);
-  vec2 uv_x = dFdx(v_uv);
-  vec2 uv_y = dFdy(v_uv);
-  vec3 towards_u = along_x * uv_y.y - along_y * uv_x.y;
-  vec3 towards_v = along_y * uv_x.x - along_x * uv_y.x;
-  float turn = uv_x.x * uv_y.y - uv_x.y * uv_y.x;
-  if (turn == 0.0) {
+  if (dot(v_tangent.xyz, v_tangent.xyz) == 0.0) {
     return normal;
   }
-  vec3 unbent = v_object_normal;
-  towards_u *= sign(turn);
-  towards_v *= sign(turn);
-  vec3 tangent = normalize(towards_u - dot(towards_u, unbent) / dot(unbent, unbent) * unbent);
-  vec3 bitangent = cross(unbent, tangent);
-  bitangent *= dot(bitangent, towards_v) < 0.0 ? -1.0 : 1.0;
+  vec3 unbent = UNIT_NORMALS ? normalize(v_object_normal) : v_object_normal;
+  vec3 bitangent = v_tangent.w * cross(unbent, v_tangent.xyz);
   vec3 color = 2.0 * slot_value(normal_image, 4, v_uv) - 1.0;
   float strength = look.data[0].w;
   color = vec3(color.xy * strength, mix(1.0, color.z, clamp(strength, 0.0, 1.0)));
-  vec3 bent = color.x * tangent + color.y * bitangent + color.z * unbent;
-  bent = normalize(transpose(to_object) * bent);
+  vec3 bent = color.x * v_tangent.xyz + color.y * bitangent + color.z * unbent;
+  bent = normalize(transpose(inverse(mat3(model))) * bent);
   return backfacing ? -bent : bent;
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import bpy
 import gpu
 import numpy as np
 from mathutils import Matrix
@@ -19,6 +20,8 @@ from .surface_uniforms import DEFINES, LOOK_SIZE, albedo_table, blend_table, flo
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
 EMISSION = ("emission",)
+# Before, Cycles left interpolated normals as long as they are.
+NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
 # That of images which are not found, as in Cycles.
 MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)
 
@@ -176,6 +179,7 @@ def _shader(outputs):
     # What a shader does not use is not there for whom sets it.
     if outputs != EMISSION:
         info.push_constant("VEC4", "placement")
+    info.define("UNIT_NORMALS", "true" if NORMAL_MAPS_BEND_UNIT_NORMALS else "false")
     info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
     images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
     for slot, name in enumerate(("positions",) if outputs == EMISSION else images):
@@ -183,11 +187,14 @@ def _shader(outputs):
     info.vertex_in(0, "VEC3", "position")
     info.vertex_in(1, "VEC3", "normal")
     info.vertex_in(2, "VEC2", "uv")
+    # Meshes without normal maps have none: they get (0, 0, 0, 1).
+    info.vertex_in(3, "VEC4", "tangent")
     passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}")
     passed.smooth("VEC3", "v_position")
     passed.smooth("VEC3", "v_normal")
     passed.smooth("VEC3", "v_object_normal")
     passed.smooth("VEC2", "v_uv")
+    passed.smooth("VEC4", "v_tangent")
     info.vertex_out(passed)
     for slot, name in enumerate(outputs):
         info.fragment_out(slot, "VEC4", f"out_{name}")

@@ -13,6 +13,7 @@ void main()
   v_normal /= ONLY_USER ? max(length(v_normal), 1e-30) : 1.0;
   v_object_normal = normal;
   v_uv = uv;
+  v_tangent = tangent;
   gl_Position = view.projection * world;
 }
 """

@@ -111,14 +111,15 @@ def _arrays(ob) -> _Arrays | None:
         vertex = read(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
         place = read(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
-        place, uv = place[vertex], _uv_maps(mesh, len(vertex))
+        place, uv = place.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
         normal, flat = interpolated_normals(mesh, vertex)
         if flat.any():
             chosen, own = own_normals(mesh, flat, triangles, place, normal)
             corners = triangles[chosen].ravel()
             triangles[chosen] = len(vertex) + np.arange(len(corners)).reshape(-1, 3)
-            place, normal = np.concatenate([place, place[corners]]), np.concatenate([normal, own.repeat(3, axis=0)])
-            uv = {name: np.concatenate([values, values[corners]]) for name, values in uv.items()}
+            normal = np.concatenate([normal, own.repeat(3, axis=0)])
+            place = np.concatenate([place, place.take(corners, axis=0)])
+            uv = {name: np.concatenate([values, values.take(corners, axis=0)]) for name, values in uv.items()}
     finally:
         ob.to_mesh_clear()
     return _Arrays(triangles, slots, place, normal, uv, middle, not flat.all())

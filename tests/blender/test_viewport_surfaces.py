@@ -202,6 +202,29 @@ def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind, passe
     assert not failures, "\n".join(failures)
 
 
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_what_cameras_do_not_see_is_not_shown(tmp_path):
+    _, camera = patches_of(MATERIALS[:4])
+    planes = [ob for ob in bpy.data.objects if ob.type == "MESH"]
+    planes[0].visible_camera = False
+    instancer = parts.link(bpy.data.objects.new("Instancer", None))
+    instancer.instance_type, instancer.instance_collection = "COLLECTION", bpy.data.collections.new("Inside")
+    instancer.visible_camera = False
+    instancer.instance_collection.objects.link(parts.add_plane(MATERIALS[0](), location=(1.5, 0.5, 0.2), name="Inside"))
+    bpy.context.scene.collection.objects.unlink(bpy.data.objects["Inside"])
+    # What lies behind a holdout is not seen either.
+    planes[2].is_holdout = True
+    parts.add_plane(MATERIALS[1](), size=8.0, location=(0.0, 0.0, -0.3))
+    bpy.context.view_layer.update()
+    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse", False)])
+    expected, square = sampled_pictures(tmp_path / "hidden.blend", ("diffuse",), 1)
+    assert notes == []
+    hidden = expected["diffuse"].max(axis=-1) == 0.0
+    assert hidden.sum() > 100 and not hidden.all()
+    same = (times_too_far(picture, expected["diffuse"]) < 1.0).all(axis=-1)
+    assert same[away_from_edges(np.where(hidden, 99, square))].all()
+
+
 def test_long_lines_of_the_view_are_broken():
     text = "Marble: Base Color is not resolved, because a texture of noise feeds it"
     lines = view_text.wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 
 import bpy
@@ -14,10 +13,21 @@ from ..lights.light_linking import Receivers
 from ..lights.shown_textures import ShownTextures
 from ..materials.surface_looks import Look, look_of
 from ..materials.world_look import world_radiance
-from ..pixels.inventory import SURFACE_TYPES
+from .depsgraph_instances import (
+    data_pointer,
+    is_seen_by_cameras,
+    is_surface,
+    mesh_key,
+    owner_of,
+    users_of_data,
+    visibility,
+)
 from .mesh_batches import MeshBatches, mesh_batches
 from .surface_uniforms import look_values, uniform_buffer
 from .view_lights import view_lights
+
+# In place of a receiver's number: nothing is seen there, nor behind it.
+HOLDOUT = -1
 
 
 @dataclass
@@ -36,7 +46,7 @@ class ShownInstance:
     mesh: MeshBatches
     model: Matrix
     looks: tuple[ShownLook, ...]  # one for each slot of the mesh
-    receiver: int
+    receiver: int  # or HOLDOUT
     side: float  # -1 where the transform mirrors
     center: np.ndarray  # (4,) of the bounding box in the world
     is_only_user: bool  # of the mesh
@@ -123,7 +133,7 @@ class SceneMirror:
         """Take over what has changed; `space` is the 3D view, whose local view counts."""
         changes = changes_of(depsgraph, not self._synced)
         self._drop_changed(changes)
-        in_view = _visibility(depsgraph, space)
+        in_view = visibility(depsgraph, space)
         if changes.surfaces:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
@@ -148,34 +158,32 @@ class SceneMirror:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
         instances, meshes, looks = [], {}, {}
-        users = _users(depsgraph)
+        users = users_of_data(depsgraph)
         for instance in depsgraph.object_instances:
             ob = instance.object
-            if not _is_surface(instance) or not in_view(instance):
+            if not is_surface(instance) or not is_seen_by_cameras(instance) or not in_view(instance):
                 continue
-            key = _mesh_key(instance)
+            key = mesh_key(instance)
             if key not in meshes:
                 known = key in self._meshes and not changes.geometry.intersection(key[:3])
                 meshes[key] = self._meshes[key] if known else mesh_batches(ob)
             mesh = meshes[key]
             if mesh is None:
                 continue
-            slots = [slot.material for slot in ob.material_slots] or [None]
-            materials = [override or slots[slot] for slot in mesh.slots]
-            names = {material.name_full if material else "": material for material in materials}
-            for name, material in names.items():
+            materials = _materials(ob, mesh, override)
+            for material in materials:
+                name = _name(material)
                 if name not in looks:
                     looks[name] = self._looks.get(name) or _shown_look(material)
-            parent = instance.parent.original.name_full if instance.is_instance and instance.parent else ""
-            receiver = receivers.numbers.get(parent, receivers.numbers.get(ob.original.name_full, 0))
-            shown = tuple(looks[material.name_full if material else ""] for material in materials)
+            shown = tuple(looks[_name(material)] for material in materials)
             for look in shown:
                 if look.look.normal is not None:
                     mesh.add_tangents(ob, look.look.uv_map)
+            receiver = _receiver(instance, receivers, depsgraph.view_layer)
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            is_only_user = users[_data_pointer(ob)] == 1
+            is_only_user = users[data_pointer(ob)] == 1
             instances.append(ShownInstance(mesh, model, shown, receiver, side, center, is_only_user))
         self.instances, self._meshes, self._looks = instances, meshes, looks
 
@@ -190,44 +198,24 @@ def _shown_look(material) -> ShownLook:
     return ShownLook(look, uniform_buffer(look_values(look)))
 
 
+def _materials(ob, mesh: MeshBatches, override) -> list:
+    """The material of every slot of `mesh`, None where there is none."""
+    slots = [slot.material for slot in ob.material_slots] or [None]
+    return [override or slots[slot] for slot in mesh.slots]
+
+
+def _name(material) -> str:
+    return material.name_full if material else ""
+
+
+def _receiver(instance, receivers: Receivers, view_layer) -> int:
+    owner = owner_of(instance).original
+    if owner.holdout_get(view_layer=view_layer):
+        return HOLDOUT
+    numbers = receivers.numbers
+    own = numbers.get(instance.object.original.name_full, 0)
+    return numbers.get(owner.name_full, own) if instance.is_instance else own
+
+
 def _originals(depsgraph) -> list:
     return [ob.original for ob in depsgraph.objects]
-
-
-def _is_surface(instance) -> bool:
-    return instance.object.type in SURFACE_TYPES and instance.show_self
-
-
-def _users(depsgraph) -> Counter:
-    """How many instances show the same evaluated data, by `_data_pointer`."""
-    return Counter(_data_pointer(found.object) for found in depsgraph.object_instances if _is_surface(found))
-
-
-def _data_pointer(ob) -> int:
-    return ob.data.as_pointer() if ob.data is not None else 0
-
-
-def _mesh_key(instance) -> tuple:
-    """What tells evaluated meshes apart: object, data and instancer, then the evaluated data itself.
-
-    Blender may use the place of freed data again, but then one of the first three has changed.
-    """
-    ob = instance.object
-    data = ob.data
-    parent = instance.parent.original.session_uid if instance.is_instance and instance.parent else 0
-    original = data.original.session_uid if data is not None and data.original is not None else 0
-    pointer = _data_pointer(ob)
-    shared = isinstance(data, bpy.types.Mesh) and not ob.modifiers and not instance.is_instance
-    return (0 if shared else ob.original.session_uid, original, parent, pointer)
-
-
-def _visibility(depsgraph, space):
-    """A test of depsgraph instances: are they seen in `space`? Only its local view makes a difference."""
-    if space is None or space.local_view is None:
-        return lambda instance: True
-
-    def in_local_view(instance) -> bool:
-        ob = instance.parent if instance.is_instance and instance.parent else instance.object
-        return ob.original.local_view_get(space)
-
-    return in_local_view

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from graphics_card import with_graphics
-from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
+from view_pictures import COLUMNS, SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon import shading
 from ltsh_addon.blender.materials.surface_looks import look_of
@@ -163,19 +163,6 @@ SCATTERED = (
 )
 
 
-def patches_of(materials):
-    """One square of each material, side by side, seen from above and a light over them."""
-    scene = parts.empty_scene(*SIZE)
-    rows = -(-len(materials) // COLUMNS)
-    for number, make in enumerate(materials):
-        row, column = divmod(number, COLUMNS)
-        parts.add_plane(make(), size=1.0, location=(column + 0.5 - 0.5 * COLUMNS, row + 0.5 - 0.5 * rows, 0.0))
-    parts.add_area_light(location=(0.5, 0.6, 1.4), size=1.5, size_y=1.0)
-    camera = parts.add_camera((0.0, -2.6, 3.4), (0.6, 0.0, 0.0))
-    bpy.context.view_layer.update()
-    return scene, camera
-
-
 @pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
 @pytest.mark.parametrize(
     ("materials", "kind", "passes"),
@@ -200,29 +187,6 @@ def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind, passe
                 failures.append(f"{material}, {name}: {times[pixels].max():.1f} times as far off as it may be")
         assert expected[name][usable].max() > 0.05
     assert not failures, "\n".join(failures)
-
-
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
-def test_what_cameras_do_not_see_is_not_shown(tmp_path):
-    _, camera = patches_of(MATERIALS[:4])
-    planes = [ob for ob in bpy.data.objects if ob.type == "MESH"]
-    planes[0].visible_camera = False
-    instancer = parts.link(bpy.data.objects.new("Instancer", None))
-    instancer.instance_type, instancer.instance_collection = "COLLECTION", bpy.data.collections.new("Inside")
-    instancer.visible_camera = False
-    instancer.instance_collection.objects.link(parts.add_plane(MATERIALS[0](), location=(1.5, 0.5, 0.2), name="Inside"))
-    bpy.context.scene.collection.objects.unlink(bpy.data.objects["Inside"])
-    # What lies behind a holdout is not seen either.
-    planes[2].is_holdout = True
-    parts.add_plane(MATERIALS[1](), size=8.0, location=(0.0, 0.0, -0.3))
-    bpy.context.view_layer.update()
-    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse", False)])
-    expected, square = sampled_pictures(tmp_path / "hidden.blend", ("diffuse",), 1)
-    assert notes == []
-    hidden = expected["diffuse"].max(axis=-1) == 0.0
-    assert hidden.sum() > 100 and not hidden.all()
-    same = (times_too_far(picture, expected["diffuse"]) < 1.0).all(axis=-1)
-    assert same[away_from_edges(np.where(hidden, 99, square))].all()
 
 
 def test_long_lines_of_the_view_are_broken():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+import scene_parts as parts
 from graphics_card import Canvas
 
 from ltsh_addon import shading
@@ -41,6 +42,19 @@ def away_from_edges(square):
             same &= np.roll(square, step, axis) == square
     same[0] = same[-1] = same[:, 0] = same[:, -1] = False
     return same
+
+
+def patches_of(materials):
+    """One square of each material, side by side, seen from above and a light over them."""
+    scene = parts.empty_scene(*SIZE)
+    rows = -(-len(materials) // COLUMNS)
+    for number, make in enumerate(materials):
+        row, column = divmod(number, COLUMNS)
+        parts.add_plane(make(), size=1.0, location=(column + 0.5 - 0.5 * COLUMNS, row + 0.5 - 0.5 * rows, 0.0))
+    parts.add_area_light(location=(0.5, 0.6, 1.4), size=1.5, size_y=1.0)
+    camera = parts.add_camera((0.0, -2.6, 3.4), (0.6, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    return scene, camera
 
 
 def sampled_pictures(path, passes, rows):

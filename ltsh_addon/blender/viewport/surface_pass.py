@@ -78,7 +78,7 @@ class SurfacePass:
         with frame_buffer.bind():
             gpu.state.viewport_set(0, 0, *size)
             gpu.state.depth_test_set("NONE")
-            gpu.state.blend_set("ADDITIVE")
+            gpu.state.blend_set("ADDITIVE_PREMULT")
             shader = self._shaders[EMISSION]
             shader.bind()
             shader.uniform_sampler("positions", self._textures["position"])

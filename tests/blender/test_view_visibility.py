@@ -1,0 +1,61 @@
+"""What of a scene the viewport shows at all: what cameras see, holdouts, what glows."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from graphics_card import with_graphics
+from view_pictures import SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
+
+
+def chalk():
+    return parts.bsdf_material("ShaderNodeBsdfDiffuse", "Chalk", Color=(0.2, 0.5, 0.8, 1.0))[0]
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_what_cameras_do_not_see_is_not_shown(tmp_path):
+    _, camera = patches_of([chalk] * 4)
+    planes = [ob for ob in bpy.data.objects if ob.type == "MESH"]
+    planes[0].visible_camera = False
+    instancer = parts.link(bpy.data.objects.new("Instancer", None))
+    instancer.instance_type, instancer.instance_collection = "COLLECTION", bpy.data.collections.new("Inside")
+    instancer.visible_camera = False
+    instancer.instance_collection.objects.link(parts.add_plane(chalk(), location=(1.5, 0.5, 0.2), name="Inside"))
+    bpy.context.scene.collection.objects.unlink(bpy.data.objects["Inside"])
+    # What lies behind a holdout is not seen either.
+    planes[2].is_holdout = True
+    parts.add_plane(chalk(), size=8.0, location=(0.0, 0.0, -0.3))
+    bpy.context.view_layer.update()
+    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse", False)])
+    expected, square = sampled_pictures(tmp_path / "hidden.blend", ("diffuse",), 1)
+    assert notes == []
+    hidden = expected["diffuse"].max(axis=-1) == 0.0
+    assert hidden.sum() > 100 and not hidden.all()
+    same = (times_too_far(picture, expected["diffuse"]) < 1.0).all(axis=-1)
+    assert same[away_from_edges(np.where(hidden, 99, square))].all()
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+def test_what_glows_is_as_bright_as_it_is_and_hidden_by_what_is_nearer():
+    glow = (0.2, 0.4, 0.9)
+
+    def lamp():
+        return parts.bsdf_material("ShaderNodeEmission", "Lamp", Strength=3.0, Color=(*glow, 1.0))[0]
+
+    def lit():
+        return parts.principled("Lit", Emission_Strength=0.5, Emission_Color=(*glow, 1.0))[0]
+
+    _, camera = patches_of([lamp, lit, lamp, lamp])
+    # Seen from behind the third shines too; the fourth lies below another square.
+    bpy.data.objects["Plane.002"].rotation_euler.x = np.pi
+    parts.add_plane(chalk(), size=1.0, location=(1.5, 0.0, 0.05), name="Cover")
+    bpy.context.view_layer.update()
+    shown = ("combined", "specular", "diffuse")
+    pictures = with_graphics(lambda: [viewport_picture(camera, name, False)[0] for name in shown])
+    emitted = pictures[0] - pictures[1] - pictures[2]
+    matrix = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE[0], y=SIZE[1])
+    matrix = np.array(matrix @ camera.matrix_world.inverted())
+    for column, strength in enumerate((3.0, 0.5, 3.0, 0.0)):
+        place = matrix @ [column - 1.5, 0.0, 0.0, 1.0]
+        x, y = (0.5 + 0.5 * place[:2] / place[3]) * SIZE
+        np.testing.assert_allclose(emitted[SIZE[1] - 1 - int(y), int(x)], strength * np.array(glow), atol=1e-5)

@@ -24,7 +24,7 @@ from eyes import (
 )
 from hands import keys, over, until
 
-SECONDS = 1500
+SECONDS = 1800
 EXPOSURE = -1.5
 
 

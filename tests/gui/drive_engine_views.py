@@ -10,7 +10,7 @@ import numpy as np
 from eyes import F12, bare_view, linear, plain_colors, settled, unclipped, view_pixels
 from hands import CLICK_SECONDS, Pulse, click, module, settings, wait_for_job
 
-SECONDS = 900
+SECONDS = 1800
 EXPOSURE = -1.5
 # After Escape is pressed; the driver itself looks only every 0.05 s, and xdotool takes its time to start.
 CANCEL_SECONDS = 0.8
@@ -167,7 +167,7 @@ def beside_cycles(rig):
     settings().techniques, settings().cycles_samples = {"ltsh4"}, 64
     with rig.override():
         bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield from wait_for_job(rig, 240)
+    yield from wait_for_job(rig, 900)
     pixels = yield from settled(rig, "views_8_difference.png")
     middle = pixels[pixels.shape[0] // 3 : -pixels.shape[0] // 3, pixels.shape[1] // 3 : -pixels.shape[1] // 3]
     rig.fact("brightness of the difference in the middle", round(float(middle.mean()), 3))

@@ -16,7 +16,7 @@ F12 = 96
 EDGE_SHARE = 1e-3
 # Of this the 256 steps of the screen take 0.004.
 AGREEMENT = 0.01
-RENDER_SECONDS = 240
+RENDER_SECONDS = 600
 
 
 def bare_view(rig):

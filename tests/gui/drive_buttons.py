@@ -19,7 +19,7 @@ from hands import (
 )
 
 SIZE = "1280x900"
-SECONDS = 600
+SECONDS = 1800
 # Places that shift with what the panel shows.
 ADD_CAMERA, BAKE_HEADER, BAKE = (151, 276), (226, 357), (142, 578)
 SHADED = "LTSH ltsh4.combined"
@@ -77,7 +77,7 @@ def shaded(rig):
     yield from click_button(rig, SHADE)
     yield from until(lambda: job() is not None)
     rig.check(job() is not None, "a click on Shade Camera View starts a job")
-    yield from wait_for_job(rig, 240)
+    yield from wait_for_job(rig, 900)
     # Panels below one that became shorter move for a moment.
     yield 3
     pixels = image_pixels(SHADED)
@@ -115,7 +115,7 @@ def baked(rig):
     yield from click_button(rig, BAKE)
     yield from until(lambda: job() is not None)
     rig.check(job() is not None, "a click on Bake Selected starts a job")
-    yield from wait_for_job(rig, 240)
+    yield from wait_for_job(rig, 900)
     # Panels below one that became shorter move for a moment.
     yield 3
     rig.check(max(image_pixels("LTSH floor ltsh4.combined"), default=0.0) > 0.1, "the baked texture is an image")

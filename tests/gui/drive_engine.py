@@ -21,7 +21,7 @@ from eyes import (
 )
 from hands import CLICK_SECONDS, drag
 
-SECONDS = 900
+SECONDS = 1800
 # Dark enough that next to nothing is clipped.
 EXPOSURE = -1.5
 LABELS = {"ltc": "LTC", "ltsh2": "LTSH 2", "ltsh4": "LTSH 4"}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import bpy
 
 from ..pixels.inventory import SURFACE_TYPES
@@ -22,11 +20,6 @@ def owner_of(instance):
 def is_seen_by_cameras(instance) -> bool:
     """False where the artist hides it from camera rays."""
     return instance.object.visible_camera and owner_of(instance).visible_camera
-
-
-def users_of_data(depsgraph) -> Counter:
-    """How many instances show the same evaluated data, by `data_pointer`."""
-    return Counter(data_pointer(found.object) for found in depsgraph.object_instances if is_surface(found))
 
 
 def data_pointer(ob) -> int:

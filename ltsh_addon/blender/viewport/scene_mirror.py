@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 import bpy
@@ -13,15 +14,7 @@ from ..lights.light_linking import Receivers
 from ..lights.shown_textures import ShownTextures
 from ..materials.surface_looks import Look, look_of
 from ..materials.world_look import world_radiance
-from .depsgraph_instances import (
-    data_pointer,
-    is_seen_by_cameras,
-    is_surface,
-    mesh_key,
-    owner_of,
-    users_of_data,
-    visibility,
-)
+from .depsgraph_instances import data_pointer, is_seen_by_cameras, is_surface, mesh_key, owner_of, visibility
 from .mesh_batches import MeshBatches, mesh_batches
 from .surface_uniforms import look_values, uniform_buffer
 from .view_lights import view_lights
@@ -157,11 +150,15 @@ class SceneMirror:
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
-        instances, meshes, looks = [], {}, {}
-        users = users_of_data(depsgraph)
+        found, meshes, looks = [], {}, {}
+        users = Counter()  # of evaluated data, also those that are not in view
         for instance in depsgraph.object_instances:
             ob = instance.object
-            if not is_surface(instance) or not is_seen_by_cameras(instance) or not in_view(instance):
+            if not is_surface(instance):
+                continue
+            data = data_pointer(ob)
+            users[data] += 1
+            if not is_seen_by_cameras(instance) or not in_view(instance):
                 continue
             key = mesh_key(instance)
             if key not in meshes:
@@ -183,9 +180,9 @@ class SceneMirror:
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            is_only_user = users[data_pointer(ob)] == 1
-            instances.append(ShownInstance(mesh, model, shown, receiver, side, center, is_only_user))
-        self.instances, self._meshes, self._looks = instances, meshes, looks
+            found.append((data, (mesh, model, shown, receiver, side, center)))
+        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
+        self._meshes, self._looks = meshes, looks
 
     def _read_world(self, scene) -> None:
         self.background, whole = world_radiance(scene.world)

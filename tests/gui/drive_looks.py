@@ -5,6 +5,7 @@ from pathlib import Path
 import bpy
 from hands import drag, settings, until
 
+SECONDS = 1200
 SIZE = "1600x900"
 NARROW = 220  # pixels at scale 1
 

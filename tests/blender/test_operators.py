@@ -3,12 +3,12 @@
 import json
 import os
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import pytest
 from job_window import SECONDS, Hand, ended, room
 
@@ -22,19 +22,22 @@ from ltsh_addon.blender.processes import blender_process
 ROOT = Path(__file__).resolve().parents[2]
 # Runs a job until its first stage, and waits to be killed or cancels it and ends.
 OWNER = """
-import json, sys, time
-sys.path.insert(0, sys.argv[1])
+import json, threading, time
 from ltsh_addon.blender.interface.job import Job, new_folder
 from ltsh_addon.blender.interface.job_plan import Plan, Step
 job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
-job.start(json.loads(sys.argv[2]), background=False)
+job.start(json.loads({runs!r}), background=False)
 while not job.finished and job.stage == "Starting":
     job.poll()
     time.sleep(0.05)
-print(job._process.pid, job.folder, flush=True)
-if sys.argv[3] == "killed":
+print("OWNER", job._process.pid, job.folder, flush=True)
+if {end!r} == "killed":
     time.sleep(600)
 job.cancel()
+# What Python does at its end; a real Blender that runs this ends without.
+for thread in threading.enumerate():
+    if thread is not threading.current_thread() and not thread.daemon:
+        thread.join()
 """
 
 
@@ -200,11 +203,10 @@ def test_opening_another_file_ends_the_job(never_ends, tmp_path):
 def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends, tmp_path, end):
     """The job belongs to another process here, which stands for that Blender."""
     runs = job_arguments.runs(bpy.context, "compare", tmp_path / "room.blend")
-    owner = subprocess.Popen(
-        [sys.executable, "-c", OWNER, str(ROOT), json.dumps(runs), end], stdout=subprocess.PIPE, text=True
-    )
-    with owner:
-        pid, folder = owner.stdout.readline().split(" ", 1)
+    command = programs.python(OWNER.format(runs=json.dumps(runs), end=end))
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
+        line = next(line for line in owner.stdout if line.startswith("OWNER "))
+        _, pid, folder = line.split(" ", 2)
         if end == "killed":
             assert Path(folder.strip()).is_dir()
             owner.kill()

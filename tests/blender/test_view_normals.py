@@ -142,7 +142,6 @@ def test_stretched_objects_shine_as_in_cycles(tmp_path):
     times = times_too_far(picture, expected["specular"]).max(axis=-1)
     usable = away_from_edges(square)
     worst = {number: times[usable & (square == number)].max() for number in range(2 * COLUMNS)}
-    # Beside pixels on the edges between flat faces, which may see the one or the other.
     assert max(worst.values()) < 1.0, worst
 
 

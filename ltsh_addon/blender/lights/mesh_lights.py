@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ...scene import AreaLight
+from ..foreach_values import read_values
 from ..materials.shader_graph import live_link, material_output
 from ..pixels.inventory import SURFACE_TYPES, EmitterTraits, RenderedSurface, surface_instancer
 from .emission_nodes import Emission, emission_behind
@@ -127,13 +128,11 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     try:
         if mesh is None or not np.isfinite(matrix).all():
             return None
-        vertices = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", vertices)
+        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
         mesh.calc_loop_triangles()
-        triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
-        mesh.loop_triangles.foreach_get("vertices", triangles)
-        slots = np.empty(len(mesh.loop_triangles), np.int32)
-        mesh.loop_triangles.foreach_get("material_index", slots)
+        count = len(mesh.loop_triangles)
+        triangles = read_values(mesh.loop_triangles, "vertices", (count, 3), np.int32)
+        slots = read_values(mesh.loop_triangles, "material_index", (count,), np.int32)
     finally:
         ob.to_mesh_clear()
     slots = np.clip(slots, 0, len(light.materials) - 1)
@@ -142,8 +141,8 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     copy = None
     if light.varies and depsgraph is not None:
         copy = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=depsgraph)
-    world = vertices.reshape(-1, 3).astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    triangles = triangles.reshape(-1, 3).astype(np.int64)
+    world = vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    triangles = triangles.astype(np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0.0:
         triangles = triangles[:, ::-1]
     return Placement(world, triangles, slots, matrix, copy)

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 
 from ...scene import FARTHEST
+from ..foreach_values import read_values
 from ..materials.material_maps import MaterialPlan
 from ..processes.child import SceneError
 from ..processes.missing_names import listed
@@ -91,7 +92,7 @@ def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
     if (np.floor(uv.min(axis=0)) == 0.0).all() and (uv.max(axis=0) <= 1.0).all():
         return [1001]
     ob.data.calc_loop_triangles()
-    triangles = _get(ob.data.loop_triangles, "loops", 3 * len(ob.data.loop_triangles))
+    triangles = read_values(ob.data.loop_triangles, "loops", (3 * len(ob.data.loop_triangles),), np.int32)
     return tiles_of(uv[triangles].reshape(-1, 3, 2))[0]
 
 
@@ -116,9 +117,9 @@ def _read(ob, mesh, matrix, uv_name):
         names = ", ".join(repr(other.name) for other in mesh.uv_layers) or "none"
         wanted = f"no UV map {uv_name!r}" if uv_name else "no UV map"
         raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or name another with --uv")
-    loops, vertices = _get(mesh.loop_triangles, "loops", 3 * count), _get(mesh.loop_triangles, "vertices", 3 * count)
-    positions = _get(mesh.vertices, "co", 3 * len(mesh.vertices), np.float32).reshape(-1, 3)
-    normals = _get(mesh.corner_normals, "vector", 3 * len(mesh.loops), np.float32).reshape(-1, 3)
+    loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
+    positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+    normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)
     maps = {other.name: _uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
     uv = maps[layer.name]
     linear = matrix[:3, :3]
@@ -133,7 +134,7 @@ def _read(ob, mesh, matrix, uv_name):
         corners=(positions[vertices].astype(np.float64) @ linear.T + matrix[:3, 3]).reshape(count, 3, 3),
         normals=world_normals.reshape(count, 3, 3),
         uv=uv,
-        material=np.minimum(_get(mesh.loop_triangles, "material_index", count), slots - 1),
+        material=np.minimum(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), slots - 1),
         vertices=vertices.reshape(count, 3),
     )
     a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
@@ -149,13 +150,7 @@ def _read(ob, mesh, matrix, uv_name):
 
 
 def _uv_of(layer, count):
-    return _get(layer.uv, "vector", 2 * count, np.float32).reshape(-1, 2)
-
-
-def _get(collection, name, count, dtype=np.int32):
-    values = np.empty(count, dtype)
-    collection.foreach_get(name, values)
-    return values
+    return read_values(layer.uv, "vector", (count, 2), np.float32)
 
 
 class ObjectBake:

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import gpu
 import numpy as np
 
-from .mesh_normals import interpolated_normals, own_normals, read
+from ..foreach_values import read_values
+from .mesh_normals import interpolated_normals, own_normals
 from .mesh_tangents import corner_tangents
 
 
@@ -105,11 +106,11 @@ def _arrays(ob) -> _Arrays | None:
         count = len(mesh.loop_triangles)
         if count == 0:
             return None
-        triangles = read(mesh.loop_triangles, "loops", (count, 3), np.int32)
+        triangles = read_values(mesh.loop_triangles, "loops", (count, 3), np.int32)
         slots = _slots(mesh, count, max(len(ob.material_slots), 1))
         # Attributes are copied as they lie in memory, `mesh.loops` and `mesh.vertices` one by one.
-        vertex = read(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
-        place = read(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
+        vertex = read_values(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
+        place = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
         place, uv = place.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
         normal, flat = interpolated_normals(mesh, vertex)
@@ -129,13 +130,13 @@ def _slots(mesh, count: int, slots: int) -> np.ndarray:
     """The material slot (count,) of every triangle."""
     if slots == 1:
         return np.zeros(count, np.int32)
-    return np.clip(read(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
+    return np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
 
 
 def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:
     maps = {}
     for layer in mesh.uv_layers:
-        maps[layer.name] = read(layer.uv, "vector", (corners, 2), np.float32)
+        maps[layer.name] = read_values(layer.uv, "vector", (corners, 2), np.float32)
         if layer.active_render:
             maps[""] = maps[layer.name]
     return maps

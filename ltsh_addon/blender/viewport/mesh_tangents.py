@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..materials.shading_normals import unit
+
 
 def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
     """Tangents (C, 4) for corners with places (C, 3), unit normals (C, 3) and UV coordinates (C, 2), in the frame of
@@ -13,15 +15,15 @@ def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
     of theirs, each projected onto the plane of the normal and weighted by its angle.
     """
     corner, area = triangles.ravel(), _uv_area(uv, triangles)
-    of_triangle = _unit(_towards_u(place, uv, triangles) * np.sign(area)[:, None])
+    of_triangle = unit(_towards_u(place, uv, triangles) * np.sign(area)[:, None])
     upward = normal[corner].astype(np.float64)
-    flat = _unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(place, triangles, upward)[:, None]
+    flat = unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(place, triangles, upward)[:, None]
     used = (area != 0.0).repeat(3)
     group = _groups(place, normal, uv, corner, area)
     flat[~used] = 0.0
     total = np.stack([np.bincount(group, flat[:, axis]) for axis in range(3)], axis=-1)
     found = np.tile(np.array([1.0, 0.0, 0.0, -1.0], np.float32), (len(place), 1))
-    found[corner[used], :3] = _unit(total)[group[used]]
+    found[corner[used], :3] = unit(total)[group[used]]
     found[corner[used], 3] = np.sign(area).repeat(3)[used]
     return found
 
@@ -46,7 +48,7 @@ def _edges(values, triangles):
 def _angles(place, triangles, upward):
     """Angles (3 T,) at the corners of the triangles, seen along the normals `upward` (3 T, 3)."""
     points = place[triangles].astype(np.float64)
-    ahead, back = (_unit(_projected((np.roll(points, way, axis=1) - points).reshape(-1, 3), upward)) for way in (-1, 1))
+    ahead, back = (unit(_projected((np.roll(points, way, axis=1) - points).reshape(-1, 3), upward)) for way in (-1, 1))
     return np.arccos(np.clip((ahead * back).sum(axis=1), -1.0, 1.0))
 
 
@@ -61,9 +63,3 @@ def _groups(place, normal, uv, corner, area):
 
 def _projected(vectors, normals):
     return vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals
-
-
-def _unit(vectors):
-    """Unit vectors, zero for zero."""
-    length = np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0.0)

@@ -11,6 +11,7 @@ from hands import (
     job,
     keys,
     module,
+    open_panel,
     over,
     settings,
     to_window,
@@ -27,10 +28,7 @@ SHADED = "LTSH ltsh4.combined"
 
 def main(rig):
     settings().resolution_percentage, settings().bake_size = 25, "256"
-    rig.camera_view()
-    rig.panel()
-    yield 1
-    rig.tab("LTSH")
+    yield from open_panel(rig)
     yield 2
     yield from mended(rig)
     yield from shaded(rig)

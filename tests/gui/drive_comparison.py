@@ -5,14 +5,15 @@ import time
 import bpy
 from hands import (
     CANCEL,
-    COMPARE,
     Pulse,
     click_button,
     drag,
     image_pixels,
     job,
     module,
+    open_panel,
     settings,
+    start_comparison,
     until,
     wait_for_job,
 )
@@ -22,10 +23,7 @@ SECONDS = 1500
 
 
 def main(rig):
-    rig.camera_view()
-    rig.panel()
-    yield 1
-    rig.tab("LTSH")
+    yield from open_panel(rig)
     yield 1.5
     rig.shot("1_panel.png")
     rig.check(settings().techniques == {"ltc", "ltsh4"}, "LTC and LTSH 4 are chosen at the start")
@@ -37,9 +35,7 @@ def main(rig):
 
 
 def cancelled(rig):
-    yield from click_button(rig, COMPARE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a click on Compare with Cycles starts a job")
+    yield from start_comparison(rig)
     pulse = Pulse()
     yield from until(lambda: job() is None or job().results, 400)
     yield 1.0
@@ -68,9 +64,7 @@ def cancelled(rig):
 def finished(rig):
     # Panels below one that became shorter move for a moment.
     yield 3
-    yield from click_button(rig, COMPARE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a second comparison starts")
+    yield from start_comparison(rig, "a second comparison starts")
     pulse = Pulse()
     yield from wait_for_job(rig, 900)
     pulse.stop(rig, "while a comparison runs")

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 import bpy
-from hands import COMPARE, click_button, job, keys, module, over, settings, until
+from hands import job, keys, module, open_panel, over, settings, start_comparison, until
 
 SECONDS = 400
 ENDING_SECONDS = 15.0
@@ -40,15 +40,10 @@ def main(rig):
 
 def started(rig):
     """A comparison that does not end by itself, started by the mouse."""
-    rig.camera_view()
-    rig.panel()
-    yield 1
-    rig.tab("LTSH")
+    yield from open_panel(rig)
     settings().cycles_samples = 1 << 20
     yield 3
-    yield from click_button(rig, COMPARE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a click on Compare with Cycles starts a job")
+    yield from start_comparison(rig)
 
 
 def after_the_add_on(function):

@@ -1,7 +1,7 @@
 """The window answers while a comparison of 1920 x 1080 pixels is started, runs, and is looked at."""
 
 import bpy
-from hands import COMPARE, Pulse, click_button, job, keys, over, settings, until, wait_for_job
+from hands import COMPARE, Pulse, click_button, job, keys, open_panel, over, settings, until, wait_for_job
 
 SECONDS = 1800
 LONGEST = 0.2  # seconds, beside drawing: the graphics driver may be a program, and the machine may be busy
@@ -10,10 +10,7 @@ DRAWINGS = 5
 
 
 def main(rig):
-    rig.camera_view()
-    rig.panel()
-    yield 1
-    rig.tab("LTSH")
+    yield from open_panel(rig)
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 1920, 1080
     settings().techniques, settings().cycles_samples = {"ltc", "ltsh4"}, 4
     yield 4

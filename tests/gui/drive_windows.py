@@ -1,17 +1,14 @@
 """Jobs with several windows and scenes: results go to the scene they were made of, whatever is closed meanwhile."""
 
 import bpy
-from hands import COMPARE, click_button, job, keys, module, over, settings, until, wait_for_job
+from hands import job, keys, module, open_panel, over, settings, start_comparison, until, wait_for_job
 
 SIZE = "1600x900"
 SECONDS = 1500
 
 
 def main(rig):
-    rig.camera_view()
-    rig.panel()
-    yield 1
-    rig.tab("LTSH")
+    yield from open_panel(rig)
     settings().techniques, settings().cycles_samples = {"ltc"}, 16
     yield 3
     yield from other_window_closed(rig)
@@ -25,17 +22,10 @@ def results_of(scene):
 
 
 def second_window(rig):
-    """A window of its own for the 3D view, with another scene."""
+    """A new window, which may show a scene of its own."""
     with rig.override():
         bpy.ops.wm.window_new_main()
-    window = bpy.context.window_manager.windows[-1]
-    return window
-
-
-def starts(rig):
-    yield from click_button(rig, COMPARE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a click on Compare with Cycles starts a job")
+    return bpy.context.window_manager.windows[-1]
 
 
 def other_window_closed(rig):
@@ -76,7 +66,7 @@ def undone_while_it_runs(rig):
         bpy.ops.ed.undo_push(message="Before")
         light.data.energy = 3.0 * energy
         bpy.ops.ed.undo_push(message="Brighter")
-    yield from starts(rig)
+    yield from start_comparison(rig)
     yield from over(rig)
     yield from keys(rig, "ctrl+z")
     yield from until(lambda: bpy.data.objects[name].data.energy == energy)
@@ -131,7 +121,7 @@ def scene_removed(rig):
     bpy.context.window.scene = doomed
     yield 3
     doomed.ltsh.techniques, doomed.ltsh.cycles_samples = {"ltc"}, 16
-    yield from starts(rig)
+    yield from start_comparison(rig)
     started = job()
     yield 3
     bpy.data.scenes.remove(doomed)

@@ -46,6 +46,21 @@ def click_button(rig, place):
     yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *place))
 
 
+def open_panel(rig):
+    """Look through the camera, with our tab in the sidebar."""
+    rig.camera_view()
+    rig.panel()
+    yield 1
+    rig.tab("LTSH")
+
+
+def start_comparison(rig, what="a click on Compare with Cycles starts a job"):
+    """Click Compare with Cycles, and wait for its job."""
+    yield from click_button(rig, COMPARE)
+    yield from until(lambda: job() is not None)
+    rig.check(job() is not None, what)
+
+
 def drag(rig, start, end):
     """Drag with the left button from `start` to `end`."""
     rig.xdo("mousemove", *start)

@@ -1,10 +1,13 @@
 """A window for the operators of jobs, which Blender has in its interface alone: timers, events, the status bar."""
 
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import bpy
+import numpy as np
 
+import ltsh_addon
 from ltsh_addon.blender.interface import operators
 
 SECONDS = 300
@@ -21,6 +24,23 @@ def room(path, width=24, height=16):
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     scene.ltsh.cycles_samples, scene.ltsh.bake_size, scene.ltsh.bake_margin = 4, "256", 2
     return scene
+
+
+@contextmanager
+def add_on_in_room(path):
+    """The add-on, and the scene of `room`."""
+    ltsh_addon.register()
+    yield room(path)
+    ltsh_addon.unregister()
+
+
+def image_pixels(name):
+    """Pixels (H, W, 3) of an image, row 0 above."""
+    image = bpy.data.images[name]
+    width, height = image.size
+    flat = np.empty(4 * width * height, np.float32)
+    image.pixels.foreach_get(flat)
+    return flat.reshape(height, width, 4)[::-1, :, :3]
 
 
 class Window:

@@ -1,0 +1,158 @@
+"""Jobs of the window that end early or elsewhere: cancelled, another file, a closed window, a Blender that ends."""
+
+import json
+import os
+import subprocess
+import time
+from pathlib import Path
+
+import bpy
+import programs
+import pytest
+from job_window import SECONDS, Hand, add_on_in_room, ended, image_pixels
+
+from ltsh_addon.blender.interface import job_arguments, operators, results
+
+ROOT = Path(__file__).resolve().parents[2]
+# Runs a job until its first stage, and waits to be killed or cancels it and ends.
+OWNER = """
+import json, threading, time
+from ltsh_addon.blender.interface.job import Job, new_folder
+from ltsh_addon.blender.interface.job_plan import Plan, Step
+job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
+job.start(json.loads({runs!r}), background=False)
+while not job.finished and job.stage == "Starting":
+    job.poll()
+    time.sleep(0.05)
+print("OWNER", job._process.pid, job.folder, flush=True)
+if {end!r} == "killed":
+    time.sleep(600)
+job.cancel()
+# What Python does at its end; a real Blender that runs this ends without.
+for thread in threading.enumerate():
+    if thread is not threading.current_thread() and not thread.daemon:
+        thread.join()
+"""
+
+
+@pytest.fixture
+def never_ends(tmp_path):
+    """The add-on and a file in which Cycles has enough to do for as long as a test takes."""
+    with add_on_in_room(tmp_path / "room.blend") as scene:
+        scene.ltsh.cycles_samples = 1 << 20
+        yield scene
+
+
+@pytest.mark.parametrize("stop", ["Esc", "button"])
+def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
+    hand = Hand().start()
+    assert hand.context.status.startswith("Compare with Cycles: ") and len(hand.context.timers) == 1
+    hand.until(lambda: operators.running_job().results)
+    hand.until(lambda: operators.running_job().stage == "Cycles A")
+    job = operators.running_job()
+    if stop == "Esc":
+        hand.send("ESC", "PRESS")
+    else:
+        assert bpy.ops.ltsh.cancel() == {"FINISHED"}
+        hand.send()
+    assert hand.outcome == {"FINISHED"} and hand.context.timers == []
+    assert hand.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
+    assert operators.running_job() is None and ended(job)
+    result = results.result_of(never_ends)
+    assert result.partial == job_arguments.NO_CYCLES
+    assert image_pixels("LTSH ltsh4.combined").max() > 0.0
+    # The choice is there again when Cycles is.
+    assert never_ends.ltsh.second == "cycles"
+
+
+class Watcher(Hand):
+    """The window that goes on with a job whose own window was closed."""
+
+    _begin = operators.LTSH_OT_watch._begin
+
+
+def test_a_job_whose_window_is_closed_goes_on_in_another(never_ends):
+    hand = Hand().start()
+    hand.until(lambda: operators.running_job().stage == "Cycles A")
+    job = operators.running_job()
+    hand.cancel(hand.context)
+    assert hand.context.timers == [] and operators.running_job() is job and not job.cancelled
+    other = Watcher().start()
+    assert other.context.status.startswith("Compare with Cycles: ")
+    other.send("ESC", "PRESS")
+    assert other.outcome == {"FINISHED"} and operators.running_job() is None and ended(job)
+    assert other.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
+
+
+def test_cancelling_before_anything_is_finished_says_so(never_ends):
+    hand = Hand().start()
+    hand.send("ESC", "PRESS")
+    assert hand.outcome == {"CANCELLED"} and hand.reports[0][1].endswith("nothing was finished yet")
+    assert results.result_of(never_ends) is None
+
+
+def test_one_job_at_a_time(never_ends):
+    hand = Hand().start()
+    for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
+        assert not operator.poll()
+        with pytest.raises(RuntimeError, match="A job is running"):
+            operator()
+    hand.send("ESC", "PRESS")
+    assert bpy.ops.ltsh.shade.poll() and not bpy.ops.ltsh.cancel.poll()
+
+
+def test_opening_another_file_ends_the_job(never_ends, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"), copy=True)
+    hand = Hand().start()
+    hand.until(lambda: operators.running_job().results)
+    job = operators.running_job()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other.blend"))
+    assert operators.running_job() is None
+    hand.send()
+    assert hand.outcome != {"RUNNING_MODAL"} and ended(job)
+    assert results.result_of(bpy.context.scene) is None
+
+
+@pytest.mark.parametrize("end", ["killed", "quit"])
+def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends, tmp_path, end):
+    """The job belongs to another process here, which stands for that Blender."""
+    runs = job_arguments.runs(bpy.context, "compare", tmp_path / "room.blend")
+    command = programs.python(OWNER.format(runs=json.dumps(runs), end=end))
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
+        line = next(line for line in owner.stdout if line.startswith("OWNER "))
+        _, pid, folder = line.split(" ", 2)
+        if end == "killed":
+            assert Path(folder.strip()).is_dir()
+            owner.kill()
+    # One that quits has waited for it.
+    seconds = SECONDS if end == "killed" else 0.0
+    assert ends(lambda: not Path(folder.strip()).exists(), seconds) and ends(lambda: not is_running(int(pid)), seconds)
+
+
+def ends(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.05)
+    return condition()
+
+
+def is_running(pid):
+    """A process that has ended stays in the list as long as nobody has asked for its exit code."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def test_disabling_the_add_on_ends_the_job(never_ends):
+    hand = Hand().start()
+    job = operators.running_job()
+    operators.unregister()
+    try:
+        assert job._process.poll() is not None and not job.folder.exists()
+        hand.send()
+        assert hand.outcome == {"CANCELLED"}
+    finally:
+        operators.register()

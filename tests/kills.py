@@ -106,6 +106,16 @@ def is_writing(output: Path) -> bool:
     return any(output.rglob(".*.tmp"))
 
 
+def is_running(pid):
+    """True for processes that are there and not zombies, which only wait to be reaped by whoever inherits them."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    status = Path(f"/proc/{pid}/stat")
+    return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
 def is_blenders_own(path: Path) -> bool:
     """True for the empty folder that a real Blender leaves when it is killed."""
     return path.name.startswith("blender_") and path.is_dir() and not any(path.iterdir())

@@ -1,7 +1,6 @@
 """Jobs of the window that end early or elsewhere: cancelled, another file, a closed window, a Blender that ends."""
 
 import json
-import os
 import subprocess
 import time
 from pathlib import Path
@@ -10,6 +9,7 @@ import bpy
 import programs
 import pytest
 from job_window import SECONDS, Hand, add_on_in_room, ended, image_pixels
+from kills import is_running
 
 from ltsh_addon.blender.interface import job_arguments, operators, results
 
@@ -134,16 +134,6 @@ def ends(condition, seconds):
     while not condition() and time.monotonic() < end:
         time.sleep(0.05)
     return condition()
-
-
-def is_running(pid):
-    """A process that has ended stays in the list as long as nobody has asked for its exit code."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    status = Path(f"/proc/{pid}/stat")
-    return not status.exists() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_disabling_the_add_on_ends_the_job(never_ends):

@@ -1,7 +1,6 @@
 """Worker processes of `shade`: the same bits, no orphans, and the work goes on where they fail."""
 
 import io
-import os
 import subprocess
 import sys
 import threading
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kills import is_running
 from surface_scenes import four_lights, random_samples
 
 from ltsh_addon import shading
@@ -204,16 +204,6 @@ def test_children_of_a_killed_parent_end():
     while is_running(child) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not is_running(child)
-
-
-def is_running(pid):
-    """True for processes that are there and not zombies, which only wait to be reaped by whoever inherits them."""
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    status = Path(f"/proc/{pid}/stat")
-    return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
 
 
 def test_shared_blocks_hold_arrays_side_by_side():

@@ -3,6 +3,18 @@
 import tempfile
 
 import pytest
+import scene_parts as parts
+
+import ltsh_addon
+
+
+@pytest.fixture
+def addon():
+    """The add-on in a factory-empty Blender, whose scene is given."""
+    scene = parts.empty_scene()
+    ltsh_addon.register()
+    yield scene
+    ltsh_addon.unregister()
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import scene_parts as parts
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-import ltsh_addon
 from ltsh_addon.blender.engine.cycles_picture import (
     Reference,
     averaged,
@@ -21,15 +20,7 @@ from ltsh_addon.blender.engine.cycles_picture import (
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.imaging.picture_index import write_index
 
-SIZE = (24, 16)
-
-
-@pytest.fixture
-def addon():
-    scene = parts.empty_scene(*SIZE)
-    ltsh_addon.register()
-    yield scene
-    ltsh_addon.unregister()
+SIZE = parts.SIZE
 
 
 def projection_of(camera, size):

@@ -7,24 +7,13 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import shading
-from ltsh_addon.blender.engine import engine_final, engine_panels, engine_preview, engine_snapshot, engine_view
+from ltsh_addon.blender.engine import engine_final, engine_panels, engine_snapshot, engine_view
 from ltsh_addon.blender.lights.shown_textures import ShownTextures
 from ltsh_addon.blender.materials import surface_looks
 from ltsh_addon.blender.processes import child
 from ltsh_addon.blender.viewport.view_lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.scene import Border
-
-SIZE = (32, 20)
-
-
-@pytest.fixture
-def addon():
-    """The add-on in a factory-empty Blender."""
-    scene = parts.empty_scene(*SIZE)
-    ltsh_addon.register()
-    yield scene
-    ltsh_addon.unregister()
 
 
 def add_content(scene):
@@ -180,46 +169,10 @@ def test_only_the_render_region_is_handed_to_blender():
     np.testing.assert_array_equal(flat.reshape(6, 10)[0], image[5, :, 0])
 
 
-def test_files_saved_during_a_preview_keep_the_artists_engine(addon, tmp_path):
-    addon.render.engine = "BLENDER_WORKBENCH"
-    bpy.ops.ltsh.preview()
-    path = tmp_path / "previewed.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    assert addon.render.engine == "LTSH" and addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    scene = bpy.context.scene
-    assert scene.render.engine == "BLENDER_WORKBENCH" and not scene.ltsh_view.artist_engine
-    bpy.ops.ltsh.preview()
-    bpy.ops.ltsh.preview()
-    assert scene.render.engine == "BLENDER_WORKBENCH"
-
-
-def test_an_engine_chosen_by_hand_is_not_taken_for_a_preview(addon, tmp_path):
-    addon.render.engine = "LTSH"
-    bpy.ops.ltsh.preview()
-    assert addon.render.engine == "LTSH" and not addon.ltsh_view.artist_engine
-    path = tmp_path / "own.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    assert bpy.context.scene.render.engine == "LTSH"
-
-
-def test_another_engine_chosen_by_hand_ends_the_preview(addon):
-    addon.render.engine = "BLENDER_WORKBENCH"
-    bpy.ops.ltsh.preview()
-    engine_preview._engine_changed()
-    assert addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
-    addon.render.engine = "CYCLES"
-    # Blender calls it between two events, of which there are none here.
-    engine_preview._engine_changed()
-    addon.render.engine = "LTSH"
-    assert not engine_preview.is_previewing(addon)
-
-
 @pytest.fixture
 def without_cycles():
     """Cycles' add-on is off."""
-    parts.empty_scene(*SIZE)
+    parts.empty_scene()
     bpy.ops.preferences.addon_disable(module="cycles")
     yield bpy.context.scene
     bpy.ops.preferences.addon_enable(module="cycles")

@@ -17,7 +17,7 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
-DEFAULTS = {"SIZE": "1280x720", "SECONDS": 300}
+DEFAULTS = {"SIZE": "1280x720", "SECONDS": 300, "INSTALL": True}
 SYSTEMS = {"Linux": "linux", "Darwin": "macos", "Windows": "windows"}
 MORE_SECONDS = 120  # for what the runner itself does before and after
 
@@ -34,11 +34,15 @@ def main() -> int:
         print(f"run_drivers: {', '.join(missing) or 'no runner'}: no such file, see tests/gui/README.md")
         return 2
     arguments.out.mkdir(parents=True, exist_ok=True)
-    fixed = ["--install", str(built_zip()), "--blend", str(demo_scene(arguments.out))]
-    fixed += ["--file", str(HERE.parent / "blender" / "random_surfaces.py")]
+    archive = built_zip()
+    fixed = ["--blend", str(demo_scene(arguments.out))]
+    for name in ("random_surfaces.py", "blender_state.py"):
+        fixed += ["--file", str(HERE.parent / "blender" / name)]
     for helper in sorted(set(HERE.glob("*.py")) - set(HERE.glob("drive_*.py")) - {Path(__file__).resolve()}):
         fixed += ["--file", str(helper)]
-    failed = [path.stem for path in drivers if not run(arguments.runner, path, fixed, arguments.out / path.stem)]
+    failed = [
+        path.stem for path in drivers if not run(arguments.runner, path, archive, fixed, arguments.out / path.stem)
+    ]
     print(f"{len(drivers) - len(failed)} of {len(drivers)} drivers passed; pictures are in {arguments.out}")
     return 1 if failed else 0
 
@@ -62,7 +66,7 @@ def demo_scene(folder: Path) -> Path:
 
 
 def options_of(driver: Path) -> dict:
-    """SIZE (of the window) and SECONDS (until it is ended) as the driver has them at its top level."""
+    """SIZE (of the window), SECONDS (until it is ended), INSTALL (the zip before the driver) as its top level says."""
     found = dict(DEFAULTS)
     for node in ast.parse(driver.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", None) in DEFAULTS:
@@ -70,11 +74,12 @@ def options_of(driver: Path) -> dict:
     return found
 
 
-def run(runner: list[str], driver: Path, fixed: list[str], out: Path) -> bool:
+def run(runner: list[str], driver: Path, archive: Path, fixed: list[str], pictures: Path) -> bool:
     """Run one driver; True where all that it checked holds."""
+    out = pictures / driver.stem
     options = options_of(driver)
     command = [*runner, "--driver", str(driver), *fixed, "--out", str(out), "--size", options["SIZE"]]
-    command += ["--timeout", str(options["SECONDS"])]
+    command += ["--timeout", str(options["SECONDS"]), "--install" if options["INSTALL"] else "--file", str(archive)]
     (out / "result.json").unlink(missing_ok=True)
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=options["SECONDS"] + MORE_SECONDS)

@@ -1,6 +1,6 @@
 """The button "Preview with LTSH": shows the scene with our engine and gives back the artist's afterwards.
 
-Files are saved with the artist's engine, so that they render elsewhere as they did before.
+Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before.
 """
 
 from __future__ import annotations
@@ -30,34 +30,58 @@ class LTSH_OT_preview(bpy.types.Operator):
 
     def execute(self, context):
         scene = context.scene
-        settings = scene.ltsh_view
-        shading = _shading(context)
         if is_previewing(scene):
             stop_preview(scene)
-            if shading is not None and settings.artist_shading:
-                shading.type = settings.artist_shading
             return {"FINISHED"}
+        space = _view(context)
         if scene.render.engine != ENGINE:
-            settings.artist_engine = scene.render.engine
+            if space is not None:
+                _lent_views[space.as_pointer()] = (scene.session_uid, space.shading.type)
+            scene.ltsh_view.artist_engine = scene.render.engine
             scene.render.engine = ENGINE
-        if shading is not None:
-            settings.artist_shading = shading.type
-            shading.type = "RENDERED"
+        if space is not None:
+            space.shading.type = "RENDERED"
         return {"FINISHED"}
 
 
-def _shading(context):
-    """Shading settings of the 3D view of `context`, or of the window's first one."""
+# Address of a 3D view that was switched to a preview -> its scene, and the shading to give back. Only kept here: undo
+# does not reach views, and files are saved without previews.
+_lent_views: dict[int, tuple[int, str]] = {}
+
+
+def _view(context):
+    """The 3D view of `context`, or the window's first one."""
     space = context.space_data
     if space is None or space.type != "VIEW_3D":
         screen = context.screen
         areas = screen.areas if screen is not None else ()
         space = next((area.spaces.active for area in areas if area.type == "VIEW_3D"), None)
-    return None if space is None else space.shading
+    return space
+
+
+def _give_back_views(scene) -> list:
+    """Give the views that show a preview of `scene` their former shading back, and return them.
+
+    Views whose shading was changed by hand since stay as they are.
+    """
+    found = []
+    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
+        owner, former = _lent_views.get(space.as_pointer(), (None, ""))
+        if owner == scene.session_uid and space.type == "VIEW_3D" and space.shading.type == "RENDERED":
+            space.shading.type = former
+            found.append(space)
+    return found
+
+
+def _forget_views(scene) -> None:
+    for address in [address for address, (owner, _) in _lent_views.items() if owner == scene.session_uid]:
+        del _lent_views[address]
 
 
 def stop_preview(scene) -> None:
-    """Give `scene` the artist's engine back."""
+    """Give `scene` the artist's engine back, and its views their shading."""
+    _give_back_views(scene)
+    _forget_views(scene)
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
     try:
@@ -68,6 +92,7 @@ def stop_preview(scene) -> None:
 
 
 _saved: list[str] = []
+_saved_views: list = []
 
 
 @persistent
@@ -76,9 +101,11 @@ def _before_saving(*_) -> None:
     if engine_snapshot.is_saving():
         return
     _saved.clear()
+    _saved_views.clear()
     for scene in bpy.data.scenes:
         if is_previewing(scene):
             _saved.append(scene.name)
+            _saved_views.extend(_give_back_views(scene))
             scene.render.engine = scene.ltsh_view.artist_engine
 
 
@@ -87,12 +114,25 @@ def _after_saving(*_) -> None:
     for name in _saved:
         if name in bpy.data.scenes:
             bpy.data.scenes[name].render.engine = ENGINE
+    for space in _saved_views:
+        space.shading.type = "RENDERED"
     _saved.clear()
+    _saved_views.clear()
+
+
+@persistent
+def _after_undo(*_) -> None:
+    """Undo takes the engine of a preview back, but does not reach the view."""
+    for scene in bpy.data.scenes:
+        if not is_previewing(scene):
+            _give_back_views(scene)
+            _forget_views(scene)
 
 
 @persistent
 def _after_loading(*_) -> None:
     """Files that were saved during a preview have the artist's engine, and no preview."""
+    _lent_views.clear()
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE:
             scene.ltsh_view.artist_engine = ""
@@ -104,6 +144,7 @@ def _engine_changed() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
             scene.ltsh_view.artist_engine = ""
+            _forget_views(scene)
 
 
 _subscriber = object()
@@ -121,6 +162,7 @@ HANDLERS = (
     ("save_pre", _before_saving),
     ("save_post", _after_saving),
     ("save_post_fail", _after_saving),
+    ("undo_post", _after_undo),
     ("load_post", _after_loading),
 )
 
@@ -134,7 +176,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Give all scenes their engines back; remove operator and handlers."""
+    """Give all scenes and views back what they had; remove operator and handlers."""
     bpy.msgbus.clear_by_owner(_subscriber)
     for scene in bpy.data.scenes:
         if is_previewing(scene):

@@ -89,9 +89,6 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     artist_engine: bpy.props.StringProperty(
         name="Former Engine", description="The render engine to give back after the preview", options={"HIDDEN"}
     )
-    artist_shading: bpy.props.StringProperty(
-        name="Former Shading", description="The viewport shading to give back after the preview", options={"HIDDEN"}
-    )
 
 
 def draw_view_settings(layout, scene) -> None:

@@ -9,7 +9,7 @@ import ltsh_addon
 from ltsh_addon import shading
 from ltsh_addon.blender.engine import engine_final, engine_panels, engine_snapshot, engine_view
 from ltsh_addon.blender.lights.shown_textures import ShownTextures
-from ltsh_addon.blender.materials import surface_looks
+from ltsh_addon.blender.materials import look_reader
 from ltsh_addon.blender.processes import child
 from ltsh_addon.blender.viewport.view_lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
@@ -186,7 +186,7 @@ def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(without_cy
         depsgraph = bpy.context.evaluated_depsgraph_get()
         lights, notes = view_lights(depsgraph, lambda instance: True, ShownTextures())
         assert len(lights) == 1 and not notes
-        assert surface_looks.look_of(plane.active_material).corrected
+        assert look_reader.look_of(plane.active_material).corrected
         assert engine_view._shown(without_cycles, "single", None, 1.0).exposure == 1.0
         channels = render(without_cycles, tmp_path / "final.exr")
         assert picture(channels, "ViewLayer", "LTSH Specular").max() > 0.01

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import scene_parts as parts
-from graphics_card import Canvas
+from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
 from ltsh_addon.blender.processes import child
@@ -74,3 +74,65 @@ def sampled_pictures(path, passes, rows):
 def times_too_far(picture, expected):
     """How many times as far `picture` is from what is expected as it may be, by number."""
     return np.abs(picture - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))
+
+
+def image(name, is_data=False, shape=(8, 8)):
+    """A packed image of random colors."""
+    made = bpy.data.images.new(name, *shape, is_data=is_data)
+    pixels = np.ones((shape[1], shape[0], 4), np.float32)
+    pixels[..., :3] = np.random.default_rng(len(name)).uniform(0.2, 0.9, (shape[1], shape[0], 3))
+    made.pixels.foreach_set(pixels.ravel())
+    made.update()
+    made.pack()
+    return made
+
+
+def textured(name, socket, is_data=False, **settings):
+    """A Principled BSDF with an image at `socket`; material, its node, and the image's."""
+    material, node = parts.principled(name, Roughness=0.35)
+    texture = material.node_tree.nodes.new("ShaderNodeTexImage")
+    texture.image = image(name, is_data)
+    for key, value in settings.items():
+        setattr(texture, key, value)
+    material.node_tree.links.new(texture.outputs["Color"], node.inputs[socket])
+    return material, node, texture
+
+
+def normal_map():
+    material, node, texture = textured("normal map", "Base Color", is_data=True)
+    tree = material.node_tree
+    pixels = np.array(texture.image.pixels[:]).reshape(-1, 4)
+    slopes = np.random.default_rng(4).uniform(-0.25, 0.25, (len(pixels), 2))
+    pixels[:, :2], pixels[:, 2] = 0.5 + 0.5 * slopes, 0.5 + 0.5 * np.sqrt(1.0 - (slopes**2).sum(axis=1))
+    texture.image.pixels.foreach_set(pixels.astype(np.float32).ravel())
+    texture.image.pack()
+    bump = tree.nodes.new("ShaderNodeNormalMap")
+    bump.inputs["Strength"].default_value = 0.6
+    tree.links.remove(node.inputs["Base Color"].links[0])
+    tree.links.new(texture.outputs["Color"], bump.inputs["Color"])
+    tree.links.new(bump.outputs["Normal"], node.inputs["Normal"])
+    return material
+
+
+def patches_too_far(path, materials, kind, passes) -> list[str]:
+    """Which of `materials` the viewport shows otherwise than samples that Cycles took, by passes and how far.
+
+    `kind` is the camera's type; nothing may be named as not shown.
+    """
+    _, camera = patches_of(materials)
+    camera.data.type, camera.data.ortho_scale = kind, 4.2
+    seen = with_graphics(lambda: [viewport_picture(camera, name, kind == "ORTHO") for name in passes])
+    expected, square = sampled_pictures(path, passes, -(-len(materials) // COLUMNS))
+    usable = away_from_edges(square)
+    failures = []
+    for name, (picture, notes) in zip(passes, seen, strict=True):
+        assert notes == []
+        times = times_too_far(picture, expected[name])
+        for number in range(len(materials)):
+            pixels = usable & (square == number)
+            assert pixels.sum() > 50
+            if times[pixels].max() > 1.0:
+                material = bpy.data.objects[f"Plane.{number:03d}" if number else "Plane"].active_material.name
+                failures.append(f"{material}, {name}: {times[pixels].max():.1f} times as far off as it may be")
+        assert expected[name][usable].max() > 0.05
+    return failures

@@ -40,9 +40,7 @@ def main() -> int:
         fixed += ["--file", str(HERE.parent / "blender" / name)]
     for helper in sorted(set(HERE.glob("*.py")) - set(HERE.glob("drive_*.py")) - {Path(__file__).resolve()}):
         fixed += ["--file", str(helper)]
-    failed = [
-        path.stem for path in drivers if not run(arguments.runner, path, archive, fixed, arguments.out / path.stem)
-    ]
+    failed = [path.stem for path in drivers if not run(arguments.runner, path, archive, fixed, arguments.out)]
     print(f"{len(drivers) - len(failed)} of {len(drivers)} drivers passed; pictures are in {arguments.out}")
     return 1 if failed else 0
 

@@ -133,8 +133,8 @@ def content(mirror) -> str:
         digest.update(np.array(instance.model).tobytes())
         digest.update(repr((instance.mesh.triangles, instance.receiver)).encode())
         digest.update(instance.mesh.middle.tobytes())
-        for shown in instance.looks:
-            digest.update(look_values(shown.look).tobytes())
+        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
+            digest.update(look_values(lobe).tobytes())
     return digest.hexdigest()
 
 

@@ -12,7 +12,8 @@ from mathutils import Matrix
 from ...scene import AreaLight
 from ..lights.light_linking import Receivers
 from ..lights.shown_textures import ShownTextures
-from ..materials.surface_looks import Look, look_of
+from ..materials.look_reader import look_of
+from ..materials.surface_looks import Look
 from ..materials.world_look import world_radiance
 from .depsgraph_instances import data_pointer, is_seen_by_cameras, is_surface, mesh_key, owner_of, visibility
 from .mesh_batches import MeshBatches, mesh_batches
@@ -30,6 +31,12 @@ class ShownLook:
     look: Look
     uniforms: object
     textures: dict | None = None
+    further: tuple[ShownLook, ...] = ()  # the other lobes
+
+    @property
+    def lobes(self) -> tuple[ShownLook, ...]:
+        """This lobe and the further ones."""
+        return (self, *self.further)
 
 
 @dataclass(frozen=True)
@@ -122,6 +129,11 @@ class SceneMirror:
     def triangles(self) -> int:
         return sum(instance.mesh.triangles for instance in self.instances)
 
+    @property
+    def most_lobes(self) -> int:
+        """How many lobes the material with the most has."""
+        return max((len(shown.lobes) for shown in self._looks.values()), default=0)
+
     def sync(self, depsgraph, space=None) -> None:
         """Take over what has changed; `space` is the 3D view, whose local view counts."""
         changes = changes_of(depsgraph, not self._synced)
@@ -144,7 +156,7 @@ class SceneMirror:
             self._looks.pop(name, None)
         if changes.images:
             self._light_textures.clear()
-            for shown in self._looks.values():
+            for shown in (lobe for look in self._looks.values() for lobe in look.lobes):
                 shown.textures = None
 
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
@@ -173,9 +185,9 @@ class SceneMirror:
                 if name not in looks:
                     looks[name] = self._looks.get(name) or _shown_look(material)
             shown = tuple(looks[_name(material)] for material in materials)
-            for look in shown:
-                if look.look.normal is not None:
-                    mesh.add_tangents(ob, look.look.uv_map)
+            for lobe in (lobe.look for look in shown for lobe in look.lobes):
+                if lobe.normal is not None:
+                    mesh.add_tangents(ob, lobe.uv_map)
             receiver = _receiver(instance, receivers, depsgraph.view_layer)
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
@@ -192,7 +204,8 @@ class SceneMirror:
 
 def _shown_look(material) -> ShownLook:
     look = look_of(None if material is None else material.original)
-    return ShownLook(look, uniform_buffer(look_values(look)))
+    further = tuple(ShownLook(lobe, uniform_buffer(look_values(lobe))) for lobe in look.further)
+    return ShownLook(look, uniform_buffer(look_values(look)), further=further)
 
 
 def _materials(ob, mesh: MeshBatches, override) -> list:

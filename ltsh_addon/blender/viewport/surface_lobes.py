@@ -37,13 +37,37 @@ float dielectric_share(float roughness, float cosine, float ior)
              share.x);
 }
 
-vec3 multiple_scattering(vec3 mean, vec2 albedo)
+vec3 scattering_boost(vec3 mean, vec2 albedo)
 {
-  if (look.data[0].y < 0.5) {
-    return vec3(1.0);
-  }
   vec3 scattered = mean * albedo.y / (1.0 - mean * (1.0 - albedo.y));
   return 1.0 + scattered * ((1.0 - albedo.x) / albedo.x);
+}
+
+vec3 multiple_scattering(vec3 mean, vec2 albedo)
+{
+  return look.data[0].y < 0.5 ? vec3(1.0) : scattering_boost(mean, albedo);
+}
+
+float dielectric_average(float ior)
+{
+  return (ior - 1.0) / (4.08567 + 1.00071 * ior);
+}
+
+/* The share of a lobe that is left under its coat, whose normal is seen under `cosine`. */
+vec3 left_under_coat(float cosine)
+{
+  float weight = look.data[LAYERS].y;
+  float roughness = look.data[LAYERS].z;
+  float ior = look.data[LAYERS].w;
+  vec2 albedo = lobe_albedo(roughness, cosine);
+  float f0 = pow((ior - 1.0) / (ior + 1.0), 2.0);
+  float reflected = f0 + (1.0 - f0) * dielectric_share(roughness, cosine, ior);
+  reflected *= albedo.x * scattering_boost(vec3(dielectric_average(ior)), albedo).x;
+  float left = clamp(1.0 - weight * (ior > 1.0 ? reflected : 0.0), 0.0, 1.0);
+  /* The light crosses the coat along the refracted ray. */
+  float depth = inversesqrt(max(1.0 - (1.0 - cosine * cosine) / (ior * ior), 1e-6));
+  vec3 tint = pow(max(look.data[LAYERS + 1].xyz, vec3(1e-20)), vec3(depth));
+  return left * (1.0 + weight * (tint - 1.0));
 }
 
 struct Lobe {
@@ -75,7 +99,7 @@ void add_dielectric(inout Lobe lobe, vec3 color, float share, float ior, float r
   float used = level == 0.5 ? ior : (1.0 + root) / (1.0 - root);
   float plain = pow((used - 1.0) / (used + 1.0), 2.0);
   vec3 tinted = clamp(f0 * max(look.data[2].xyz, vec3(0.0)), vec3(0.0), vec3(1.0));
-  float average = (used - 1.0) / (4.08567 + 1.00071 * used);
+  float average = dielectric_average(used);
   vec3 mean = tinted + (1.0 - tinted) * clamp((average - plain) / (1.0 - plain), 0.0, 1.0);
   vec3 factor = multiple_scattering(mean, albedo);
   vec3 reflected = tinted + (1.0 - tinted) * dielectric_share(roughness, cosine, used);
@@ -119,6 +143,10 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
     lobe.f90 = factor * look.data[FIRST_TERM + 1].xyz;
     lobe.dip = factor * look.data[FIRST_TERM + 2].xyz;
     lobe.dielectric = factor * look.data[FIRST_TERM + 3].xyz;
+  }
+  else if (kind == COAT) {
+    lobe.dielectric = look.data[LAYERS].y * scattering_boost(vec3(dielectric_average(ior)), albedo);
+    lobe.ior = max(ior, 1.0);
   }
   else {
     lobe.diffuse = color;

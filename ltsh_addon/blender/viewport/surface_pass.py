@@ -46,11 +46,12 @@ class SurfacePass:
     """Shaders and textures of one view's G-buffer; needs an active GPU context."""
 
     def __init__(self):
-        self._shaders = {outputs: _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
+        self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size, self._textures, self._buffers = None, {}, {}
+        self._lobe_textures: dict = {}
 
     def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
         """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call.
@@ -58,11 +59,20 @@ class SurfacePass:
         Normals of their own are there where a surface is smooth or bent.
         """
         self._resize(size)
-        self._draw_into(SURFACES, instances, view, size)
-        textures = {name: self._textures[name] for name in SURFACES}
+        textures = dict(self._draw_into(SURFACES, instances, view, size))
         if has_normals(instances):
-            self._draw_into(NORMALS, instances, view, size)
-            textures.update({name: self._textures[name] for name in NORMALS})
+            textures.update(self._draw_into(NORMALS, instances, view, size))
+        return GBufferTextures(**textures)
+
+    def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
+        """The G-buffer of the lobes `number`, from 1 on, of what `draw` drew last; valid until the next call.
+
+        There is no surface where a material has fewer lobes.
+        """
+        having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
+        textures = dict(self._draw_into(SURFACES, having, view, self._size, number))
+        if has_normals(having):
+            textures.update(self._draw_into(NORMALS, having, view, self._size, number))
         return GBufferTextures(**textures)
 
     @property
@@ -79,17 +89,15 @@ class SurfacePass:
             gpu.state.viewport_set(0, 0, *size)
             gpu.state.depth_test_set("NONE")
             gpu.state.blend_set("ADDITIVE_PREMULT")
-            shader = self._shaders[EMISSION]
-            shader.bind()
-            shader.uniform_sampler("positions", self._textures["position"])
             try:
-                self._draw_instances(shader, shining, view, with_images=False)
+                self._draw_instances(self._shaders[EMISSION, False], shining, view, is_emission=True)
             finally:
                 gpu.state.blend_set("NONE")
 
     def free(self) -> None:
         """Let go of everything."""
         self._size, self._textures, self._buffers, self._tables, self._shaders = None, {}, {}, {}, {}
+        self._lobe_textures = {}
         self._nothing = self._missing = self._depth = None
 
     def _resize(self, size) -> None:
@@ -103,43 +111,64 @@ class SurfacePass:
             )
             for outputs in (SURFACES, NORMALS)
         }
+        self._lobe_textures = {}
         self._size = size
 
-    def _draw_into(self, outputs, instances, view: View, size) -> None:
-        buffer = self._buffers[outputs]
+    def _target(self, outputs, is_further: bool):
+        """Textures by name and the frame buffer that `outputs` are drawn into; those of further lobes have no depth."""
+        if not is_further:
+            return {name: self._textures[name] for name in outputs}, self._buffers[outputs]
+        if outputs not in self._lobe_textures:
+            textures = {name: gpu.types.GPUTexture(self._size, format="RGBA32F") for name in outputs}
+            buffer = gpu.types.GPUFrameBuffer(color_slots=list(textures.values()))
+            self._lobe_textures[outputs] = textures, buffer
+        return self._lobe_textures[outputs]
+
+    def _draw_into(self, outputs, instances, view: View, size, number: int = 0) -> dict:
+        """Draw the lobes `number`; the textures by name."""
+        textures, buffer = self._target(outputs, number > 0)
+        if (outputs, number > 0) not in self._shaders:
+            self._shaders[outputs, True] = _shader(outputs, is_further=True)
         with buffer.bind():
             gpu.state.viewport_set(0, 0, *size)
             # Only the position tells where there is a surface, but no number may be left that is not one.
-            buffer.clear(color=(0.0, 0.0, 0.0, 0.0), depth=1.0)
+            if number > 0:
+                buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
+            else:
+                buffer.clear(color=(0.0, 0.0, 0.0, 0.0), depth=1.0)
             gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("LESS_EQUAL")
-            gpu.state.depth_mask_set(True)
+            gpu.state.depth_test_set("NONE" if number > 0 else "LESS_EQUAL")
+            gpu.state.depth_mask_set(number == 0)
             gpu.state.face_culling_set("NONE")
             try:
-                self._draw_instances(self._shaders[outputs], instances, view)
+                self._draw_instances(self._shaders[outputs, number > 0], instances, view, number)
             finally:
                 gpu.state.depth_test_set("NONE")
                 gpu.state.depth_mask_set(False)
+        return textures
 
-    def _draw_instances(self, shader, instances, view: View, with_images: bool = True) -> None:
+    def _draw_instances(self, shader, instances, view: View, number: int = 0, is_emission: bool = False) -> None:
         shader.bind()
+        if number > 0 or is_emission:
+            shader.uniform_sampler("positions", self._textures["position"])
         values = np.vstack([view.projection.T, [*view.eye, 0.0 if view.is_parallel else 1.0]])
         # Kept until all is drawn: the card reads it then.
         self._view_values = uniform_buffer(values)
         shader.uniform_block("view", self._view_values)
-        for name, table in self._tables.items() if with_images else ():
+        for name, table in self._tables.items() if not is_emission else ():
             shader.uniform_sampler(name, table)
         # From near to far: what is hidden need not be computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             shader.uniform_float("model", instance.model)
-            if with_images:
+            if not is_emission:
                 marks = instance.mesh.is_smooth, instance.is_only_user
                 shader.uniform_float("placement", (instance.receiver, instance.side, *marks))
             for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
-                shader.uniform_block("look", look.uniforms)
-                if with_images:
-                    self._bind_images(shader, look)
-                instance.mesh.batch(slot, look.look.uv_map).draw(shader)
+                for lobe in look.lobes[number : number + 1]:
+                    shader.uniform_block("look", lobe.uniforms)
+                    if not is_emission:
+                        self._bind_images(shader, lobe)
+                    instance.mesh.batch(slot, lobe.look.uv_map).draw(shader)
 
     def _bind_images(self, shader, shown: ShownLook) -> None:
         if shown.textures is None:
@@ -158,7 +187,7 @@ def has_normals(instances: list[ShownInstance]) -> bool:
 
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:
     """True where a diffuse lobe does not end at its own normal's horizon."""
-    return any(_bends(look) for instance in instances for look in instance.looks)
+    return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
 
 
 def _bends(shown: ShownLook) -> bool:
@@ -166,7 +195,7 @@ def _bends(shown: ShownLook) -> bool:
     return shown.look.normal is not None or shown.look.kind == "translucent"
 
 
-def _shader(outputs):
+def _shader(outputs, is_further: bool = False):
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(
         f"struct SurfaceView {{ mat4 projection; vec4 eye; }};\nstruct SurfaceLook {{ vec4 data[{LOOK_SIZE}]; }};\n"
@@ -182,14 +211,16 @@ def _shader(outputs):
     info.define("UNIT_NORMALS", "true" if NORMAL_MAPS_BEND_UNIT_NORMALS else "false")
     info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
     images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
-    for slot, name in enumerate(("positions",) if outputs == EMISSION else images):
+    needs_seen = is_further or outputs == EMISSION
+    for slot, name in enumerate((*(images if outputs != EMISSION else ()), *(("positions",) if needs_seen else ()))):
         info.sampler(slot, "FLOAT_2D", name)
+    info.define("LEAVE_OUT_HIDDEN", "if (!is_seen()) { discard; }" if is_further else "")
     info.vertex_in(0, "VEC3", "position")
     info.vertex_in(1, "VEC3", "normal")
     info.vertex_in(2, "VEC2", "uv")
     # Meshes without normal maps have none: they get (0, 0, 0, 1).
     info.vertex_in(3, "VEC4", "tangent")
-    passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}")
+    passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}_{int(is_further)}")
     passed.smooth("VEC3", "v_position")
     passed.smooth("VEC3", "v_normal")
     passed.smooth("VEC3", "v_object_normal")
@@ -199,7 +230,7 @@ def _shader(outputs):
     for slot, name in enumerate(outputs):
         info.fragment_out(slot, "VEC4", f"out_{name}")
     info.vertex_source(source.VERTEX)
-    info.fragment_source(_fragment_source(outputs))
+    info.fragment_source((source.SEEN if needs_seen else "") + _fragment_source(outputs))
     return gpu.shader.create_from_info(info)
 
 

@@ -1,4 +1,4 @@
-"""GLSL of the passes that draw surfaces into the G-buffer: what `lobe_samples` does for pixels, for one lobe.
+"""GLSL of the passes that draw surfaces into the G-buffer: what `lobe_samples` does for pixels, lobe by lobe.
 
 What it reads of images and normals stands in `surface_inputs`, lobes in `surface_lobes`.
 """
@@ -49,12 +49,21 @@ FRAGMENT_OF_SURFACES = """
   float ior = max(slot_value(ior_image, 3, v_uv).x, 1.0);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
   Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
+  vec3 weight = vec3(look.data[LAYERS].x);
+  if (look.data[LAYERS].y > 0.0 && int(look.data[0].x + 0.5) != COAT) {
+    vec3 coat_normal = specular_normal;
+    if (look.data[LAYERS + 1].w < 0.5) {
+      coat_normal = flags >= 2 ? valid_specular_normal(smooth_normal, true_normal, towards_eye) : smooth_normal;
+    }
+    weight *= left_under_coat(clamp(dot(coat_normal, towards_eye), 0.0, 1.0));
+  }
   out_position = vec4(v_position, 1.0 + placement.x);
   out_normal = vec4(specular_normal, roughness);
-  out_base = vec4(lobe.diffuse, lobe.ior);
-  out_f0 = vec4(lobe.f0, lobe.dip.r);
-  out_f90 = vec4(lobe.f90, lobe.dip.g);
-  out_dielectric = vec4(lobe.dielectric, lobe.dip.b);
+  out_base = vec4(weight * lobe.diffuse, lobe.ior);
+  out_f0 = vec4(weight * lobe.f0, weight.r * lobe.dip.r);
+  out_f90 = vec4(weight * lobe.f90, weight.g * lobe.dip.g);
+  out_dielectric = vec4(weight * lobe.dielectric, weight.b * lobe.dip.b);
+  LEAVE_OUT_HIDDEN
 }
 """
 
@@ -66,17 +75,25 @@ FRAGMENT_OF_NORMALS = """
   }
   out_diffuse_normal = vec4(diffuse_normal, alpha2);
   out_smooth_normal = vec4(smooth_normal, 0.0);
+  LEAVE_OUT_HIDDEN
 }
 """
 
-# Adds what surfaces emit to a picture, where they are those of the G-buffer.
-EMISSION_FRAGMENT = """
-void main()
+# What is drawn later is drawn where it is the surface of the G-buffer.
+SEEN = """
+bool is_seen()
 {
   vec4 seen = texelFetch(positions, ivec2(gl_FragCoord.xy), 0);
   vec3 between = seen.xyz - v_position;
   float distance2 = view.eye.w < 0.5 ? 1.0 : dot(view.eye.xyz - v_position, view.eye.xyz - v_position);
-  if (seen.w == 0.0 || dot(between, between) > 1e-7 * distance2) {
+  return seen.w != 0.0 && dot(between, between) <= 1e-7 * distance2;
+}
+"""
+
+EMISSION_FRAGMENT = """
+void main()
+{
+  if (!is_seen()) {
     discard;
   }
   out_emission = vec4(look.data[1].xyz, 0.0);

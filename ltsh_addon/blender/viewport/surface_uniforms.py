@@ -8,15 +8,18 @@ import numpy as np
 from ..materials import reflectance
 from ..materials.aovs import LOBE_KINDS
 from ..materials.linear_values import EXTENSIONS, Value
-from ..materials.surface_looks import IMAGE_SLOTS, Look
+from ..materials.surface_looks import COAT, IMAGE_SLOTS, Look
 
-# In units of vec4: where slots start, the size of one, where the terms of conductors start, the size of all.
+# In units of vec4: where slots start, the size of one, where the terms of conductors and where the coat starts, all.
 FIRST_SLOT, SLOT_SIZE = 3, 6
 FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
-LOOK_SIZE = FIRST_TERM + 5
+LAYERS = FIRST_TERM + 5
+LOOK_SIZE = LAYERS + 2
+KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
-    **{name.upper(): str(int(number)) for name, number in LOBE_KINDS.items()},
+    **{name.upper(): str(int(number)) for name, number in KINDS.items()},
     **{"FIRST_SLOT": str(FIRST_SLOT), "SLOT_SIZE": str(SLOT_SIZE), "FIRST_TERM": str(FIRST_TERM)},
+    "LAYERS": str(LAYERS),
 }
 
 
@@ -30,7 +33,7 @@ def look_values(look: Look) -> np.ndarray:
     """The uniform buffer (LOOK_SIZE, 4) of a look."""
     data = np.zeros((LOOK_SIZE, 4))
     flags = (look.normal is not None) + 2 * look.corrected
-    data[0] = LOBE_KINDS[look.kind], look.scattered, flags, look.normal_strength
+    data[0] = KINDS[look.kind], look.scattered, flags, look.normal_strength
     data[1] = *look.emission, look.value("transmission").offset[0]
     data[2] = *look.value("tint").offset, look.value("specular_level").offset[0]
     for position, name in enumerate(IMAGE_SLOTS):
@@ -38,6 +41,10 @@ def look_values(look: Look) -> np.ndarray:
         if value is not None:
             start = FIRST_SLOT + SLOT_SIZE * position
             data[start : start + SLOT_SIZE] = _slot_values(value)
+    data[LAYERS, 0] = look.weight
+    if look.coat is not None:
+        data[LAYERS, 1:] = look.coat.weight, look.coat.roughness, look.coat.ior
+        data[LAYERS + 1] = *look.coat.tint, look.coat.follows_normal
     if look.kind.startswith("conductor"):
         exact = look.kind == "conductor"
         index, extinction = look.value("color").offset[None], np.maximum(look.value("tint").offset, 0.0)[None]

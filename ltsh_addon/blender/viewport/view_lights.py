@@ -17,10 +17,10 @@ from ..lights.mesh_light_faces import constant_mesh_lights
 from ..lights.mesh_lights import collect_mesh_lights
 from ..lights.shown_textures import ShownTextures
 from ..materials.linear_values import product
+from ..materials.look_reader import look_of
 from ..materials.node_sources import source_of
 from ..materials.node_values import value_at
 from ..materials.shader_graph import material_output
-from ..materials.surface_looks import look_of
 from ..pixels.inventory import SURFACE_TYPES, EmitterTraits
 
 # Where nothing says on which side of closed emissive meshes the eye is, it is outside.

@@ -46,6 +46,7 @@ class ViewRenderer:
         self._lighting: dict[str, LightingPass] = {}
         self._targets: list = []
         self._horizons: HorizonPass | None = None
+        self._lobe_horizons: HorizonPass | None = None
         self._gbuffer: GBufferTextures | None = None
         self._lit_gbuffer: GBufferTextures | None = None
         self._lights: UploadedLights | None = None
@@ -97,15 +98,17 @@ class ViewRenderer:
 
     def _choose_horizons(self, mirror, view: View) -> None:
         """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
-        gbuffer, self._lit_gbuffer = self._gbuffer, None
-        if gbuffer.geometric_normal is None:
-            self._lit_gbuffer = gbuffer
-            return
-        if self._horizons is None:
+        self._lit_gbuffer = None
+        if self._horizons is None and self._gbuffer.geometric_normal is not None:
             self._horizons = HorizonPass()
-        horizon = self._horizons.draw(gbuffer, self._lights, (*view.eye, 0.0 if view.is_parallel else 1.0))
+        self._lit_gbuffer = self._with_horizons(self._gbuffer, self._horizons, mirror, view)
+
+    def _with_horizons(self, gbuffer, horizons, mirror, view: View) -> GBufferTextures:
+        if gbuffer.geometric_normal is None:
+            return gbuffer
+        horizon = horizons.draw(gbuffer, self._lights, (*view.eye, 0.0 if view.is_parallel else 1.0))
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
-        self._lit_gbuffer = replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
+        return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
     def _lit(self, number: int, technique: str, mirror, view: View, size, shown: ShownPicture):
         lighting = self._lighting.get(technique)
@@ -116,6 +119,12 @@ class ViewRenderer:
         texture, buffer = self._target(number, size)
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
         lighting.draw(self._lit_gbuffer, buffer, shown.passes, **place)
+        for number in range(1, mirror.most_lobes):
+            gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
+            if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
+                self._lobe_horizons = HorizonPass()
+            gbuffer = self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
+            lighting.draw(gbuffer, buffer, shown.passes, **place, add=True)
         if shown.passes == "combined" and shown.second_picture is None:
             self._surfaces.add_emission(mirror.instances, view, size, buffer)
         return texture
@@ -143,9 +152,10 @@ class ViewRenderer:
         self._lighting.clear()
         self._targets.clear()
         self._surfaces.free()
-        if self._horizons is not None:
-            self._horizons.free()
-        self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = None
+        for horizons in (self._horizons, self._lobe_horizons):
+            if horizons is not None:
+                horizons.free()
+        self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = self._lobe_horizons = None
         self._drawn = self._uploaded = None
 
 
@@ -153,8 +163,8 @@ def common_iors(mirror: SceneMirror) -> tuple[float, ...]:
     """The constant indices of refraction of most instances, as the lighting pass takes them."""
     counts: dict[float, int] = {}
     for instance in mirror.instances:
-        for shown in instance.looks:
-            value: Value = shown.look.value("ior")
+        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
+            value: Value = lobe.value("ior")
             ior = round(200.0 * float(value.offset[0])) / 200.0
             if value.is_constant and ior > 1.0:
                 counts[ior] = counts.get(ior, 0) + 1

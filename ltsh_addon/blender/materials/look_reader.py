@@ -1,0 +1,223 @@
+"""From the nodes of a material to how the viewport shades it; nothing is edited.
+
+What cannot be said by `Look` gets the material's viewport settings and is named in `Look.notes`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import bpy
+import numpy as np
+
+from ..pixels.cycles_settings import cycles_setting
+from .bsdf_leaves import TRANSPARENT_NODES
+from .bsdf_lobes import (
+    LOBE_SOCKETS,
+    METALLIC,
+    METALLIC_SOCKETS,
+    MULTIPLE_SCATTERING_NODES,
+    NEAREST_ALPHA,
+    PRINCIPLED,
+    is_emission,
+)
+from .linear_values import Value, constant
+from .lobe_slots import SMALLEST_WEIGHT
+from .node_sources import Source, source_of
+from .node_values import value_at
+from .shader_graph import material_output
+from .surface_looks import COAT, IMAGE_SLOTS, NEUTRAL, Coat, Look, default_look, is_missing, plain_look
+
+# Quantity of `aovs.LOBE_AOVS` -> viewport setting of the material that stands in for it.
+STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
+# Each costs as much as the first.
+MOST_LOBES = 8
+
+
+def look_of(material) -> Look:
+    """How the viewport shades `material`."""
+    if material is None:
+        return default_look()
+    if bpy.app.version < (5, 0, 0) and not material.use_nodes:
+        return plain_look(material.diffuse_color)
+    tree = material.node_tree
+    output = material_output(tree) if tree is not None else None
+    if output is None:
+        return plain_look(0.0)
+    walk = _Leaves()
+    walk.follow(source_of(tree, output.inputs["Surface"]), 1.0)
+    return _Reader(material, walk).look()
+
+
+def _is_same(first: Source | None, second: Source | None) -> bool:
+    """Do both sockets have the same node before them?"""
+    return first is not None and second is not None and first.node == second.node and first.groups == second.groups
+
+
+class _Leaves:
+    """The shader nodes of a material with their shares; of unknown factors both sides get half."""
+
+    def __init__(self):
+        self.found: list[tuple[Source, float]] = []
+        self.guessed: list[str] = []
+
+    def follow(self, source: Source | None, weight: float) -> None:
+        if source is None or source.node is None or weight <= 0.0:
+            return
+        kind = source.node.bl_idname
+        if kind == "ShaderNodeMixShader":
+            factor = value_at(source.tree, source.node.inputs[0], source.groups)
+            share = 0.5
+            if factor is None or not factor.is_constant:
+                self.guessed.append(source.node.name)
+            else:
+                share = float(np.clip(factor.offset[0], 0.0, 1.0))
+            self.follow(source.input(1), weight * (1.0 - share))
+            self.follow(source.input(2), weight * share)
+        elif kind == "ShaderNodeAddShader":
+            self.follow(source.input(0), weight)
+            self.follow(source.input(1), weight)
+        else:
+            self.found.append((source, weight))
+
+
+class _Reader:
+    """From the leaves of a material to its look."""
+
+    def __init__(self, material, walk: _Leaves):
+        self.material, self.notes = material, []
+        self.emitters = [(source, share) for source, share in walk.found if is_emission(source.node)]
+        others = [pair for pair in walk.found if not is_emission(pair[0].node)]
+        solid = [pair for pair in others if pair[0].node.bl_idname not in TRANSPARENT_NODES]
+        clear = sum(share for source, share in others if source.node.bl_idname in TRANSPARENT_NODES)
+        if clear > 0.0 and solid:
+            self.note("transparency is not shown")
+        # Opaque, they share what is left to them.
+        self.leaves = [(source, share / max(1.0 - clear, share)) for source, share in solid]
+        for name in walk.guessed:
+            self.note(f"factor of {name!r} is not resolved")
+
+    def note(self, message: str) -> None:
+        """Name something that the viewport does not show as it is."""
+        self.notes.append(f"{self.material.name}: {message}")
+
+    def look(self) -> Look:
+        """The heaviest lobe with the others behind it."""
+        emission = np.zeros(3)
+        for source, share in self.emitters:
+            emission = emission + share * self._emission(source, "Color", "Strength")
+        lobes: list[Look] = []
+        for source, share in sorted(self.leaves, key=lambda pair: -pair[1]):
+            if source.node.bl_idname == PRINCIPLED:
+                emission = emission + share * self._emission(source, "Emission Color", "Emission Strength")
+            lobes += self._lobes_of(source, share)
+        if not lobes:
+            lobes = [plain_look(0.0)]
+        if len(lobes) > MOST_LOBES:
+            self.note(f"of its {len(lobes)} lobes only {MOST_LOBES} are shown")
+        first, *further = lobes[:MOST_LOBES]
+        return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
+
+    def _lobes_of(self, source: Source, share: float) -> list[Look]:
+        """The lobes of one BSDF node."""
+        node = source.node
+        sockets = LOBE_SOCKETS.get(node.bl_idname)
+        if node.bl_idname == METALLIC:
+            sockets = METALLIC_SOCKETS[node.fresnel_type]
+        if sockets is None:
+            self.note(f"{node.bl_label} is not shown, its viewport color is")
+            return [replace(plain_look(self.material.diffuse_color), weight=share)]
+        look = replace(self._lobe(source, *sockets), weight=share)
+        coat = self._coat(source, look) if look.kind == "principled" else None
+        if coat is None:
+            return [look]
+        values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior)}
+        normal = (look.normal, look.normal_strength) if coat.follows_normal else (None, 1.0)
+        # Its multiple scattering is always there.
+        shine = Look(COAT, values, *normal, scattered=True, corrected=look.corrected, weight=share, coat=coat)
+        return [replace(look, coat=coat), shine]
+
+    def _lobe(self, source: Source, kind: str, names: dict[str, str]) -> Look:
+        node = source.node
+        values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
+        values = self._on_one_uv_map(values)
+        distribution = getattr(node, "distribution", "")
+        if distribution in NEAREST_ALPHA:
+            values["roughness"] = values["roughness"].mapped(NEAREST_ALPHA[distribution] ** 0.5 * np.eye(3))
+            self.note(f"distribution {distribution} is shown as GGX")
+        if kind == "principled":
+            weight = value_at(source.tree, node.inputs["Sheen Weight"], source.groups)
+            if weight is None or not weight.is_constant or weight.offset[0] > 0.0:
+                self.note("sheen is not shown")
+        normal, strength = self._normal(source, values)
+        scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
+        corrected = cycles_setting(self.material, "use_bump_map_correction")
+        look = Look(kind, values, normal, strength, scattered, corrected)
+        for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
+            self.note(f"image {name!r} is missing, it is pink")
+        return look
+
+    def _coat(self, source: Source, look: Look) -> Coat | None:
+        """What covers a Principled BSDF, None where nothing does."""
+        weight = float(self._value(source, "", "Coat Weight").offset[0])
+        if weight <= SMALLEST_WEIGHT:
+            return None
+        sockets = ("Coat Roughness", "Coat IOR", "Coat Tint")
+        roughness, ior, tint = (self._value(source, "", name).offset for name in sockets)
+        normal, follows = source.input("Coat Normal"), False
+        if normal is not None and normal.node is not None:
+            follows = look.normal is not None and _is_same(normal, source.input("Normal"))
+            if not follows:
+                self.note("Coat Normal is not resolved")
+        roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)
+        return Coat(weight, roughness, ior, np.maximum(tint, 0.0) * np.ones(3), follows)
+
+    def _value(self, source: Source, name: str, socket_name: str) -> Value:
+        value = value_at(source.tree, source.node.inputs[socket_name], source.groups)
+        if value is not None and (value.is_constant or name in IMAGE_SLOTS):
+            return value
+        self.note(f"{socket_name} is not resolved")
+        if name in STAND_INS:
+            return constant(getattr(self.material, STAND_INS[name]))
+        default = source.node.inputs[socket_name].default_value
+        return constant(default if value is None else value.offset)
+
+    def _on_one_uv_map(self, values: dict[str, Value]) -> dict[str, Value]:
+        """`values` with stand-ins for the images on other UV maps than the first."""
+        first, result = None, {}
+        for name, value in values.items():
+            if value.image is not None:
+                first = value.image.uv_map if first is None else first
+                if value.image.uv_map != first:
+                    self.note(f"the image of {name} is on another UV map and not shown")
+                    value = constant(getattr(self.material, STAND_INS[name]) if name in STAND_INS else NEUTRAL[name])
+            result[name] = value
+        return result
+
+    def _normal(self, source: Source, values: dict[str, Value]) -> tuple[Value | None, float]:
+        """The normal map at the Normal socket and its strength."""
+        normal = source.input("Normal") if "Normal" in source.node.inputs else None
+        if normal is None or normal.node is None:
+            return None, 1.0
+        node = normal.node
+        if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
+            self.note(f"normals from {node.name!r} are not resolved")
+            return None, 1.0
+        color, strength = (value_at(normal.tree, node.inputs[name], normal.groups) for name in ("Color", "Strength"))
+        maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
+        if color is None or strength is None or not strength.is_constant or len(maps - {""}) > 1:
+            self.note(f"normals from {node.name!r} are not resolved")
+            return None, 1.0
+        if color.image is None:
+            return None, 1.0
+        return color, float(strength.offset[0])
+
+    def _emission(self, source: Source, color_name: str, strength_name: str) -> np.ndarray:
+        if color_name not in source.node.inputs:
+            return np.zeros(3)
+        parts = [value_at(source.tree, source.node.inputs[name], source.groups) for name in (strength_name, color_name)]
+        if all(part is not None and part.is_constant for part in parts):
+            return parts[0].offset * parts[1].offset
+        if parts[0] is None or not parts[0].is_constant or np.any(parts[0].offset):
+            self.note("its emission varies and is not shown")
+        return np.zeros(3)

@@ -1,0 +1,153 @@
+"""Materials of several lobes in the viewport: coats, mixes and sums of BSDF nodes, against samples of Cycles."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from view_pictures import normal_map, patches_too_far
+
+from ltsh_addon import shading
+from ltsh_addon.blender.materials import look_reader
+from ltsh_addon.blender.materials.look_reader import look_of
+
+RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
+
+
+def coated(name, **inputs):
+    return lambda: parts.principled(name, Base_Color=RED, **{"Roughness": 0.5, "Coat_Weight": 1.0, **inputs})[0]
+
+
+def coated_normal_map(follows):
+    """A bumpy base under a coat that is as bumpy, or smooth."""
+
+    def make():
+        material = normal_map()
+        node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
+        node.inputs["Coat Weight"].default_value, node.inputs["Coat Roughness"].default_value = 0.8, 0.2
+        if follows:
+            link = node.inputs["Normal"].links[0]
+            material.node_tree.links.new(link.from_socket, node.inputs["Coat Normal"])
+        material.name = f"coat over bumps {follows}"
+        return material
+
+    return make
+
+
+def nodes_of(tree, *types):
+    return [tree.nodes.new(f"ShaderNode{kind}") for kind in types]
+
+
+def mixed(name, joiner="MixShader", factor=0.3):
+    """Chalk and gloss, mixed or added."""
+
+    def make():
+        material, tree, output = parts.new_material(name)
+        join, chalk, gloss = nodes_of(tree, joiner, "BsdfDiffuse", "BsdfAnisotropic")
+        chalk.inputs["Color"].default_value, gloss.inputs["Color"].default_value = RED, GOLD
+        gloss.distribution, gloss.inputs["Roughness"].default_value = "GGX", 0.35
+        if joiner == "MixShader":
+            join.inputs[0].default_value = factor
+        for entry, node in zip(list(join.inputs)[-2:], (chalk, gloss), strict=True):
+            tree.links.new(node.outputs[0], entry)
+        tree.links.new(join.outputs[0], output.inputs["Surface"])
+        return material
+
+    return make
+
+
+def nested():
+    """A coated plastic, chalk behind it and gloss: four lobes."""
+    material, tree, output = parts.new_material("nested")
+    outer, inner, plastic, chalk, gloss = nodes_of(
+        tree, "MixShader", "MixShader", "BsdfPrincipled", "BsdfDiffuse", "BsdfAnisotropic"
+    )
+    outer.inputs[0].default_value, inner.inputs[0].default_value = 0.4, 0.25
+    plastic.inputs["Coat Weight"].default_value, plastic.inputs["Roughness"].default_value = 0.7, 0.6
+    gloss.distribution, gloss.inputs["Roughness"].default_value = "GGX", 0.25
+    tree.links.new(plastic.outputs[0], inner.inputs[1])
+    tree.links.new(chalk.outputs[0], inner.inputs[2])
+    tree.links.new(inner.outputs[0], outer.inputs[1])
+    tree.links.new(gloss.outputs[0], outer.inputs[2])
+    tree.links.new(outer.outputs[0], output.inputs["Surface"])
+    return material
+
+
+def half_glow():
+    """Half of the chalk gives way to what glows: passes of light do not show that."""
+    material, tree, output = parts.new_material("half glow")
+    mix, chalk, glow = nodes_of(tree, "MixShader", "BsdfDiffuse", "Emission")
+    glow.inputs["Strength"].default_value = 1e-6
+    tree.links.new(chalk.outputs[0], mix.inputs[1])
+    tree.links.new(glow.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    return material
+
+
+LAYERED = (
+    coated("varnish"),
+    coated("thin varnish", Coat_Weight=0.4, Coat_Roughness=0.3, Coat_IOR=1.8),
+    coated("tinted varnish", Coat_Tint=AMBER, Coat_Roughness=0.15, Coat_IOR=1.35),
+    coated("tint alone", Coat_Tint=AMBER, Coat_IOR=1.0),
+    coated("car paint", Metallic=0.7, Coat_Roughness=0.1),
+    coated_normal_map(False),
+    coated_normal_map(True),
+    mixed("mixed"),
+    mixed("added", "AddShader"),
+    mixed("mostly gloss", factor=0.9),
+    nested,
+    half_glow,
+)
+
+
+@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@pytest.mark.parametrize(("kind", "passes"), [("PERSP", shading.PASSES), ("ORTHO", ("specular",))])
+def test_the_viewport_adds_up_the_lobes_that_cycles_sampled(tmp_path, kind, passes):
+    assert not patches_too_far(tmp_path / "patches.blend", LAYERED, kind, passes)
+
+
+def test_mixed_shaders_are_lobes_with_their_shares():
+    parts.empty_scene()
+    look = look_of(mixed("Mixed", factor=0.7)())
+    assert [(lobe.kind, round(lobe.weight, 6)) for lobe in look.lobes] == [("glossy", 0.7), ("diffuse", 0.3)]
+    assert look.notes == ()
+
+
+def test_transparent_parts_leave_their_share_to_the_rest():
+    parts.empty_scene()
+    material, tree, output = parts.new_material("Veil")
+    mix, clear, chalk = nodes_of(tree, "MixShader", "BsdfTransparent", "BsdfDiffuse")
+    mix.inputs[0].default_value = 0.2
+    tree.links.new(clear.outputs[0], mix.inputs[1])
+    tree.links.new(chalk.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    look = look_of(material)
+    assert len(look.lobes) == 1 and look.weight == pytest.approx(1.0)
+    assert look.notes == ("Veil: transparency is not shown",)
+
+
+def test_more_lobes_than_are_shown_are_named():
+    parts.empty_scene()
+    material, tree, output = parts.new_material("Onion")
+    last = tree.nodes.new("ShaderNodeBsdfDiffuse")
+    for number in range(look_reader.MOST_LOBES + 1):
+        add, gloss = nodes_of(tree, "AddShader", "BsdfAnisotropic")
+        gloss.inputs["Roughness"].default_value = 0.1 * (number + 1)
+        tree.links.new(last.outputs[0], add.inputs[0])
+        tree.links.new(gloss.outputs[0], add.inputs[1])
+        last = add
+    tree.links.new(last.outputs[0], output.inputs["Surface"])
+    look = look_of(material)
+    assert len(look.lobes) == look_reader.MOST_LOBES
+    assert look.notes == (f"Onion: of its {look_reader.MOST_LOBES + 2} lobes only {look_reader.MOST_LOBES} are shown",)
+
+
+def test_a_coat_that_is_not_resolved_is_named():
+    parts.empty_scene()
+    material, node = parts.principled("Lacquer", Coat_Weight=0.5)
+    noise = material.node_tree.nodes.new("ShaderNodeTexNoise")
+    bump = material.node_tree.nodes.new("ShaderNodeBump")
+    material.node_tree.links.new(noise.outputs[0], node.inputs["Coat Roughness"])
+    material.node_tree.links.new(bump.outputs[0], node.inputs["Coat Normal"])
+    look = look_of(material)
+    np.testing.assert_allclose(look.coat.roughness, 0.03, rtol=1e-6)
+    assert look.notes == ("Lacquer: Coat Roughness is not resolved", "Lacquer: Coat Normal is not resolved")

@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from view_pictures import normal_map, patches_too_far
+from view_pictures import image, normal_map, patches_too_far
 
 from ltsh_addon import shading
 from ltsh_addon.blender.materials import look_reader
@@ -99,10 +99,77 @@ LAYERED = (
 )
 
 
+def masked(name, node_type=None, output="Color", inside=False, **inputs):
+    """Chalk and gloss mixed by what a node says, or else an image; `inside`: that mixed with metal by an image."""
+
+    def make():
+        material = mixed(name)()
+        tree = material.node_tree
+        mix = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeMixShader")
+        (factor,) = nodes_of(tree, node_type or "TexImage")
+        if node_type is None:
+            factor.image = image(name, is_data=True)
+        for key, value in inputs.items():
+            factor.inputs[key].default_value = value
+        tree.links.new(factor.outputs[output], mix.inputs[0])
+        if inside:
+            outer, metal = nodes_of(tree, "MixShader", "BsdfMetallic")
+            metal.inputs["Roughness"].default_value = 0.4
+            texture = tree.nodes.new("ShaderNodeTexImage")
+            texture.image = image(f"{name} outside", is_data=True)
+            tree.links.new(texture.outputs["Color"], outer.inputs[0])
+            end = mix.outputs[0].links[0].to_socket
+            tree.links.new(mix.outputs[0], outer.inputs[1])
+            tree.links.new(metal.outputs[0], outer.inputs[2])
+            tree.links.new(outer.outputs[0], end)
+        return material
+
+    return make
+
+
+MASKED = (
+    masked("mask"),
+    masked("Fresnel", "Fresnel", "Factor", IOR=1.8),
+    masked("dense Fresnel", "Fresnel", "Factor", IOR=3.5, inside=True),
+    masked("layer of Fresnel", "LayerWeight", "Fresnel", Blend=0.6),
+    masked("facing", "LayerWeight", "Facing", Blend=0.5),
+    masked("facing less", "LayerWeight", "Facing", Blend=0.2),
+    masked("facing more", "LayerWeight", "Facing", Blend=0.9),
+)
+
+
 @pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
-@pytest.mark.parametrize(("kind", "passes"), [("PERSP", shading.PASSES), ("ORTHO", ("specular",))])
-def test_the_viewport_adds_up_the_lobes_that_cycles_sampled(tmp_path, kind, passes):
-    assert not patches_too_far(tmp_path / "patches.blend", LAYERED, kind, passes)
+@pytest.mark.parametrize(
+    ("materials", "kind", "passes"),
+    [(LAYERED, "PERSP", shading.PASSES), (LAYERED, "ORTHO", ("specular",)), (MASKED, "PERSP", shading.PASSES)],
+    ids=["perspective", "parallel", "masked"],
+)
+def test_the_viewport_adds_up_the_lobes_that_cycles_sampled(tmp_path, materials, kind, passes):
+    assert not patches_too_far(tmp_path / "patches.blend", materials, kind, passes)
+
+
+def test_factors_that_depend_on_more_are_named():
+    parts.empty_scene()
+    material = masked("Noise", "TexNoise", "Color")()
+    look = look_of(material)
+    assert [lobe.weight for lobe in look.lobes] == [0.5, 0.5]
+    assert look.notes == ("Noise: factor of 'Mix Shader' is not resolved",)
+
+
+@pytest.mark.parametrize("emitter", ["Emission", "BsdfPrincipled"])
+def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter):
+    parts.empty_scene()
+    material, tree, output = parts.new_material("Lamp shade")
+    mix, clear, glow = nodes_of(tree, "MixShader", "BsdfTransparent", emitter)
+    mix.inputs[0].default_value = 0.25
+    strength = "Strength" if emitter == "Emission" else "Emission Strength"
+    glow.inputs[strength].default_value = 2.0
+    tree.links.new(clear.outputs[0], mix.inputs[1])
+    tree.links.new(glow.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], output.inputs["Surface"])
+    look = look_of(material)
+    np.testing.assert_allclose(look.emission, 0.5, rtol=1e-6)
+    assert look.weight == 1.0
 
 
 def test_mixed_shaders_are_lobes_with_their_shares():

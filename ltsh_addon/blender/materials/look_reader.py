@@ -5,7 +5,7 @@ What cannot be said by `Look` gets the material's viewport settings and is named
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -26,10 +26,12 @@ from .lobe_slots import SMALLEST_WEIGHT
 from .node_sources import Source, source_of
 from .node_values import value_at
 from .shader_graph import material_output
-from .surface_looks import COAT, IMAGE_SLOTS, NEUTRAL, Coat, Look, default_look, is_missing, plain_look
+from .surface_looks import COAT, IMAGE_SLOTS, NEUTRAL, Coat, Look, ViewFactor, default_look, is_missing, plain_look
 
 # Quantity of `aovs.LOBE_AOVS` -> viewport setting of the material that stands in for it.
 STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
+# Nodes whose value depends on the view; the name of an output is a kind of `ViewFactor`.
+VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
 # Each costs as much as the first.
 MOST_LOBES = 8
 
@@ -45,7 +47,7 @@ def look_of(material) -> Look:
     if output is None:
         return plain_look(0.0)
     walk = _Leaves()
-    walk.follow(source_of(tree, output.inputs["Surface"]), 1.0)
+    walk.follow(source_of(tree, output.inputs["Surface"]), Share())
     return _Reader(material, walk).look()
 
 
@@ -54,31 +56,90 @@ def _is_same(first: Source | None, second: Source | None) -> bool:
     return first is not None and second is not None and first.node == second.node and first.groups == second.groups
 
 
+@dataclass(frozen=True)
+class Share:
+    """The share of a node in a material: a product of which one factor may come from an image, one from the view."""
+
+    constant: float = 1.0
+    image: Value | None = None
+    curve: ViewFactor | None = None
+    shining: float = 1.0  # times what emits, where transparency takes the rest
+
+    @property
+    def estimate(self) -> float:
+        """About how much it is on average."""
+        return self.constant * 0.5 ** ((self.image is not None) + (self.curve is not None))
+
+    def split(self, factor: Value | ViewFactor | None) -> tuple[Share, Share] | None:
+        """The shares of both sides of a mix with `factor`; None where that cannot be said."""
+        if isinstance(factor, ViewFactor) and self.curve is None:
+            return replace(self, curve=factor.complement()), replace(self, curve=factor)
+        if not isinstance(factor, Value):
+            return None
+        if factor.is_constant:
+            part = float(np.clip(factor.offset[0], 0.0, 1.0))
+            return replace(self, constant=self.constant * (1.0 - part)), replace(self, constant=self.constant * part)
+        if self.image is None:
+            return replace(self, image=factor.mapped(-np.eye(3), 1.0)), replace(self, image=factor)
+        return None
+
+
 class _Leaves:
     """The shader nodes of a material with their shares; of unknown factors both sides get half."""
 
     def __init__(self):
-        self.found: list[tuple[Source, float]] = []
+        self.found: list[tuple[Source, Share]] = []
         self.guessed: list[str] = []
+        self.is_transparent = False
 
-    def follow(self, source: Source | None, weight: float) -> None:
-        if source is None or source.node is None or weight <= 0.0:
+    def follow(self, source: Source | None, share: Share) -> None:
+        if source is None or source.node is None or share.estimate <= 0.0:
             return
         kind = source.node.bl_idname
         if kind == "ShaderNodeMixShader":
-            factor = value_at(source.tree, source.node.inputs[0], source.groups)
-            share = 0.5
-            if factor is None or not factor.is_constant:
-                self.guessed.append(source.node.name)
-            else:
-                share = float(np.clip(factor.offset[0], 0.0, 1.0))
-            self.follow(source.input(1), weight * (1.0 - share))
-            self.follow(source.input(2), weight * share)
+            self._follow_mix(source, share)
         elif kind == "ShaderNodeAddShader":
-            self.follow(source.input(0), weight)
-            self.follow(source.input(1), weight)
+            self.follow(source.input(0), share)
+            self.follow(source.input(1), share)
+        elif kind in TRANSPARENT_NODES:
+            self.is_transparent = True
         else:
-            self.found.append((source, weight))
+            self.found.append((source, share))
+
+    def _follow_mix(self, source: Source, share: Share) -> None:
+        first, second = source.input(1), source.input(2)
+        factor = _factor_of(source)
+        shares = share.split(factor)
+        if shares is None:
+            self.guessed.append(source.node.name)
+            shares = share.split(constant(0.5))
+        clear = [side is not None and _is_transparent(side) for side in (first, second)]
+        if any(clear):
+            # Surfaces are opaque here: the other side has the share of both.
+            shares = tuple(replace(share, shining=share.shining * part.estimate / share.estimate) for part in shares)
+        self.follow(first, shares[0])
+        self.follow(second, shares[1])
+
+
+def _is_transparent(source: Source) -> bool:
+    return source.node is not None and source.node.bl_idname in TRANSPARENT_NODES
+
+
+def _factor_of(source: Source) -> Value | ViewFactor | None:
+    """The factor of a Mix Shader node."""
+    factor = value_at(source.tree, source.node.inputs[0], source.groups)
+    if factor is not None:
+        return factor
+    behind = source.input(0)
+    if behind is None or behind.node is None or behind.node.bl_idname not in VIEW_FACTORS:
+        return None
+    normal = behind.input("Normal")
+    parameter = value_at(behind.tree, behind.node.inputs[0], behind.groups)
+    if normal is None or normal.node is not None or parameter is None or not parameter.is_constant:
+        return None
+    is_blend = behind.node.bl_idname == "ShaderNodeLayerWeight"
+    kind = behind.socket.name.lower() if is_blend else "fresnel"
+    return ViewFactor.of(kind, float(parameter.offset[0]), is_blend)
 
 
 class _Reader:
@@ -87,13 +148,9 @@ class _Reader:
     def __init__(self, material, walk: _Leaves):
         self.material, self.notes = material, []
         self.emitters = [(source, share) for source, share in walk.found if is_emission(source.node)]
-        others = [pair for pair in walk.found if not is_emission(pair[0].node)]
-        solid = [pair for pair in others if pair[0].node.bl_idname not in TRANSPARENT_NODES]
-        clear = sum(share for source, share in others if source.node.bl_idname in TRANSPARENT_NODES)
-        if clear > 0.0 and solid:
+        self.leaves = [(source, share) for source, share in walk.found if not is_emission(source.node)]
+        if walk.is_transparent and self.leaves:
             self.note("transparency is not shown")
-        # Opaque, they share what is left to them.
-        self.leaves = [(source, share / max(1.0 - clear, share)) for source, share in solid]
         for name in walk.guessed:
             self.note(f"factor of {name!r} is not resolved")
 
@@ -105,11 +162,12 @@ class _Reader:
         """The heaviest lobe with the others behind it."""
         emission = np.zeros(3)
         for source, share in self.emitters:
-            emission = emission + share * self._emission(source, "Color", "Strength")
+            emission = emission + self._shining(share, self._emission(source, "Color", "Strength"))
         lobes: list[Look] = []
-        for source, share in sorted(self.leaves, key=lambda pair: -pair[1]):
+        for source, share in sorted(self.leaves, key=lambda pair: -pair[1].estimate):
             if source.node.bl_idname == PRINCIPLED:
-                emission = emission + share * self._emission(source, "Emission Color", "Emission Strength")
+                glow = self._emission(source, "Emission Color", "Emission Strength")
+                emission = emission + self._shining(share, glow)
             lobes += self._lobes_of(source, share)
         if not lobes:
             lobes = [plain_look(0.0)]
@@ -118,7 +176,12 @@ class _Reader:
         first, *further = lobes[:MOST_LOBES]
         return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
 
-    def _lobes_of(self, source: Source, share: float) -> list[Look]:
+    def _shining(self, share: Share, emission: np.ndarray) -> np.ndarray:
+        if emission.any() and (share.image is not None or share.curve is not None):
+            self.note("its emission varies: half of it is shown")
+        return share.shining * share.estimate * emission
+
+    def _lobes_of(self, source: Source, share: Share) -> list[Look]:
         """The lobes of one BSDF node."""
         node = source.node
         sockets = LOBE_SOCKETS.get(node.bl_idname)
@@ -126,20 +189,22 @@ class _Reader:
             sockets = METALLIC_SOCKETS[node.fresnel_type]
         if sockets is None:
             self.note(f"{node.bl_label} is not shown, its viewport color is")
-            return [replace(plain_look(self.material.diffuse_color), weight=share)]
-        look = replace(self._lobe(source, *sockets), weight=share)
+            return [replace(plain_look(self.material.diffuse_color), weight=share.constant, view_factor=share.curve)]
+        look = self._lobe(source, *sockets, share)
         coat = self._coat(source, look) if look.kind == "principled" else None
         if coat is None:
             return [look]
-        values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior)}
-        normal = (look.normal, look.normal_strength) if coat.follows_normal else (None, 1.0)
+        look = replace(look, coat=coat)
+        values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior), "weight": look.value("weight")}
         # Its multiple scattering is always there.
-        shine = Look(COAT, values, *normal, scattered=True, corrected=look.corrected, weight=share, coat=coat)
-        return [replace(look, coat=coat), shine]
+        shine = replace(look, kind=COAT, values=values, scattered=True)
+        return [look, shine if coat.follows_normal else replace(shine, normal=None)]
 
-    def _lobe(self, source: Source, kind: str, names: dict[str, str]) -> Look:
+    def _lobe(self, source: Source, kind: str, names: dict[str, str], share: Share) -> Look:
         node = source.node
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
+        if share.image is not None:
+            values["weight"] = share.image
         values = self._on_one_uv_map(values)
         distribution = getattr(node, "distribution", "")
         if distribution in NEAREST_ALPHA:
@@ -152,7 +217,7 @@ class _Reader:
         normal, strength = self._normal(source, values)
         scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
         corrected = cycles_setting(self.material, "use_bump_map_correction")
-        look = Look(kind, values, normal, strength, scattered, corrected)
+        look = Look(kind, values, normal, strength, scattered, corrected, share.constant, share.curve)
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
@@ -10,9 +10,9 @@ import numpy as np
 from .linear_values import ImageUse, Value, constant
 
 # Quantities that may come from an image; all others are constants.
-IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal")
+IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
-           "transmission": 0.0}  # fmt: skip
+           "transmission": 0.0, "weight": 1.0}  # fmt: skip
 # The kind of a lobe that is the coat of another one; all others are those of `aovs.LOBE_KINDS`.
 COAT = "coat"
 
@@ -29,6 +29,29 @@ class Coat:
 
 
 @dataclass(frozen=True)
+class ViewFactor:
+    """What the nodes Fresnel and Layer Weight say of the cosine c between the view and the smooth normal."""
+
+    kind: str  # "fresnel": of a dielectric; "facing": 1 - c^parameter
+    parameter: float  # "fresnel": the index of refraction
+    is_complement: bool = False  # 1 minus that
+
+    @classmethod
+    def of(cls, kind: str, parameter: float, is_blend: bool = False) -> ViewFactor:
+        """From the node's number: an index of refraction, or the Blend of a Layer Weight node."""
+        if not is_blend:
+            return cls(kind, max(parameter, 1e-5))
+        if kind == "fresnel":
+            return cls(kind, 1.0 / max(1.0 - parameter, 1e-5))
+        blend = float(np.clip(parameter, 0.0, 1.0 - 1e-5))
+        return cls(kind, 2.0 * blend if blend < 0.5 else 0.5 / (1.0 - blend))
+
+    def complement(self) -> ViewFactor:
+        """1 minus this."""
+        return replace(self, is_complement=not self.is_complement)
+
+
+@dataclass(frozen=True)
 class Look:
     """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
 
@@ -39,6 +62,7 @@ class Look:
     scattered: bool = False  # Multiscatter GGX
     corrected: bool = True  # Cycles bends specular normals toward the eye
     weight: float = 1.0
+    view_factor: ViewFactor | None = None  # times the weight
     coat: Coat | None = None  # over it; of the kind COAT itself
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()

@@ -53,6 +53,29 @@ float dielectric_average(float ior)
   return (ior - 1.0) / (4.08567 + 1.00071 * ior);
 }
 
+float fresnel_of_dielectric(float cosine, float ior)
+{
+  float g = ior * ior - 1.0 + cosine * cosine;
+  if (g <= 0.0) {
+    return 1.0;
+  }
+  g = sqrt(g);
+  float a = (g - cosine) / (g + cosine);
+  float b = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0);
+  return 0.5 * a * a * (1.0 + b * b);
+}
+
+/* What Fresnel and Layer Weight say: kind (0: 1), number, whether it is taken from 1. */
+float view_factor(vec3 factor, float cosine, bool backfacing)
+{
+  if (factor.x < 0.5) {
+    return 1.0;
+  }
+  float share = factor.x < 1.5 ? fresnel_of_dielectric(cosine, backfacing ? 1.0 / factor.y : factor.y)
+                               : 1.0 - pow(max(cosine, 1e-20), factor.y);
+  return factor.z > 0.5 ? 1.0 - share : share;
+}
+
 /* The share of a lobe that is left under its coat, whose normal is seen under `cosine`. */
 vec3 left_under_coat(float cosine)
 {

@@ -50,6 +50,8 @@ FRAGMENT_OF_SURFACES = """
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
   Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
   vec3 weight = vec3(look.data[LAYERS].x);
+  weight *= clamp(slot_value(weight_image, 5, v_uv).x, 0.0, 1.0);
+  weight *= view_factor(look.data[LAYERS + 2].xyz, abs(dot(smooth_normal, towards_eye)), backfacing);
   if (look.data[LAYERS].y > 0.0 && int(look.data[0].x + 0.5) != COAT) {
     vec3 coat_normal = specular_normal;
     if (look.data[LAYERS + 1].w < 0.5) {

@@ -14,7 +14,8 @@ from ..materials.surface_looks import COAT, IMAGE_SLOTS, Look
 FIRST_SLOT, SLOT_SIZE = 3, 6
 FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
 LAYERS = FIRST_TERM + 5
-LOOK_SIZE = LAYERS + 2
+LOOK_SIZE = LAYERS + 3
+VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
     **{name.upper(): str(int(number)) for name, number in KINDS.items()},
@@ -42,6 +43,9 @@ def look_values(look: Look) -> np.ndarray:
             start = FIRST_SLOT + SLOT_SIZE * position
             data[start : start + SLOT_SIZE] = _slot_values(value)
     data[LAYERS, 0] = look.weight
+    if look.view_factor is not None:
+        factor = look.view_factor
+        data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
     if look.coat is not None:
         data[LAYERS, 1:] = look.coat.weight, look.coat.roughness, look.coat.ior
         data[LAYERS + 1] = *look.coat.tint, look.coat.follows_normal

@@ -30,7 +30,7 @@ from .surface_looks import COAT, IMAGE_SLOTS, NEUTRAL, Coat, Look, ViewFactor, d
 
 # Quantity of `aovs.LOBE_AOVS` -> viewport setting of the material that stands in for it.
 STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
-# Nodes whose value depends on the view; the name of an output is a kind of `ViewFactor`.
+# Nodes whose value depends on the view; the outputs of the second have the names of kinds of `ViewFactor`.
 VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
 # Each costs as much as the first.
 MOST_LOBES = 8
@@ -69,6 +69,11 @@ class Share:
     def estimate(self) -> float:
         """About how much it is on average."""
         return self.constant * 0.5 ** ((self.image is not None) + (self.curve is not None))
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """What of it is a quantity of a `Look`."""
+        return {} if self.image is None else {"weight": self.image}
 
     def split(self, factor: Value | ViewFactor | None) -> tuple[Share, Share] | None:
         """The shares of both sides of a mix with `factor`; None where that cannot be said."""
@@ -189,7 +194,8 @@ class _Reader:
             sockets = METALLIC_SOCKETS[node.fresnel_type]
         if sockets is None:
             self.note(f"{node.bl_label} is not shown, its viewport color is")
-            return [replace(plain_look(self.material.diffuse_color), weight=share.constant, view_factor=share.curve)]
+            values = {"color": constant(self.material.diffuse_color), **share.values}
+            return [Look("diffuse", values, weight=share.constant, view_factor=share.curve)]
         look = self._lobe(source, *sockets, share)
         coat = self._coat(source, look) if look.kind == "principled" else None
         if coat is None:
@@ -203,9 +209,7 @@ class _Reader:
     def _lobe(self, source: Source, kind: str, names: dict[str, str], share: Share) -> Look:
         node = source.node
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
-        if share.image is not None:
-            values["weight"] = share.image
-        values = self._on_one_uv_map(values)
+        values = self._on_one_uv_map({**values, **share.values})
         distribution = getattr(node, "distribution", "")
         if distribution in NEAREST_ALPHA:
             values["roughness"] = values["roughness"].mapped(NEAREST_ALPHA[distribution] ** 0.5 * np.eye(3))

@@ -67,6 +67,29 @@ def test_left_of_the_line_is_the_first_picture_and_right_the_second(scene, tmp_p
         np.testing.assert_array_equal(seen(), expected)
 
 
+def test_a_dragged_line_is_seen_before_the_settings_know_it(scene, tmp_path):
+    pictures = write_results(tmp_path)
+    scene.ltsh.split = 0.0
+    viewer.drag_split(scene, 0.5)
+    expected = pictures["cycles.combined"].copy()
+    columns = round(0.5 * WIDTH)
+    expected[:, :columns] = pictures["ltsh4.combined"][:, :columns]
+    np.testing.assert_array_equal(seen(), expected)
+    assert scene.ltsh.split == 0.0 and viewer.split_of(scene) == 0.5
+    viewer.drag_split(scene, None)
+    np.testing.assert_array_equal(seen(), pictures["cycles.combined"])
+
+
+def test_moving_the_line_reads_no_file_again(scene, tmp_path):
+    write_results(tmp_path)
+    scene.ltsh.split = 0.2
+    images = [image for image in results.our_images(scene) if not viewer.is_viewer(image)]
+    for image in images:
+        image.pixels[0] = 7.0  # which is gone when Blender reads the file
+    scene.ltsh.split = 0.8
+    assert images and all(image.pixels[0] == 7.0 for image in images)
+
+
 def test_changing_technique_and_pass_changes_the_picture_at_once(scene, tmp_path):
     pictures = write_results(tmp_path)
     scene.ltsh.mode = "A"

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import bpy
-from hands import drag, settings, until
+from hands import drag, over, settings, until
 
 SECONDS = 1200
 SIZE = "1600x900"
@@ -44,6 +44,10 @@ def main(rig):
     with rig.override("PROPERTIES"):
         bpy.ops.screen.screen_full_area()
     yield 2
+    # Our panel is the last one.
+    yield from over(rig, "PROPERTIES")
+    rig.xdo("click", "--repeat", 60, 5)
+    yield 3
     rig.shot("5_render_properties.png")
     with rig.override("PROPERTIES"):
         bpy.ops.screen.back_to_previous()

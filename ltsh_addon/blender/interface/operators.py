@@ -31,6 +31,7 @@ class _JobOperator:
     # Not REGISTER: "Repeat Last" would run `execute`, which waits.
     bl_options = {"UNDO"}
     command = ""
+    _opened = False  # the next results are those of the scene, but the comparison does not show them yet
 
     @classmethod
     def poll(cls, context):
@@ -56,7 +57,7 @@ class _JobOperator:
             return {"CANCELLED"}
         try:
             self._job.wait()
-            self._show_results(context)
+            self._show_all_results(context)
             return self._finish(context)
         except Exception as error:
             return self._fail(context, error)
@@ -76,7 +77,8 @@ class _JobOperator:
             return self._finish(context)
         if event.type == "TIMER":
             job.poll()
-            self._show_results(context)
+            if self._show_some_results(context):
+                return {"PASS_THROUGH"}
             if job.finished:
                 return self._finish(context)
             self._show_progress(context)
@@ -127,13 +129,25 @@ class _JobOperator:
             context.workspace.status_text_set(text)
             redraw_panels()
 
-    def _show_results(self, context) -> None:
+    def _show_some_results(self, context) -> bool:
+        """Show a part of what is new, as much as the window may wait for: large files are read one at a time. True
+        where something was shown."""
         scene, job = self._scene(), self._job
-        while scene is not None and job.shown < len(job.results):
+        if scene is None or job.shown == len(job.results):
+            return False
+        if not self._opened:
             results.show(scene, job.results[job.shown])
+            self._opened = True
+        elif not viewer.read_a_picture(scene):
             viewer.refresh(scene)
             viewer.put_in_editor(context, scene)
+            self._opened = False
             job.shown += 1
+        return True
+
+    def _show_all_results(self, context) -> None:
+        while self._show_some_results(context):
+            pass
 
     def _end_timer(self, context) -> None:
         if self._timer is not None:
@@ -143,6 +157,8 @@ class _JobOperator:
     def _finish(self, context):
         job = self._job
         self._end_timer(context)
+        if self._opened and not job.error:
+            self._show_all_results(context)
         if running_job() is job:
             _running["job"] = None
         for workspace in bpy.data.workspaces:

@@ -134,11 +134,17 @@ def layer_image(scene, result: Result, group: str, layer: str):
         image.name = PREFIX + full
         image[LAYER], image[SCENE] = full, scene.name
         image.use_fake_user = True
-    image.filepath = _blender_path(path)
     is_error = layer.startswith(ERROR)
-    image.colorspace_settings.name = "Non-Color" if is_error else linear_space()
-    image.use_view_as_render = not is_error
+    _set(image, "filepath", _blender_path(path))
+    _set(image.colorspace_settings, "name", "Non-Color" if is_error else linear_space())
+    _set(image, "use_view_as_render", not is_error)
     return image
+
+
+def _set(owner, name: str, value) -> None:
+    """Set a property that is another one: Blender reads the whole file again, also for the same path."""
+    if getattr(owner, name) != value:
+        setattr(owner, name, value)
 
 
 def our_images(scene) -> list:
@@ -170,6 +176,15 @@ def pixels_of(image) -> np.ndarray:
             _pixels.pop(next(iter(_pixels)))
         _pixels[path] = known
     return known[1]
+
+
+def is_read(image) -> bool:
+    """Are the pixels of an image known, without a look into its file?"""
+    path = bpy.path.abspath(image.filepath)
+    try:
+        return path in _pixels and _pixels[path][0][0] == Path(path).stat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def linear_space() -> str:

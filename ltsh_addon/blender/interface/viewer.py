@@ -18,7 +18,7 @@ from . import results
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "kept": False}
+_state = {"lookup": None, "settling": set(), "kept": False, "dragged": None}
 
 
 def changed(settings, context) -> None:
@@ -26,8 +26,12 @@ def changed(settings, context) -> None:
     try:
         refresh(settings.id_data)
     except RuntimeError as error:
-        # A picture is gone; the panels say so when the results are shown anew.
-        logging.getLogger(__name__).warning("%s", " ".join(str(error).split()))
+        _warn(error)
+
+
+def _warn(error: RuntimeError) -> None:
+    """A picture is gone; the panels say so when the results are shown anew."""
+    logging.getLogger(__name__).warning("%s", " ".join(str(error).split()))
 
 
 def refresh(scene) -> bool:
@@ -38,20 +42,48 @@ def refresh(scene) -> bool:
     choice = results.choice_of(scene.ltsh, result)
     results.images_of_pass(scene, result, choice)
     group = result.groups[choice.group]
-    pictures = []
-    for name in (choice.first, choice.second):
-        layer = f"{name}.{choice.pass_name}"
-        if layer not in group["files"]:
-            return False
-        pictures.append(results.pixels_of(results.layer_image(scene, result, choice.group, layer)))
-    if pictures[0].shape != pictures[1].shape or not pictures[0].size:
+    pictures = [results.pixels_of(image) for image in _chosen_images(scene, result, choice)]
+    if len(pictures) < 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
         return False
     mode = scene.ltsh.mode
-    pixels = compose(*pictures, mode, scene.ltsh.split, error_scale(scene.ltsh, group, choice))
+    pixels = compose(*pictures, mode, split_of(scene), error_scale(scene.ltsh, group, choice))
     _store(viewer_image(scene), pixels, mode != "ERROR")
     _settle_later(scene)
     redraw_image_editors()
     return True
+
+
+def _chosen_images(scene, result, choice) -> list:
+    """The two images that are compared; none where the results lack one."""
+    layers = [f"{name}.{choice.pass_name}" for name in (choice.first, choice.second)]
+    if any(layer not in result.groups[choice.group]["files"] for layer in layers):
+        return []
+    return [results.layer_image(scene, result, choice.group, layer) for layer in layers]
+
+
+def read_a_picture(scene) -> bool:
+    """Read the pixels of a picture that `refresh` needs; False where it has them all."""
+    result = results.result_of(scene)
+    images = [] if result is None else _chosen_images(scene, result, results.choice_of(scene.ltsh, result))
+    unread = next((image for image in images if not results.is_read(image)), None)
+    return unread is not None and results.pixels_of(unread).size > 0
+
+
+def split_of(scene) -> float:
+    """Where the line of the wipe is, as a share of the width: also while the mouse drags it."""
+    return scene.ltsh.split if _state["dragged"] is None else _state["dragged"]
+
+
+def drag_split(scene, position: float | None) -> None:
+    """Show the line at `position` meanwhile; None: where the settings have it.
+
+    With the settings themselves Blender would evaluate the scene anew and draw all windows for every step of the mouse.
+    """
+    _state["dragged"] = None if position is None else min(max(position, 0.0), 1.0)
+    try:
+        refresh(scene)
+    except RuntimeError as error:
+        _warn(error)
 
 
 def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:

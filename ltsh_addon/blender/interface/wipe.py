@@ -26,7 +26,7 @@ def _shown(context):
 
 def line_position(context) -> float:
     """Where the line is, in pixels from the left of the region."""
-    return context.region.view2d.view_to_region(context.scene.ltsh.split, 0.0, clip=False)[0]
+    return context.region.view2d.view_to_region(viewer.split_of(context.scene), 0.0, clip=False)[0]
 
 
 class LTSH_GT_wipe(bpy.types.Gizmo):
@@ -42,20 +42,20 @@ class LTSH_GT_wipe(bpy.types.Gizmo):
         return 0 if abs(location[0] - line_position(context)) <= grip else -1
 
     def invoke(self, context, event):
-        self._before = context.scene.ltsh.split
         context.window.cursor_modal_set("MOVE_X")
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event, tweak):
-        context.scene.ltsh.split = context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0]
+        viewer.drag_split(context.scene, context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0])
         return {"RUNNING_MODAL"}
 
     def exit(self, context, cancel):
         context.window.cursor_modal_restore()
-        if cancel:
-            context.scene.ltsh.split = self._before
-        elif context.scene.ltsh.split != self._before:
+        settings, position = context.scene.ltsh, viewer.split_of(context.scene)
+        if not cancel and position != settings.split:
+            settings.split = position
             bpy.ops.ed.undo_push(message="Drag Split")
+        viewer.drag_split(context.scene, None)
 
 
 class LTSH_GGT_wipe(bpy.types.GizmoGroup):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from bpy.app.translations import pgettext_iface as translated
+
 from . import preflight
-from .job import STARTING
+from .job import STARTING, Job, clock
 from .job_arguments import REFERENCE, chosen
 from .job_plan import Step
 
@@ -69,3 +71,15 @@ def _bake(context) -> list[Step]:
 
 def _shading(technique: str, points: float) -> float:
     return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
+
+
+def stage_title(job: Job) -> str:
+    """What the job does now."""
+    return translated(TITLES.get(job.stage, job.stage))
+
+
+def progress_text(job: Job) -> str:
+    """Percent and time left of the whole job."""
+    text = f"{100.0 * job.plan.share():.0f} %"
+    left = job.seconds_left()
+    return text if left is None else f"{text}, {clock(left)} {translated('left')}"

@@ -122,7 +122,8 @@ class _JobOperator:
     def _show_progress(self, context) -> None:
         """Draw progress again where it has changed, at most a few times per second."""
         job = self._job
-        text = f"{job.title}: {stage_title(job)}  {progress_text(job)}    {translated('Esc')}: {translated('Cancel')}"
+        done = f"{job.title}: {job_stages.stage_title(job)}  {job_stages.progress_text(job)}"
+        text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
         shown = text, clock(job.seconds())
         if shown != self._progress:
             self._progress = shown
@@ -258,18 +259,6 @@ def _watch_elsewhere(job: Job) -> None:
     if running_job() is job and windows:
         with bpy.context.temp_override(window=windows[0]):
             bpy.ops.ltsh.watch("INVOKE_DEFAULT")
-
-
-def stage_title(job: Job) -> str:
-    """What the job does now."""
-    return translated(job_stages.TITLES.get(job.stage, job.stage))
-
-
-def progress_text(job: Job) -> str:
-    """Percent and time left of the whole job."""
-    text = f"{100.0 * job.plan.share():.0f} %"
-    left = job.seconds_left()
-    return text if left is None else f"{text}, {clock(left)} {translated('left')}"
 
 
 def redraw_panels() -> None:

@@ -7,7 +7,7 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
-from . import operators, preflight
+from . import job_stages, operators, preflight
 from .job import clock
 
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
@@ -81,10 +81,10 @@ def draw_job(layout) -> bool:
     row = column.row()
     row.label(text=job.title, icon="RENDER_STILL")
     _draw_right(row, clock(job.seconds()))
-    column.progress(factor=job.plan.share(), text=operators.progress_text(job))
+    column.progress(factor=job.plan.share(), text=job_stages.progress_text(job))
     row = column.row()
     row.active = False
-    row.label(text=operators.stage_title(job), translate=False)
+    row.label(text=job_stages.stage_title(job), translate=False)
     _draw_right(row, f"{job.plan.number} / {job.plan.count}")
     column.operator("ltsh.cancel", text="Cancel", icon="X")
     return True

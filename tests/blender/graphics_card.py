@@ -8,6 +8,11 @@ import gpu
 import numpy as np
 import pytest
 
+# For tests that read a scene by operators or the depsgraph while they draw.
+edits_with_graphics = pytest.mark.skipif(
+    bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes"
+)
+
 
 def with_graphics(function):
     """What `function()` returns; skips the test on a machine without OpenGL."""

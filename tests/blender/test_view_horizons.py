@@ -4,10 +4,9 @@ from dataclasses import fields, replace
 
 import bpy
 import numpy as np
-import pytest
 import random_surfaces
 import scene_parts as parts
-from graphics_card import Canvas, with_graphics
+from graphics_card import Canvas, edits_with_graphics, with_graphics
 from random_surfaces import EYE
 
 from ltsh_addon import shading
@@ -126,7 +125,7 @@ def drawn(camera):
         renderer.free()
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     camera = low_poly_sphere()
     lights, samples, pixel, pictures = with_graphics(lambda: drawn(camera))

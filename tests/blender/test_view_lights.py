@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from graphics_card import with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from lit_plane import add_image, add_lamp_plane, light_tree
 from view_pictures import SIZE, viewport_picture
 
@@ -135,7 +135,7 @@ def lit_scene():
     return camera, ball
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     camera, ball = lit_scene()
     pictures, notes = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES]), []

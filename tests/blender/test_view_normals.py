@@ -3,9 +3,8 @@ objects, normal maps."""
 
 import bpy
 import numpy as np
-import pytest
 import scene_parts as parts
-from graphics_card import with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender.processes import child
@@ -120,7 +119,7 @@ def tilted(name):
     return material
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_stretched_objects_shine_as_in_cycles(tmp_path):
     parts.empty_scene(*SIZE)
     metal = parts.principled("Metal", Metallic=1.0, Roughness=0.3)[0]

@@ -2,9 +2,8 @@
 
 import bpy
 import numpy as np
-import pytest
 import scene_parts as parts
-from graphics_card import with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
 
 
@@ -12,7 +11,7 @@ def chalk():
     return parts.bsdf_material("ShaderNodeBsdfDiffuse", "Chalk", Color=(0.2, 0.5, 0.8, 1.0))[0]
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     _, camera = patches_of([chalk] * 4)
     planes = [ob for ob in bpy.data.objects if ob.type == "MESH"]
@@ -35,7 +34,7 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     assert same[away_from_edges(np.where(hidden, 99, square))].all()
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_what_glows_is_as_bright_as_it_is_and_hidden_by_what_is_nearer():
     glow = (0.2, 0.4, 0.9)
 

@@ -1,9 +1,9 @@
 """Materials of several lobes in the viewport: coats, mixes and sums of BSDF nodes, against samples of Cycles."""
 
-import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
+from graphics_card import edits_with_graphics
 from view_pictures import image, normal_map, patches_too_far
 
 from ltsh_addon import shading
@@ -138,7 +138,7 @@ MASKED = (
 )
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 @pytest.mark.parametrize(
     ("materials", "kind", "passes"),
     [(LAYERED, "PERSP", shading.PASSES), (LAYERED, "ORTHO", ("specular",)), (MASKED, "PERSP", shading.PASSES)],

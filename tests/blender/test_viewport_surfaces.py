@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from graphics_card import with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import SIZE, normal_map, patches_too_far, textured, viewport_picture
 
 from ltsh_addon import shading
@@ -125,7 +125,7 @@ SCATTERED = (
 )
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 @pytest.mark.parametrize(
     ("materials", "kind", "passes"),
     [(MATERIALS, "PERSP", shading.PASSES), (MATERIALS, "ORTHO", ("specular",)), (SCATTERED, "PERSP", shading.PASSES)],
@@ -169,7 +169,7 @@ def test_materials_of_other_kinds_are_shown_in_their_viewport_color(node_type, s
     assert any(note.startswith("Odd: ") and said in note for note in look.notes)
 
 
-@pytest.mark.skipif(bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes")
+@edits_with_graphics
 def test_missing_images_are_pink_and_named():
     parts.empty_scene(*SIZE)
     material, _, texture = textured("Lost", "Base Color")

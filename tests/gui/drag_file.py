@@ -71,7 +71,7 @@ class FileDrag:
 
     def _window_that_accepts(self, window: Window) -> Window | None:
         """The first window at or below `window` with the property XdndAware."""
-        count, names = ctypes.c_int(), ctypes.POINTER(Atom)()
+        count = ctypes.c_int()
         self.x11.XListProperties.restype = ctypes.POINTER(Atom)
         names = self.x11.XListProperties(self.display, window, ctypes.byref(count))
         if self.atom("XdndAware").value in names[: count.value]:

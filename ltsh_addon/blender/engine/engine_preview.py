@@ -59,8 +59,8 @@ def _view(context):
     return space
 
 
-def _give_back_views(scene) -> list:
-    """Give the views that show a preview of `scene` their former shading back, and return them.
+def _shading_before(scene) -> list:
+    """Give the views that show a preview of `scene` the shading that they had before, and return them.
 
     Views whose shading was changed by hand since stay as they are.
     """
@@ -73,6 +73,12 @@ def _give_back_views(scene) -> list:
     return found
 
 
+def _give_back_views(scene) -> None:
+    """End what the preview of `scene` did to views."""
+    _shading_before(scene)
+    _forget_views(scene)
+
+
 def _forget_views(scene) -> None:
     for address in [address for address, (owner, _) in _lent_views.items() if owner == scene.session_uid]:
         del _lent_views[address]
@@ -81,7 +87,6 @@ def _forget_views(scene) -> None:
 def stop_preview(scene) -> None:
     """Give `scene` the artist's engine back, and its views their shading."""
     _give_back_views(scene)
-    _forget_views(scene)
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
     try:
@@ -105,7 +110,7 @@ def _before_saving(*_) -> None:
     for scene in bpy.data.scenes:
         if is_previewing(scene):
             _saved.append(scene.name)
-            _saved_views.extend(_give_back_views(scene))
+            _saved_views.extend(_shading_before(scene))
             scene.render.engine = scene.ltsh_view.artist_engine
 
 
@@ -126,7 +131,6 @@ def _after_undo(*_) -> None:
     for scene in bpy.data.scenes:
         if not is_previewing(scene):
             _give_back_views(scene)
-            _forget_views(scene)
 
 
 @persistent

@@ -16,7 +16,6 @@ from .job_plan import Plan
 from .scene_copy import save_scene_copy
 
 TIMER_SECONDS = 0.1
-PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 _running: dict = {"job": None}
 
 
@@ -128,7 +127,7 @@ class _JobOperator:
         if shown != self._progress:
             self._progress = shown
             context.workspace.status_text_set(text)
-            redraw_panels()
+            viewer.redraw_panels()
 
     def _show_some_results(self, context) -> bool:
         """Show a part of what is new, as much as the window may wait for: large files are read one at a time. True
@@ -164,7 +163,7 @@ class _JobOperator:
             _running["job"] = None
         for workspace in bpy.data.workspaces:
             workspace.status_text_set(None)
-        redraw_panels()
+        viewer.redraw_panels()
         if job.error:
             self.report({"ERROR"}, job.error)
         elif job.cancelled:
@@ -249,7 +248,7 @@ class LTSH_OT_cancel(bpy.types.Operator):
 
     def execute(self, context):
         running_job().cancel()
-        redraw_panels()
+        viewer.redraw_panels()
         return {"FINISHED"}
 
 
@@ -259,16 +258,6 @@ def _watch_elsewhere(job: Job) -> None:
     if running_job() is job and windows:
         with bpy.context.temp_override(window=windows[0]):
             bpy.ops.ltsh.watch("INVOKE_DEFAULT")
-
-
-def redraw_panels() -> None:
-    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            wanted = PANEL_REGIONS.get(area.type)
-            for region in area.regions:
-                if region.type == wanted:
-                    region.tag_redraw()
 
 
 @bpy.app.handlers.persistent

@@ -17,6 +17,7 @@ from . import results
 
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
+PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 _LOOKUP_SIZE = 1024
 _state = {"lookup": None, "settling": set(), "kept": False, "dragged": None}
 
@@ -186,10 +187,22 @@ def put_in_editor(context, scene) -> bool:
 
 def redraw_image_editors() -> None:
     """Draw all Image Editors again."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "IMAGE_EDITOR":
-                area.tag_redraw()
+    for area in _areas():
+        if area.type == "IMAGE_EDITOR":
+            area.tag_redraw()
+
+
+def redraw_panels() -> None:
+    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
+    for area in _areas():
+        wanted = PANEL_REGIONS.get(area.type)
+        for region in area.regions:
+            if region.type == wanted:
+                region.tag_redraw()
+
+
+def _areas() -> list:
+    return [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
 
 
 @contextlib.contextmanager

@@ -58,10 +58,11 @@ class ViewRenderer:
         lights_changed = self._upload_lights(mirror)
         if surfaces_changed or lights_changed or self._lit_gbuffer is None:
             self._choose_horizons(mirror, view)
-        first = self._lit(0, shown.technique, mirror, view, size, shown)
-        second = shown.second_picture
-        if shown.mode != "single" and second is None:
-            second = self._lit(1, shown.second_technique, mirror, view, size, shown)
+        techniques = [shown.technique]
+        if shown.mode != "single" and shown.second_picture is None:
+            techniques.append(shown.second_technique)
+        first, *others = self._lit(techniques, mirror, view, size, shown)
+        second = others[0] if others else shown.second_picture
         # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
         with frame_buffer.bind():
             self._picture.draw(
@@ -110,24 +111,33 @@ class ViewRenderer:
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
-    def _lit(self, number: int, technique: str, mirror, view: View, size, shown: ShownPicture):
-        lighting = self._lighting.get(technique)
-        if lighting is None:
-            lighting = self._lighting[technique] = LightingPass(technique)
+    def _lit(self, techniques: list[str], mirror, view: View, size, shown: ShownPicture) -> list:
+        """The textures that `techniques` are drawn into; the surfaces of a further lobe are drawn once for all."""
+        lightings = [self._lighting_of(technique, mirror) for technique in techniques]
+        targets = [self._target(number, size) for number in range(len(techniques))]
+        place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
+        for number in range(max(mirror.most_lobes, 1)):
+            gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
+            for lighting, (_, buffer) in zip(lightings, targets, strict=True):
+                lighting.draw(gbuffer, buffer, shown.passes, **place, add=number > 0)
+        if shown.passes == "combined" and shown.second_picture is None:
+            for _, buffer in targets:
+                self._surfaces.add_emission(mirror.instances, view, size, buffer)
+        return [texture for texture, _ in targets]
+
+    def _lighting_of(self, technique: str, mirror) -> LightingPass:
+        if technique not in self._lighting:
+            self._lighting[technique] = LightingPass(technique)
+        lighting = self._lighting[technique]
         lighting.set_iors(common_iors(mirror))
         lighting.set_lights(self._lights)
-        texture, buffer = self._target(number, size)
-        place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
-        lighting.draw(self._lit_gbuffer, buffer, shown.passes, **place)
-        for number in range(1, mirror.most_lobes):
-            gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
-            if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
-                self._lobe_horizons = HorizonPass()
-            gbuffer = self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
-            lighting.draw(gbuffer, buffer, shown.passes, **place, add=True)
-        if shown.passes == "combined" and shown.second_picture is None:
-            self._surfaces.add_emission(mirror.instances, view, size, buffer)
-        return texture
+        return lighting
+
+    def _further_lobe(self, number: int, mirror, view: View) -> GBufferTextures:
+        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
+        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
+            self._lobe_horizons = HorizonPass()
+        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
 
     def _target(self, number: int, size):
         """Texture and frame buffer that the technique `number` is drawn into."""

@@ -5,18 +5,16 @@ linear transform turns the lobe into something simple and keeps polygons polygon
 2016), a spherical harmonics expansion in LTSH (Allmenroeder and Peters 2021), which follows the tear shape of grazing
 highlights. Either way the integral has a closed form, so the picture has no noise.
 
-    scene      AreaLight, SurfaceSamples, Film: the shared vocabulary
-    ownership  temporary files of processes on several machines
-    shading    the paper: warp, polygon, moments, lookup table, reference quadrature (numpy only)
+    scene      the shared vocabulary: AreaLight, SurfaceSamples, Film
+    files      how files are written, and what dead processes left is deleted
+    shading    the paper: lookup table, polygon, edge integrals, `shade`, reference quadrature (numpy only)
+    cycles     how Cycles shades: closures, normals, G-buffers, UV rasters (numpy only)
     imaging    EXR, metrics, false color, comparison sheet, report
-    blender    .blend to lights and samples, Cycles ground truth, panels, render engine (the only place that knows bpy)
-    comparison the whole way from a .blend: techniques beside Cycles
-    baking     the same per texel
-    jobs       many pictures and bakes: tasks, shards, records of what is done
-    commands   the command line's commands; cli calls them
+    blender    .blend to lights and samples, Cycles renders, viewport, panels, render engine (all that knows bpy)
+    pipeline   a .blend in, files out: pictures, bakes, tasks
+    cli        the command line
+    panel_job  the process that a panel starts
 """
-
-__version__ = "0.1.0"
 
 
 def register():

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+VERSION = "0.1.0"  # also in blender_manifest.toml and pyproject.toml
+
 
 class Cancelled(Exception):
     """A long computation was stopped on request."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import families, fit, grazing, optimum, table_file, validate
+from . import families, fit, grazing, optimum, validate
 from .brdfs import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -149,13 +149,13 @@ def _fit_one(options) -> int:
 def _fit_and_write(options) -> int:
     start = time.perf_counter()
     family, model, path = families.family_named(options.name), BRDFS[options.brdf], options.path
-    checkpoint = table_file.Checkpoint(path.with_suffix(".progress"), table_file.settings(family, model, options.size))
+    checkpoint = fit.Checkpoint(path.with_suffix(".progress"), fit.settings(family, model, options.size))
 
     def show(fraction):
         print(f"{100.0 * fraction:.0f} %", flush=True)
 
     fitted = fit.fit(family, options.size, model=model, progress=show, checkpoint=checkpoint)
-    table_file.write_table(path, fitted)
+    fit.write_table(path, fitted)
     checkpoint.remove()
     print(f"fitted in {time.perf_counter() - start:.0f} s")
     return 0

@@ -18,9 +18,8 @@ from ltsh_addon.shading.lookup_table import LookupTable
 
 from .brdfs import GGX
 from .families import family_named
-from .fresnel_basis import FLAT
 from .optimum import best_lobes
-from .projection import Points, project, warped_basis
+from .projection import FLAT, Points, project, warped_basis
 from .validate import disks, hemisphere_samples
 from .walk import warp_of
 

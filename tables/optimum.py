@@ -14,8 +14,7 @@ from ltsh_addon.shading.edge_integrals import ridge_matrix
 
 from .brdfs import GGX
 from .families import family_named
-from .fresnel_basis import FLAT
-from .projection import Points, project, relative_error, warped_basis
+from .projection import FLAT, Points, project, relative_error, warped_basis
 from .validate import grid
 from .walk import HIGHEST, LOWEST, minimize, warp_of
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import matplotlib
-
-matplotlib.use("Agg")
-
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -15,6 +12,8 @@ from matplotlib.colors import LogNorm
 from ltsh_addon.shading import SHIPPED_TABLES, brdf, evaluate_lobe, load_table
 
 from . import optimum, validate
+
+matplotlib.use("Agg")
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 110}
 COLORS = {"ltc": "tab:gray", "ltsh2": "tab:blue", "ltsh4": "tab:red"}

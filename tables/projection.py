@@ -1,14 +1,68 @@
-"""Best coefficients for given warps: the linear half of the fit (variable projection, Golub and Pereyra 1973)."""
+"""Fresnel curves that share one warp: 1 and (1 - c)^5 for Schlick, c (1 - c)^6 for the F82 tint, two for dielectrics.
+
+A lobe is linear in its coefficients, so a reflectance that is a combination of the curves costs nothing beyond the fit
+of the curves themselves. The F82 tint of metals is Kutz, Hasan and Edmondson 2021, "Novel Aspects of the Adobe Standard
+Material". The two curves for dielectrics, on top of the fixed three, minimize the squared relative error of the exact
+dielectric reflectance over index of refraction and angle: weighted low-rank approximation by alternating least squares
+(Srebro and Jaakkola 2003).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from ltsh_addon.shading import brdf
+from ltsh_addon.shading.lookup_table import theta_at
 
-from .fresnel_basis import COSINES, FLAT
+COSINES = np.linspace(0.0, 1.0, 257)
+FLAT = np.ones((1, len(COSINES)))
+# Fitted on this range; weights are tabulated on a wider one, where the error grows.
+FITTED_IOR = np.linspace(1.05, 3.0, 196)
+TABULATED_IOR = np.concatenate([np.linspace(1.0, 1.05, 11), np.linspace(1.06, 1.6, 109), np.linspace(1.62, 4.0, 120)])
+CURVE_NAMES = ["1", "(1-c)^5", "c(1-c)^6", "dielectric 1", "dielectric 2"]
+OPTIMIZED_CURVES = 2
+
+
+@cache
+def fresnel_basis(sweeps: int = 800):
+    """Curves (5, 257) on COSINES, and the weights (I, 5) of TABULATED_IOR."""
+    fixed = np.stack([np.ones_like(COSINES), brdf.schlick_curve(COSINES), COSINES * (1.0 - COSINES) ** 6])
+    count = len(fixed)
+    reflectance = brdf.dielectric_reflectance(COSINES, FITTED_IOR[:, None])
+    squared_weight = 1.0 / reflectance**2
+    optimized = np.linalg.svd(reflectance)[2][:OPTIMIZED_CURVES]
+    for _ in range(sweeps):
+        curves = np.concatenate([fixed, optimized])
+        weights = combine(curves, reflectance)
+        residual = reflectance - weights[:, :count] @ fixed
+        free = weights[:, count:]
+        system = np.tensordot(squared_weight, _outer(free), axes=(0, 0))
+        target = (squared_weight * residual).T @ free
+        optimized = np.linalg.solve(_damped(system), target[..., None])[..., 0].T
+        optimized = np.linalg.qr(optimized.T)[0].T
+    curves = np.concatenate([fixed, optimized])
+    return curves, combine(curves, brdf.dielectric_reflectance(COSINES, TABULATED_IOR[:, None]))
+
+
+def combine(curves, reflectance):
+    """Weights (I, F) that approximate reflectance (I, C) by the curves (F, C), least squares of the relative error."""
+    squared_weight = 1.0 / np.maximum(reflectance, 1e-6) ** 2
+    system = np.tensordot(squared_weight, _outer(curves.T), axes=(1, 0))
+    target = (squared_weight * reflectance) @ curves.T
+    return np.linalg.solve(_damped(system), target[..., None])[..., 0]
+
+
+def _outer(vectors):
+    return vectors[:, :, None] * vectors[:, None, :]
+
+
+def _damped(system):
+    size = system.shape[-1]
+    return system + 1e-12 * np.trace(system, axis1=1, axis2=2)[:, None, None] * np.eye(size)
+
 
 # Relative to the normalized Gram matrix: keeps directions that hardly matter from growing.
 RIDGE = 1e-6
@@ -87,3 +141,72 @@ def relative_error(points, values):
     target = points.lobes[..., 0]
     squared = (points.quadrature * (values - target) ** 2).sum(axis=1)
     return np.sqrt(squared / (points.quadrature * target**2).sum(axis=1))
+
+
+# Positions of the two Gauss points of a cell along each axis
+GAUSS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])
+# Points that are worked on at a time
+BATCH = 126
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The 2 x 2 Gauss points of all cells of a table of R x T nodes: arrays of P = 4 (R - 1)(T - 1)."""
+
+    shape: tuple[int, int]
+    roughness: np.ndarray  # (P,)
+    cosine: np.ndarray  # (P,)
+    albedo: np.ndarray  # (P, F)
+
+    @classmethod
+    def of(cls, model, shape, lowest_cosine, curves):
+        """Cells of a table of `shape` for a BRDF and Fresnel curves (F, C); cosines are at least `lowest_cosine`."""
+        positions = [((np.arange(count - 1)[:, None] + GAUSS) / (count - 1)).ravel() for count in shape]
+        roughness, theta = (grid.ravel() for grid in np.meshgrid(positions[0], theta_at(positions[1]), indexing="ij"))
+        cosine = np.maximum(np.cos(theta), lowest_cosine)
+        albedo = [
+            directional_albedo(model, cosine[part], roughness[part] ** 2, curves, (48, 64))
+            for part in batches(len(cosine))
+        ]
+        return cls(shape, roughness, cosine, np.concatenate(albedo))
+
+    def interpolate(self, nodes):
+        """Values (P, d) at the Gauss points of node values (R, T, d)."""
+        rows = np.stack([nodes[:-1] * (1 - t) + nodes[1:] * t for t in GAUSS], axis=1)
+        rows = rows.reshape(-1, *nodes.shape[1:])
+        columns = np.stack([rows[:, :-1] * (1 - t) + rows[:, 1:] * t for t in GAUSS], axis=2)
+        return columns.reshape(-1, nodes.shape[2])
+
+    def distribute(self, values):
+        """The transpose of `interpolate`: (P, d) -> (R, T, d)."""
+        rows, columns = self.shape
+        values = values.reshape(2 * (rows - 1), columns - 1, 2, -1)
+        spread = np.zeros((2 * (rows - 1), columns, values.shape[-1]))
+        result = np.zeros((rows, columns, values.shape[-1]))
+        for k, t in enumerate(GAUSS):
+            spread[:, :-1] += values[:, :, k] * (1 - t)
+            spread[:, 1:] += values[:, :, k] * t
+        spread = spread.reshape(rows - 1, 2, columns, -1)
+        for k, t in enumerate(GAUSS):
+            result[:-1] += spread[:, k] * (1 - t)
+            result[1:] += spread[:, k] * t
+        return result
+
+    def node_blocks(self, matrices):
+        """Diagonal blocks (R, T, d, d) of the nodes in the normal matrix whose blocks at the points are (P, d, d)."""
+        rows, columns = self.shape
+        size = matrices.shape[-1]
+        matrices = matrices.reshape(rows - 1, 2, columns - 1, 2, size, size)
+        blocks = np.zeros((rows, columns, size, size))
+        for i in (0, 1):
+            for j in (0, 1):
+                for k, s in enumerate(GAUSS):
+                    for m, t in enumerate(GAUSS):
+                        weight = (s if i else 1 - s) * (t if j else 1 - t)
+                        blocks[i : rows - 1 + i, j : columns - 1 + j] += weight**2 * matrices[:, k, :, m]
+        return blocks
+
+
+def batches(count):
+    """Slices of at most BATCH of `count` points."""
+    return [slice(start, start + BATCH) for start in range(0, count, BATCH)]

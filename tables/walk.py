@@ -15,8 +15,7 @@ import numpy as np
 
 from ltsh_addon.shading.lookup_table import WARP_REGULARIZATION
 
-from .fresnel_basis import FLAT
-from .projection import Points, project
+from .projection import FLAT, Points, project
 
 PENALTY = 1e-3
 MAX_BETA = 1.5705

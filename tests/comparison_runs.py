@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon import imaging
-from ltsh_addon.comparison.compare import Options
+from ltsh_addon.pipeline.picture import Options
 
 TECHNIQUES = ("ltc", "ltsh4", "reference")
 # Images pass through float32 once; sums of a few of them differ by a few roundings.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltsh_addon import shading
-from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.process import client
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
@@ -72,12 +72,12 @@ class FakeChild:
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None):
         self.groups, self.empty, self.error = groups, empty, error
-        self.asked: list[child.ExtractOptions] = []
+        self.asked: list[client.ExtractOptions] = []
         self.built: list = []
 
     def install(self, monkeypatch) -> FakeChild:
-        monkeypatch.setattr(child, "extract", self.extract)
-        monkeypatch.setattr(child, "build_demo", self.build_demo)
+        monkeypatch.setattr(client, "extract", self.extract)
+        monkeypatch.setattr(client, "build_demo", self.build_demo)
         return self
 
     def build_demo(self, path, *, progress=None):
@@ -93,7 +93,7 @@ class FakeChild:
         for stage in ("samples", "Cycles A", "Cycles B"):
             if progress is not None and progress(stage, 1.0) is False:
                 raise Cancelled(f"cancelled at {stage}")
-        return child.Extraction(
+        return client.Extraction(
             lights=some_lights,
             samples=points,
             film=some_film,

@@ -5,9 +5,9 @@ import re
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.baking.bake import BakeOptions, check_memory
-from ltsh_addon.blender.processes import child, memory
-from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.blender.process import client, memory
+from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.pipeline.bake import BakeOptions, check_memory
 
 LIMIT = ["--memory-limit", "450M"]
 
@@ -19,7 +19,7 @@ def room(tmp_path, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("Blender was started")
 
-    monkeypatch.setattr(child, "run_child", refuse)
+    monkeypatch.setattr(client, "run_child", refuse)
     monkeypatch.delenv(memory.VARIABLE, raising=False)
     monkeypatch.setenv("LTSH_CORES", "1")
     path = tmp_path / "room.blend"
@@ -70,10 +70,10 @@ def test_what_is_said_to_help_helps(room, tmp_path, monkeypatch):
         number, unit = re.search(r"about ([\d.]+) ([MG])iB", str(raised.value)).groups()
         return float(number) * {"M": 1, "G": 1024}[unit]
 
-    monkeypatch.setattr("ltsh_addon.baking.bake.cores", lambda: 8)
+    monkeypatch.setattr("ltsh_addon.pipeline.bake.cores", lambda: 8)
     whole, wide = needed(), needed(width=8192, height=8192, margin=512)
     assert needed(width=512, height=512) < whole and needed(width=256, height=256) < 0.5 * whole
-    monkeypatch.setattr("ltsh_addon.baking.bake.cores", lambda: 1)
+    monkeypatch.setattr("ltsh_addon.pipeline.bake.cores", lambda: 1)
     assert needed() < 0.5 * whole
     assert needed(width=8192, height=8192, margin=16) < wide
     # A large bake takes little more than one of 1024 x 1024.

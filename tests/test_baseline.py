@@ -7,9 +7,9 @@ import fake_scene
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.commands import argument_values
-from ltsh_addon.comparison.baseline import Baseline, Tolerance
-from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
+from ltsh_addon.cli import arguments as arguments_module
+from ltsh_addon.pipeline.baseline import Baseline, Tolerance
+from ltsh_addon.pipeline.picture import Options, compare_scene, shade_scene
 
 
 @pytest.fixture
@@ -66,8 +66,8 @@ def test_what_got_worse_is_named_with_its_place(report, tmp_path, keys, place):
 def test_a_tolerance_is_absolute_or_relative():
     assert Tolerance(0.002).allows(0.01, 0.0119) and not Tolerance(0.002).allows(0.01, 0.0121)
     assert Tolerance(0.1, relative=True).allows(0.01, 0.0109) and not Tolerance(0.1, relative=True).allows(0.01, 0.0111)
-    assert argument_values.tolerance("0.002") == Tolerance(0.002)
-    assert argument_values.tolerance("10%") == Tolerance(0.1, relative=True)
+    assert arguments_module.tolerance("0.002") == Tolerance(0.002)
+    assert arguments_module.tolerance("10%") == Tolerance(0.1, relative=True)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_several_pictures_are_told_apart(report, tmp_path):
 @pytest.mark.parametrize("text", ["", "x", "-1", "nan", "inf", "%", "1%%"])
 def test_tolerances_that_are_none(text):
     with pytest.raises(Exception, match="tolerance is"):
-        argument_values.tolerance(text)
+        arguments_module.tolerance(text)
 
 
 def test_the_command_ends_with_1_where_something_got_worse(capsys, monkeypatch, tmp_path):

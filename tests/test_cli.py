@@ -12,9 +12,8 @@ import fake_scene
 import numpy as np
 import pytest
 
-from ltsh_addon import cli
-from ltsh_addon.blender.processes.child import SceneError
-from ltsh_addon.imaging import atomic
+from ltsh_addon import cli, files
+from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -138,7 +137,7 @@ def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path
     def refuse(path, *arguments):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
-    monkeypatch.setattr(atomic.os, "open", refuse)
+    monkeypatch.setattr(files.os, "open", refuse)
     assert_failure(run(capsys, "shade", room, "-o", tmp_path, "--quiet"), "Permission denied")
     assert child.asked == []
 

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon import __version__, cli, shading
-from ltsh_addon.commands import argument_values, tables_command
+from ltsh_addon import cli, shading
+from ltsh_addon.cli import arguments as arguments_module
+from ltsh_addon.cli import commands
+from ltsh_addon.scene import VERSION
 
 
 @pytest.fixture
@@ -93,9 +95,7 @@ def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
 
 
 def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(
-        tables_command, "__file__", str(tmp_path / "site" / "ltsh_addon" / "commands" / "tables_command.py")
-    )
+    monkeypatch.setattr(commands, "__file__", str(tmp_path / "site" / "ltsh_addon" / "commands" / "tables_command.py"))
     assert_misuse(run(capsys, "tables", "fit"), "needs the source checkout")
 
 
@@ -123,7 +123,7 @@ def test_the_program_is_named_as_it_was_called(capsys, out):
 
 def test_version(capsys):
     code, stdout, _ = run(capsys, "--version")
-    assert (code, stdout) == (0, f"ltsh {__version__}\n")
+    assert (code, stdout) == (0, f"ltsh {VERSION}\n")
 
 
 @pytest.mark.parametrize("command", ["demo", "compare", "shade"])
@@ -143,4 +143,4 @@ def test_the_main_help_names_the_commands_and_examples(capsys):
 
 
 def test_every_shipped_table_is_a_technique():
-    assert argument_values.techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES
+    assert arguments_module.techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES

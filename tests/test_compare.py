@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
-from ltsh_addon import imaging, shading
-from ltsh_addon.comparison import compare
-from ltsh_addon.comparison.compare import compare_scene
+from ltsh_addon import imaging, scene, shading
+from ltsh_addon.pipeline.picture import compare_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
@@ -20,7 +19,7 @@ TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
 def test_layers_have_the_names_of_the_design(child, tmp_path):
     compare_scene(options(tmp_path))
     layers = written(tmp_path)
-    expected = {"coverage.hit", *(f"samples.{field}" for field in compare.SurfaceSamples.__dataclass_fields__)}
+    expected = {"coverage.hit", *(f"samples.{field}" for field in scene.SurfaceSamples.__dataclass_fields__)}
     for pass_name in ("specular", "diffuse"):
         expected |= {f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")}
         for name in TECHNIQUES:

@@ -10,8 +10,8 @@ import pytest
 from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
 from ltsh_addon import imaging, shading
-from ltsh_addon.comparison import compare
-from ltsh_addon.comparison.compare import compare_scene, shade_scene
+from ltsh_addon.pipeline import picture
+from ltsh_addon.pipeline.picture import compare_scene, shade_scene
 
 
 def without_seconds(report):
@@ -110,7 +110,7 @@ def test_material_classes_part_metals_from_dielectrics():
         specular_f90=np.array([[1.0, 1, 1], [0, 0, 0], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6], [0, 0, 0]]),
         dielectric=np.array([0.0, 1.0, 0.6, 0.4, 0.0]),
     )
-    classes = compare.material_classes(samples)
+    classes = picture.material_classes(samples)
     assert classes["metals"].tolist() == [True, False, False, True, False]
     assert classes["dielectrics"].tolist() == [False, True, True, False, False]
 

@@ -14,7 +14,7 @@ import pytest
 import zstandard
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.processes import blend_header
+from ltsh_addon.blender.process import client
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE = (ROOT / "tables" / "ltsh2.npz").read_bytes()
@@ -57,7 +57,7 @@ def newer_scene(pack=bytes, header=b"BLENDER17-01v0999"):
     return data(pack(header + NUMBERS.bytes(9999)))
 
 
-NEWER = "was saved by Blender 9.99, but this is Blender {}[.]{}".format(*blend_header.running())
+NEWER = "was saved by Blender 9.99, but this is Blender {}[.]{}".format(*client.running())
 SHADE_A = ["shade", "a.blend", "-o", "out"]
 
 # id: how to make which file (None: none is needed), the arguments, the exit code, what the line must say

@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.jobs.toml_lines import key_lines
+from ltsh_addon.cli.job_file import key_lines
 
 
 @pytest.fixture

@@ -6,8 +6,9 @@ import json
 import fake_scene
 import pytest
 
-from ltsh_addon.blender.processes.child import SceneError
-from ltsh_addon.jobs import job_steps
+from ltsh_addon import panel_job
+from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.cli.progress import MESSAGE, LineProgress
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
 
@@ -16,9 +17,9 @@ def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, roo
     fake_scene.FakeChild().install(monkeypatch)
     messages = io.StringIO()
     arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL]
-    report, _ = job_steps._command(arguments, job_steps.LineProgress(messages))
+    report, _ = panel_job._command(arguments, LineProgress(messages))
     assert report == json.loads((tmp_path / "out" / "report.json").read_text()) and report["resolution"]
-    sent = [json.loads(line.removeprefix(job_steps.MESSAGE)) for line in messages.getvalue().splitlines()]
+    sent = [json.loads(line.removeprefix(MESSAGE)) for line in messages.getvalue().splitlines()]
     stages = list(dict.fromkeys(message["stage"] for message in sent))
     assert stages[0] == "samples" and stages[-2:] == ["LTC", "write"] and sent[-1]["fraction"] == 1.0
 
@@ -34,5 +35,5 @@ def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, roo
 def test_a_command_that_fails_gives_the_line_that_says_why(monkeypatch, room, tmp_path, arguments, error, complaint):
     fake_scene.FakeChild(error=error).install(monkeypatch)
     arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL, *arguments]
-    report, line = job_steps._command(arguments, job_steps.LineProgress(io.StringIO()))
+    report, line = panel_job._command(arguments, LineProgress(io.StringIO()))
     assert report is None and line.startswith(complaint)

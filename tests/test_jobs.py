@@ -8,11 +8,11 @@ import fake_scene
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.blender.processes.child import SceneError
-from ltsh_addon.comparison.compare import Options
-from ltsh_addon.jobs import batch, task_records
-from ltsh_addon.jobs.merge import merge
-from ltsh_addon.jobs.tasks import Job
+from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.pipeline import batch, tasks
+from ltsh_addon.pipeline.batch import merge
+from ltsh_addon.pipeline.picture import Options
+from ltsh_addon.pipeline.tasks import Job
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
@@ -122,7 +122,7 @@ def test_what_is_not_whole_is_done_again(child, room, tmp_path, existing, damage
     batch.run_tasks(wanted)
     before = contents(tmp_path / "out")
     image = tmp_path / "out" / "shade_0001.exr"
-    record = tmp_path / "out" / task_records.FOLDER / "tasks" / "shade_0001.json"
+    record = tmp_path / "out" / tasks.FOLDER / "tasks" / "shade_0001.json"
     if damage == "cut":
         image.write_bytes(image.read_bytes()[:-1])
     elif damage == "changed":
@@ -145,9 +145,9 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
             raise SceneError("room.blend: no area light\nat this frame")
         return extract(options, progress=progress)
 
-    from ltsh_addon.blender.processes import child as child_module
+    from ltsh_addon.blender.process import client
 
-    monkeypatch.setattr(child_module, "extract", fail_at_two)
+    monkeypatch.setattr(client, "extract", fail_at_two)
     arguments = ["shade", room, "--frames", "1-3", *SMALL]
     code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one")
     assert code == 1 and "failed: shade_0002: room.blend: no area light at this frame" in stderr.splitlines()
@@ -156,14 +156,14 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
     codes = [run(capsys, *arguments, "-o", tmp_path / "two", "--shard", shard)[0] for shard in ("1/2", "2/2")]
     assert codes == [0, 1] and run(capsys, "merge", tmp_path / "two")[0] == 1
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    monkeypatch.setattr(child_module, "extract", extract)
+    monkeypatch.setattr(client, "extract", extract)
     code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one", "--resume")
     assert (code, [options.frame for options in fake.asked[-1:]]) == (0, [2]) and "failed" not in stderr
 
 
 def test_results_of_different_versions_are_not_mixed(child, room, tmp_path):
     batch.run_tasks(job(room, tmp_path / "out", frames=(1, 2)))
-    path = tmp_path / "out" / task_records.FOLDER / "tasks" / "shade_0002.json"
+    path = tmp_path / "out" / tasks.FOLDER / "tasks" / "shade_0002.json"
     path.write_text(path.read_text().replace("5.2.3", "4.5.15"))
     (problem,) = merge(tmp_path / "out").problems
     assert "different versions" in problem and "5.2.3" in problem and "4.5.15" in problem

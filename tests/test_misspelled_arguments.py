@@ -3,7 +3,7 @@
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.blender.processes.missing_names import listed
+from ltsh_addon.blender.process.blender_process import listed
 
 
 @pytest.mark.parametrize(

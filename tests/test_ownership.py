@@ -7,20 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon import ownership
+from ltsh_addon import files
 
 ROOT = Path(__file__).resolve().parents[1]
 OTHER = "0123456789ab"
-LONG = ownership.ABANDONED_SECONDS + 60.0
+LONG = files.ABANDONED_SECONDS + 60.0
 # Makes a file, one that belongs to it and a folder, as a process of a machine, and waits for a line.
 MAKER = """
 import sys
 from pathlib import Path
-from ltsh_addon import ownership
+from ltsh_addon import files
 folder, machine = Path(sys.argv[1]), sys.argv[2]
 if machine:
-    ownership.machine = lambda: machine
-file, directory = ownership.new_file(folder, ".a.", ".tmp")[0], ownership.new_folder(folder, "run-")[0]
+    files.machine = lambda: machine
+file, directory = files.new_file(folder, ".a.", ".tmp")[0], files.new_folder(folder, "run-")[0]
 Path(f"{file}.saved").write_bytes(b"x")
 (directory / "below").mkdir()
 (directory / "below" / "file").write_bytes(b"x")
@@ -65,8 +65,8 @@ def age(folder, seconds, names="**/*"):
 
 def make_and_remove(folder):
     """What every process does that writes a file and needs a folder."""
-    file, lock = ownership.new_file(folder, ".a.", ".tmp")
-    directory, other_lock = ownership.new_folder(folder, "run-")
+    file, lock = files.new_file(folder, ".a.", ".tmp")
+    directory, other_lock = files.new_folder(folder, "run-")
     file.unlink()
     directory.rmdir()
     os.close(lock), os.close(other_lock)
@@ -87,7 +87,7 @@ def test_of_another_machine_whose_locks_cannot_be_seen_only_what_is_old_goes(tmp
     """A killed process holds no lock, as one that lives has none here where locks stay within machines."""
     kill(maker(OTHER))
     before = everything(tmp_path)
-    age(tmp_path, ownership.ABANDONED_SECONDS - 60.0)
+    age(tmp_path, files.ABANDONED_SECONDS - 60.0)
     make_and_remove(tmp_path)
     assert len(before) == 5 and everything(tmp_path) == before
     age(tmp_path, 120.0)
@@ -127,7 +127,7 @@ def test_without_locks_only_what_is_old_goes(tmp_path, maker, monkeypatch):
     def refuse(*arguments):
         raise OSError(95, "Operation not supported")
 
-    monkeypatch.setattr(ownership.fcntl, "flock", refuse)
+    monkeypatch.setattr(files.fcntl, "flock", refuse)
     kill(maker())
     before = everything(tmp_path)
     make_and_remove(tmp_path)
@@ -138,7 +138,7 @@ def test_without_locks_only_what_is_old_goes(tmp_path, maker, monkeypatch):
 
 
 def test_names_that_are_nearly_ours_stay(tmp_path):
-    mark = f"{ownership.machine()}-01234567"
+    mark = f"{files.machine()}-01234567"
     names = [f".a.{mark}", f".a.{mark[:-1]}.tmp", f".a.{mark[1:]}.tmp", f".a.x{mark}.tmp", f".b.{mark}.tmp", ".a.tmp"]
     for name in names:
         (tmp_path / name).touch()
@@ -149,12 +149,12 @@ def test_names_that_are_nearly_ours_stay(tmp_path):
 
 def test_a_folder_that_is_not_there_is_told(tmp_path):
     with pytest.raises(FileNotFoundError):
-        ownership.new_file(tmp_path / "absent", ".a.", ".tmp")
+        files.new_file(tmp_path / "absent", ".a.", ".tmp")
     with pytest.raises(FileNotFoundError):
-        ownership.new_folder(tmp_path / "absent", "run-")
+        files.new_folder(tmp_path / "absent", "run-")
 
 
 def test_a_machine_has_one_name():
-    code = "from ltsh_addon import ownership; print(ownership.machine())"
+    code = "from ltsh_addon import files; print(files.machine())"
     run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == ownership.machine() and len(ownership.machine()) == 12
+    assert run.stdout.strip() == files.machine() and len(files.machine()) == 12

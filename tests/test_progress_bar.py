@@ -4,8 +4,8 @@ import io
 
 import pytest
 
-from ltsh_addon.commands import progress_bar
-from ltsh_addon.commands.progress_bar import ProgressBar, duration
+from ltsh_addon.cli import progress
+from ltsh_addon.cli.progress import ProgressBar, duration
 
 
 class Stream(io.StringIO):
@@ -27,7 +27,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(progress_bar, "time", clock)
+    monkeypatch.setattr(progress, "time", clock)
     return clock
 
 

@@ -3,7 +3,7 @@
 import os
 from concurrent.futures import ThreadPoolExecutor
 
-from ltsh_addon.commands.run_log import RunLog
+from ltsh_addon.cli.progress import RunLog
 
 
 def lines_of(path):

@@ -13,8 +13,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from ltsh_addon import cli, shading, table_export
+from ltsh_addon import cli, shading
 from ltsh_addon.imaging import read_channels
+from ltsh_addon.pipeline import export
 from ltsh_addon.shading import lookup_table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -30,7 +31,7 @@ def run(capsys, *arguments):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
-    table_export.export_tables(table_export.export_prefixes(shading.SHIPPED_TABLES), folder)
+    export.export_tables(export.export_prefixes(shading.SHIPPED_TABLES), folder)
     return folder
 
 
@@ -110,7 +111,7 @@ def test_every_channel_is_documented_and_every_documented_one_is_written(exporte
 
 
 def test_exporting_twice_gives_the_same_bytes(exported, out):
-    for path in table_export.export_tables({"ltsh2": "ltsh2"}, out)["ltsh2"]:
+    for path in export.export_tables({"ltsh2": "ltsh2"}, out)["ltsh2"]:
         assert path.read_bytes() == (exported / path.name).read_bytes()
 
 
@@ -120,7 +121,7 @@ def test_exporting_twice_gives_the_same_bytes(exported, out):
      ("LTSH", "table_ltsh"), ("ä", "table")],
 )  # fmt: skip
 def test_names_in_headers_are_identifiers(name, expected):
-    assert table_export.identifier(name) == expected
+    assert export.identifier(name) == expected
 
 
 def test_all_shipped_tables_are_the_default(capsys, out):

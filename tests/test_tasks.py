@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.commands import argument_values
-from ltsh_addon.comparison.compare import Options
-from ltsh_addon.jobs import output_names
-from ltsh_addon.jobs.tasks import Job, shard_of, tasks_of
+from ltsh_addon.cli import arguments as arguments_module
+from ltsh_addon.pipeline import tasks as tasks_module
+from ltsh_addon.pipeline.picture import Options
+from ltsh_addon.pipeline.tasks import Job, shard_of, tasks_of
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
@@ -39,7 +39,7 @@ def run(capsys, *arguments):
     ],
 )
 def test_frames_are_ranges_and_single_ones_each_once(text, expected):
-    assert argument_values.frames(text) == expected
+    assert arguments_module.frames(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_wrong_values_are_misuse(capsys, child, room, tmp_path, option, text, co
 
 def test_stems_differ_in_any_case_and_hold_no_separators():
     names = ["Floor", "floor", "a/b", "a:b", "../../x", "", "Bücher", "x" * 300, "x" * 301]
-    stems = output_names.file_stems(names)
+    stems = tasks_module.file_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names) and stems[0] == "Floor" and stems[6] == "Bücher"
     assert not [stem for stem in stems if set(stem) & set("/\\:.") or not stem.strip() or len(stem) > 110]
 
@@ -98,10 +98,10 @@ def test_tasks_that_would_write_the_same_file_are_misuse(capsys, child, room, tm
 
 
 def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatch, capsys, child, room, tmp_path):
-    from ltsh_addon.blender.processes import scene_facts
+    from ltsh_addon.blender.process import client
 
     found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}}
-    monkeypatch.setattr(scene_facts, "ask", lambda *arguments, **options: [found])
+    monkeypatch.setattr(client, "ask", lambda *arguments, **options: [found])
     name = "{camera}_{frame:03d}"
     assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0
     assert (tmp_path / "out" / "Main_1_012.exr").is_file() and child.asked[0].frame is None

@@ -1,35 +1,38 @@
-"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
+"""stdout for one document alone, in a Blender that prints on it too. Imports no bpy."""
 
 from __future__ import annotations
 
 import atexit
 import importlib
+import os
+import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 
 import bpy
 
-from .processes import standard_output
+
+def reserve() -> None:
+    """From now on to the end of the process what is not printed through sys.stdout goes to stderr: Blender's own lines,
+    from C, also those that it prints when it ends."""
+    sys.stdout.flush()
+    ours = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = open(ours, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, buffering=1)
+
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
 PARTS = (
-    "interface.preferences",
-    "engine.view_properties",
-    "engine.render_engine",
-    "engine.engine_panels",
-    "engine.engine_preview",
-    "engine.split_gizmo",
-    "interface.properties",
-    "interface.operators",
-    "interface.operators_fix",
-    "interface.operators_view",
-    "interface.overview",
-    "interface.viewer",
-    "interface.probe",
-    "interface.wipe",
-    "interface.settings_presets",
-    "interface.panels",
-    "interface.image_panels",
+    "ui.settings",
+    "engine.settings",
+    "engine.render",
+    "ui.preview",
+    "ui.operators",
+    "ui.preflight",
+    "ui.view_operators",
+    "ui.overview",
+    "ui.comparison",
+    "ui.panels",
 )
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.
@@ -41,7 +44,7 @@ def register(command_line: Callable[..., int]) -> None:
 
     def run(arguments: list[str]) -> int:
         if "--json" in arguments:
-            standard_output.reserve()
+            reserve()
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
     with ExitStack() as added:
@@ -57,8 +60,8 @@ def register(command_line: Callable[..., int]) -> None:
 
 def unregister() -> None:
     """Remove what `register` added."""
-    from .interface import availability
+    from .ui import preflight
 
     atexit.unregister(unregister)
-    availability.missing_libraries.cache_clear()
+    preflight.missing_libraries.cache_clear()
     _registered.close()

@@ -5,15 +5,19 @@ scene-referred linear RGB, Rec.709 where a function says nothing else, unless a 
 reference, red too bright, blue too dark.
 """
 
-from .color_space import chromaticities
+from .color import chromaticities, exposure_factor, signed_error_colors, to_srgb8
 from .exr import Layer, read_channels, read_layers, write_layers
-from .false_color import signed_error_colors
 from .flip import mean_flip
-from .metrics import ErrorStatistics, error_statistics, noisy_error_statistics, reference_noise, unbiased_relative_error
+from .metrics import (
+    ErrorStatistics,
+    error_statistics,
+    noisy_error_statistics,
+    reference_noise,
+    unbiased_relative_error,
+)
 from .png import write_png
 from .report import write_html, write_json, write_overview
 from .sheet import Tile, comparison_sheet
-from .tone import exposure_factor, to_srgb8
 
 __all__ = [
     "ErrorStatistics",

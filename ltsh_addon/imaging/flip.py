@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .tone import exposure_factor
+from .color import exposure_factor
 
 # A monitor 0.7 m wide with 3840 pixels, seen from 0.7 m: the paper's own choice.
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180.0

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from .tone import luminance
+from .color import luminance
 
 # Relative errors of single pixels are taken where the reference's luminance is above this share of its maximum.
 LIT_SHARE = 1e-4

@@ -8,7 +8,7 @@ import zlib
 
 import numpy as np
 
-from .atomic import write_bytes
+from ..files import write_bytes
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -1,4 +1,4 @@
-"""The report of a comparison: JSON for machines, one self-contained HTML page for people."""
+"""report.json, report.html and the index of pictures."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import os
 import posixpath
 import urllib.parse
 from collections.abc import Mapping
+from pathlib import Path
 
-from .atomic import write_bytes
+from ..files import write_bytes
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
@@ -163,3 +164,32 @@ def _percent(value) -> str:
 
 def _text(value) -> str:
     return html.escape(str(value))
+
+
+FILE = "index.json"
+
+
+def write_index(folder: Path, index: dict) -> None:
+    """Write the index. Raises OSError."""
+    write_json(Path(folder) / FILE, index)
+
+
+def read_index(folder: Path) -> dict:
+    """The index in `folder`. Raises OSError, and ValueError, naming the file, where it is damaged."""
+    path = Path(folder) / FILE
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+        complete = isinstance(index["report"], dict) and {"command", "partial"} <= set(index)
+        needed = {"files", "multilayer", "names", "labels", "passes", "scales"}
+        complete = complete and all(needed <= set(group) for group in index["groups"].values())
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: is damaged ({error}); shade or bake again") from error
+    if not complete or not index["groups"]:
+        raise ValueError(f"{path}: is damaged (parts are missing); shade or bake again")
+    return index
+
+
+def index_stamp(folder: Path) -> tuple[int, int]:
+    """Changes when the index does. Raises OSError."""
+    status = (Path(folder) / FILE).stat()
+    return status.st_mtime_ns, status.st_size

@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .false_color import color_bar, signed_error_colors
+from .color import color_bar, exposure_factor, luminance, signed_error_colors, to_srgb8
 from .font import draw_text, shorten, text_size, wrap
-from .tone import exposure_factor, luminance, to_srgb8
 
 COLUMNS = 5
 TILE_WIDTHS = (240, 480)  # tiny images are enlarged to the first, large ones reduced to the second

@@ -56,7 +56,7 @@ def _serve(commands, answers) -> None:
     first = receive(commands)
     # The parent's search path, so that numpy is the same one; running a script puts its own folder first.
     sys.path[:] = [str(PACKAGE_FOLDER.parent), *first["path"]]
-    exchange = importlib.import_module(f"{PACKAGE_FOLDER.name}.shading.block_exchange")
+    exchange = importlib.import_module(f"{PACKAGE_FOLDER.name}.shading.parallel")
     task = receive(commands, first["package"])
     side = exchange.ChildSide(task, first["handle"], first["size"])
     send(answers, None)

@@ -76,10 +76,10 @@ def report(frames, scene=None, resolution="64x36") -> bool:
     with tempfile.TemporaryDirectory(prefix="ltsh-animation-") as name:
         folder = Path(name)
         if scene is None:
-            from ltsh_addon.blender.processes import child
+            from ltsh_addon.blender.process import client
 
             scene = folder / "demo.blend"
-            child.build_demo(scene)
+            client.build_demo(scene)
         common = [Path(scene).absolute(), "--techniques", "ltsh4", "--resolution", resolution]
         singles = [run([*common, "-o", folder / f"single_{n}", "--frames", 1], []) for n in range(3)]
         rows: list = []

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon import shading
-from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.process import client
 
 SIZE = (480, 270)
 
@@ -16,9 +16,9 @@ def report(cycles_samples):
     """Print what ltsh4 takes, and what Cycles takes to reach ltsh4's error, on the specular pass."""
     with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
         scene = Path(folder) / "demo.blend"
-        child.build_demo(scene)
-        extraction = child.extract(
-            child.ExtractOptions(scene, width=SIZE[0], height=SIZE[1], cycles_samples=cycles_samples)
+        client.build_demo(scene)
+        extraction = client.extract(
+            client.ExtractOptions(scene, width=SIZE[0], height=SIZE[1], cycles_samples=cycles_samples)
         )
     start = time.perf_counter()
     shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 
-from ltsh_addon.shading import edge_loop
+from ltsh_addon.shading import moments32
 
 
 def interleaved(cases, rounds=5):
@@ -55,7 +55,7 @@ class _Counted(np.ndarray):
         return result.view(_Counted) if isinstance(result, np.ndarray) else result
 
 
-class CountingScratch(edge_loop.Scratch):
+class CountingScratch(moments32.Scratch):
     """Arrays that count what is done to them."""
 
     def _view(self, name, shape):

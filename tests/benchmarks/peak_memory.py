@@ -9,7 +9,7 @@ sys.path[:0] = [str(Path(__file__).resolve().parents[2]), str(Path(__file__).par
 from bench_scenes import floor_scene  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
-from ltsh_addon.shading import workers  # noqa: E402
+from ltsh_addon.shading import parallel  # noqa: E402
 
 
 def print_peak(count):
@@ -19,13 +19,13 @@ def print_peak(count):
     before = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     # What making the samples took for a while must not count.
     Path("/proc/self/clear_refs").write_text("5")
-    children, start = [], workers.subprocess.Popen
+    children, start = [], parallel.subprocess.Popen
 
     def popen(*arguments, **options):
         children.append(start(*arguments, **options))
         return children[-1]
 
-    workers.subprocess.Popen = popen
+    parallel.subprocess.Popen = popen
     peaks = {}
 
     def look(_):

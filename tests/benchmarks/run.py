@@ -25,7 +25,7 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
-from ltsh_addon.shading import edge_integrals, edge_loop, light_polygons, workers  # noqa: E402
+from ltsh_addon.shading import edge_integrals, light_polygons, moments32, parallel  # noqa: E402
 from ltsh_addon.shading.polygon import project_to_sphere, split_at_horizon  # noqa: E402
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
@@ -132,12 +132,12 @@ def bounds(options):
     heading(f"elements that numpy writes per rectangle and light (chunks of {CHUNK})")
     _, _, vertices = random_polygons(CHUNK, "whole")
     corners = np.ascontiguousarray(vertices.transpose(2, 1, 0))
-    kernels = {"ltc: integral": lambda scratch: edge_loop.cosine_integral(corners, scratch)}
+    kernels = {"ltc: integral": lambda scratch: moments32.cosine_integral(corners, scratch)}
     for degree in (2, 4):
-        kernels[f"N={degree}: moments"] = lambda scratch, d=degree: edge_loop.moments(corners, d, scratch)
+        kernels[f"N={degree}: moments"] = lambda scratch, d=degree: moments32.moments(corners, d, scratch)
     work, out = (np.ones((4, CHUNK), np.float32) for _ in range(2))
     per_element = timed(repeated, partial(np.multiply, work, work, out=out), 200) / 200 / work.size
-    scratch = edge_loop.Scratch()
+    scratch = moments32.Scratch()
     cases = {name: partial(repeated, partial(kernel, scratch), 10) for name, kernel in kernels.items()}
     times = measure.interleaved(cases)
     base = None
@@ -169,9 +169,9 @@ def growth(options):
         row(f"{lights} lights", seconds / count / lights * 1e9)
     heading("growth with degree: moments of rectangles, ns per polygon")
     corners = np.ascontiguousarray(random_polygons(CHUNK, "whole")[2].transpose(2, 1, 0))
-    scratch = edge_loop.Scratch()
+    scratch = moments32.Scratch()
     unit = project_to_sphere(corners.astype(np.float64))
-    cases = {f"N={d}, float32": lambda d=d: edge_loop.moments(corners, d, scratch) for d in range(1, 5)}
+    cases = {f"N={d}, float32": lambda d=d: moments32.moments(corners, d, scratch) for d in range(1, 5)}
     cases |= {f"N={d}, float64": lambda d=d: edge_integrals.moments(unit, d) for d in range(1, 9)}
     for name, seconds in measure.interleaved(cases, 3).items():
         row(name, seconds / CHUNK * 1e9)
@@ -289,7 +289,7 @@ def main():
     sys.stdout.reconfigure(line_buffering=True)
     start = time.perf_counter()
     print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
-          f"load {os.getloadavg()[0]:.1f}, children run on {workers.interpreter()}")  # fmt: skip
+          f"load {os.getloadavg()[0]:.1f}, children run on {parallel.interpreter()}")  # fmt: skip
     for name in options.sections or SECTIONS:
         if not (name in ("cycles", "animation", "viewport") and options.no_cycles):
             SECTIONS[name](options)

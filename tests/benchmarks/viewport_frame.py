@@ -22,10 +22,10 @@ import bpy
 import gpu
 import numpy as np
 
-from ltsh_addon.blender.demo import demo_scene
-from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
-from ltsh_addon.blender.viewport.surface_pass import View
-from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender import demo
+from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.surfaces import View
 
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4")
 TARGETS = {"ltsh2": 1.3, "ltsh4": 2.0}
@@ -37,7 +37,7 @@ class Frames:
 
     def __init__(self, size):
         with tempfile.TemporaryDirectory() as folder:
-            demo_scene.build(Path(folder) / "demo.blend")
+            demo.build(Path(folder) / "demo.blend")
         scene = bpy.context.scene
         depsgraph = bpy.context.evaluated_depsgraph_get()
         self.mirror = SceneMirror()

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 import numpy as np
 
-from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
+from ltsh_addon.blender.viewport.mirror import SceneMirror
 
 REPEATS = 9
 

@@ -7,7 +7,7 @@ import scene_parts
 from scene_parts import add_plane, add_sphere, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.baking.bake import BakeOptions, bake_scene
+from ltsh_addon.pipeline.bake import BakeOptions, bake_scene
 
 SIZE = 64
 

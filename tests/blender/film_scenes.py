@@ -6,8 +6,8 @@ import scene_parts
 from scene_parts import add_plane, bsdf_material
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.pixels.render_settings import enable_passes, render_exr
-from ltsh_addon.comparison.compare import Options, compare_scene
+from ltsh_addon.blender.render_settings import enable_passes, render_exr
+from ltsh_addon.pipeline.picture import Options, compare_scene
 
 SIZE = (26, 16)
 

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 import ltsh_addon
-from ltsh_addon.blender.interface import operators
+from ltsh_addon.blender.ui import operators
 
 SECONDS = 300
 

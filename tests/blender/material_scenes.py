@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import scene_parts
 
-from ltsh_addon.blender.pixels import gbuffer
+from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.shading import shade
 

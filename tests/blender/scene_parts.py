@@ -7,8 +7,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ltsh_addon.blender.pixels import cameras, cycles_reference, extraction, gbuffer, pixel_samples, render_settings
-from ltsh_addon.blender.processes import child
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.process import client
+from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
 
 SIZE = (24, 16)
@@ -129,9 +131,9 @@ def add_bump(tree, node, strength=1.0, scale=6.0, distance=0.3):
 def prepare():
     """The scene's preparation as the child does it; (scene, view layer, light inventory, warnings)."""
     scene, warnings = bpy.context.scene, []
-    camera = cameras.choose_camera(scene, None)
+    camera = render_settings.choose_camera(scene, None)
     layer = render_settings.choose_view_layer(scene, warnings)
-    inventory = extraction.prepare_scene(scene, layer, camera, warnings)
+    inventory = pixels.prepare_scene(scene, layer, camera, warnings)
     return scene, layer, inventory, warnings
 
 
@@ -142,7 +144,7 @@ def silent(stage, fraction):
 def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
     """Samples (one array per render), their pixels and the raw channels of each sample render."""
     scene, layer = prepared[:2]
-    files = pixel_samples.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
+    files = pixels.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
     channels = [read_channels(folder / name) for name in files]
     for image in channels:
         gbuffer.clear_holdouts(image)
@@ -154,12 +156,12 @@ def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
     """The Cycles reference: {"specular", "diffuse"} -> (2, H, W, 3)."""
     scene, layer = prepared[:2]
     manifest = {
-        "reference": cycles_reference.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),
+        "reference": pixels.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),
         "passes": render_settings.pass_names(),
         "width": scene.render.resolution_x,
         "height": scene.render.resolution_y,
     }
-    return child.read_reference(manifest, folder)
+    return client.read_reference(manifest, folder)
 
 
 def group_with_principled(name="Group"):

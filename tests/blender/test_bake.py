@@ -11,9 +11,10 @@ from bake_scenes import SIZE, baked, save, start, textured_scene
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.baking import bake_object
-from ltsh_addon.blender.pixels import gbuffer, render_settings
+from ltsh_addon.blender import render_settings
+from ltsh_addon.cycles import lobes
 from ltsh_addon.imaging.exr import read_metadata
+from ltsh_addon.pipeline import bake
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
@@ -159,7 +160,7 @@ def test_blocks_of_rows_change_nothing(tmp_path, monkeypatch):
     textured_scene()
     path = save(tmp_path)
     _, whole = baked(path, tmp_path / "whole", margin=3)
-    monkeypatch.setattr(bake_object, "BLOCK_TEXELS", 7 * SIZE)
+    monkeypatch.setattr(bake, "BLOCK_TEXELS", 7 * SIZE)
     _, parts = baked(path, tmp_path / "parts", margin=3)
     for name, layers in whole.items():
         assert np.array_equal(layers["coverage.hit"], parts[name]["coverage.hit"])
@@ -223,6 +224,6 @@ def test_apply_saves_a_file_whose_object_shows_the_texture(tmp_path):
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
     render_settings.render_exr(scene, tmp_path / "picture.exr")
     channels = imaging.read_channels(tmp_path / "picture.exr")
-    rendered = gbuffer.read_layer(channels, "Combined", "RGB")
+    rendered = lobes.read_layer(channels, "Combined", "RGB")
     # Cycles keeps the texture in half precision and blends neighbors by a thousandth of a texel.
     assert np.abs(rendered - combined).max() <= 5e-3 * combined.max()

@@ -122,7 +122,7 @@ def test_a_full_disk_for_temporary_files_is_one_line(small_disk, tmp_path, capfd
 def test_a_folder_that_cannot_be_written_is_named_before_anything_starts(scene, small_disk, capsys, monkeypatch):
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     monkeypatch.setattr(
-        "ltsh_addon.blender.processes.blender_process.start", lambda *_: pytest.fail("Blender was started")
+        "ltsh_addon.blender.process.blender_process.start", lambda *_: pytest.fail("Blender was started")
     )
     assert cli.main(["bake", str(scene), "-o", str(small_disk / "out"), "--quiet"]) == 1
     expected = (

@@ -8,10 +8,9 @@ from bake_scenes import baked, save, start
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.baking.bake_planes import Planes
-from ltsh_addon.blender.texels import texel_bake
-from ltsh_addon.blender.texels.uv_raster import UvTriangles
-from ltsh_addon.blender.texels.uv_seams import UvSeams
+from ltsh_addon.blender.extract import bake
+from ltsh_addon.cycles.uv import UvSeams, UvTriangles
+from ltsh_addon.pipeline.bake_files import Planes
 
 SIZE, MARGIN = 128, 6
 
@@ -105,7 +104,7 @@ def test_margins_agree_with_blenders_own(tmp_path, kind, share):
     ob.data.materials.clear()
     ob.data.materials.append(position_material())
     plain, wide = blender_bake(ob, 0), blender_bake(ob, MARGIN)
-    mesh, _, _ = texel_bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+    mesh, _, _ = bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
 
     def colors(texels):
         return plain.reshape(-1, 3)[texels.index]

@@ -11,8 +11,9 @@ from bake_scenes import baked, save
 from scene_parts import bsdf_material, new_material, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.materials import sheen_albedos, sheen_measurement
-from ltsh_addon.comparison.compare import Options, make_picture
+from ltsh_addon.blender.materials import sheen_measurement
+from ltsh_addon.cycles import closures
+from ltsh_addon.pipeline.picture import Options, make_picture
 
 WIDTH, HEIGHT, SCALE = 192, 64, 6.0  # texels, and m of the picture's width
 RED, BLUE = (0.8, 0.3, 0.2, 1.0), (0.2, 0.4, 0.9, 1.0)
@@ -121,4 +122,4 @@ def test_the_albedos_of_sheen_are_those_of_this_cycles():
     cosine, roughness, albedo = sheen_measurement.measure(96)
     assert len(albedo) == 96**2 and albedo.max() > 0.7 and cosine.min() < 0.01 and cosine.max() > 0.99
     # Half precision would leave 2e-4; the nodes were fitted to 512 x 512 pixels.
-    assert np.abs(sheen_albedos.sheen_albedo(cosine, roughness) - albedo).max() < 1e-4
+    assert np.abs(closures.sheen_albedo(cosine, roughness) - albedo).max() < 1e-4

@@ -9,8 +9,8 @@ import scene_parts
 from bake_scenes import baked, save, start
 from scene_parts import add_plane, principled
 
-from ltsh_addon.baking.bake import BakeOptions, bake_scene
-from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.pipeline.bake import BakeOptions, bake_scene
 from ltsh_addon.scene import Cancelled
 
 
@@ -61,11 +61,15 @@ def test_broken_objects_are_named_and_the_rest_is_baked(tmp_path, capsys):
 def test_scenes_that_cannot_be_baked_say_why(tmp_path):
     start(light=False)
     add_plane()
-    with pytest.raises(child.SceneError, match="no area light that renders, found no lights at all; add an area light"):
+    with pytest.raises(
+        blender_process.SceneError, match="no area light that renders, found no lights at all; add an area light"
+    ):
         baked(save(tmp_path), tmp_path / "out")
     scene_parts.add_area_light()
     path = save(tmp_path)
-    with pytest.raises(child.SceneError, match="object 'Wall' is not in scene 'Scene'; meshes there: 'Plane'"):
+    with pytest.raises(
+        blender_process.SceneError, match="object 'Wall' is not in scene 'Scene'; meshes there: 'Plane'"
+    ):
         baked(path, tmp_path / "out", objects=("Wall",))
     report, _ = baked(path, tmp_path / "out", uv="Lightmap")
     assert report["problems"] == [
@@ -74,7 +78,7 @@ def test_scenes_that_cannot_be_baked_say_why(tmp_path):
     with pytest.raises(ValueError, match="size is 32x8192, expected 64 to 8192 each"):
         baked(path, tmp_path / "out", width=32, height=8192)
     bpy.data.objects.remove(bpy.data.objects["Plane"])
-    with pytest.raises(child.SceneError, match="no mesh that renders, nothing to bake"):
+    with pytest.raises(blender_process.SceneError, match="no mesh that renders, nothing to bake"):
         baked(save(tmp_path), tmp_path / "out")
 
 
@@ -84,7 +88,7 @@ def test_above_needs_no_camera_and_camera_does(tmp_path):
     path = save(tmp_path)
     _, files = baked(path, tmp_path / "out", view="above")
     assert files["Plane.exr"]["ltsh4.specular"].max() > 0.0
-    with pytest.raises(child.SceneError, match="no active camera"):
+    with pytest.raises(blender_process.SceneError, match="no active camera"):
         baked(path, tmp_path / "out")
 
 

@@ -8,11 +8,12 @@ import pytest
 from bake_scenes import SIZE, save, start
 from scene_parts import add_plane, principled
 
-from ltsh_addon.baking import bake
-from ltsh_addon.baking.bake import BakeOptions
-from ltsh_addon.blender.materials.image_textures import ImageTexture
-from ltsh_addon.blender.texels import bake_child, texel_samples
-from ltsh_addon.blender.texels.uv_raster import UvTriangles
+from ltsh_addon.blender.process import client
+from ltsh_addon.cycles import texels as texels_module
+from ltsh_addon.cycles.images import ImageTexture
+from ltsh_addon.cycles.uv import UvTriangles
+from ltsh_addon.pipeline import bake
+from ltsh_addon.pipeline.bake import BakeOptions
 from ltsh_addon.scene import AreaLight
 
 # Cycles bakes 0.001 and 0.002 of a texel beside the center, where these textures change by 0.3 per texel at most.
@@ -95,23 +96,23 @@ def samples_by_object(path, folder, look_up):
     folder.mkdir()
     options = BakeOptions(scene=path, output=folder, width=SIZE, height=SIZE, view="above")
     job = replace(bake._job(options, {}), look_up_images=look_up)
-    manifest = bake_child.extract_bake(job, folder)
+    manifest = client.extract_bake(job, folder)
     lights = tuple(AreaLight(**record) for record in manifest["lights"])
     found = {}
     for record in manifest["objects"]:
         assert record["problem"] is None
         of_object = folder / record["folder"]
-        mesh = texel_samples.TexelMesh.load(of_object / "mesh.npz")
+        mesh = texels_module.TexelMesh.load(of_object / "mesh.npz")
         uv_maps = {name: of_object / file for name, file in record["uv_maps"].items()}
-        materials = [texel_samples.BakeMaterial.of(value, folder, uv_maps) for value in record["materials"]]
+        materials = [texels_module.BakeMaterial.of(value, folder, uv_maps) for value in record["materials"]]
         texels = UvTriangles.in_tile(mesh.uv, SIZE, SIZE).texels(0, SIZE)
         maps = np.load(of_object / "maps_1001_0.npy") if record["maps"] else None
 
         def read_map(number, maps=maps, index=texels.index):
             return maps[number].reshape(-1, 3)[index]
 
-        view = texel_samples.BakeView(**manifest["view"])
-        samples, _ = texel_samples.texel_samples(mesh, materials, texels, read_map, view, lights)
+        view = texels_module.BakeView(**manifest["view"])
+        samples, _ = texels_module.texel_samples(mesh, materials, texels, read_map, view, lights)
         found[record["name"]] = samples, record["maps"]
     return found
 
@@ -164,9 +165,9 @@ def altered(kind, folder):
     "kind", ["alpha", "mapping node", "cubic", "box", "own mapping", "no such map", "color space", "math"]
 )
 def test_anything_more_is_left_to_cycles(tmp_path, kind):
-    from ltsh_addon.blender.materials.bsdf_lobes import lobe_of
-    from ltsh_addon.blender.materials.material_maps import MaterialPlan
-    from ltsh_addon.blender.materials.plain_textures import SavedImages
+    from ltsh_addon.blender.materials.bsdfs import lobe_of
+    from ltsh_addon.blender.materials.maps import MaterialPlan
+    from ltsh_addon.blender.materials.values import SavedImages
 
     altered(kind, tmp_path)
     material = bpy.data.materials["More"]

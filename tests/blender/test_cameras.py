@@ -8,10 +8,11 @@ import pytest
 import scene_parts
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.pixels import cameras
-from ltsh_addon.blender.pixels.render_settings import enable_passes, render_exr
-from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
-from ltsh_addon.comparison.compare import Options, shade_scene
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.render_settings import enable_passes, render_exr
+from ltsh_addon.pipeline.picture import Options, shade_scene
 
 
 def room(width=26, height=15):
@@ -161,7 +162,7 @@ def test_shifted_rays_are_the_pixels_of_a_finer_picture(tmp_path, fit, kind, asp
     set_all(scene.render, pixel_aspect_x=aspect[0], pixel_aspect_y=aspect[1])
     moved = {}
     for i, j in ((0, 2), (3, 4)):
-        with cameras.shifted_pixels(scene, np.array([i - 2, 2 - j]) / 5.0):
+        with render_settings.shifted_pixels(scene, np.array([i - 2, 2 - j]) / 5.0):
             moved[i, j] = plain_positions(tmp_path, scene)
     scene.render.resolution_percentage = 500
     fine = plain_positions(tmp_path, scene)

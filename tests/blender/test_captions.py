@@ -3,8 +3,8 @@
 import bpy  # noqa: F401  brings blf and gpu
 import pytest
 
-from ltsh_addon.blender.interface.drawing import INK, PLATE
-from ltsh_addon.blender.viewport import view_text
+from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.ui.drawing import INK, PLATE
 
 # WCAG 2.2, success criterion 1.4.3, https://www.w3.org/TR/WCAG22/#contrast-minimum
 LEAST_CONTRAST = 4.5
@@ -20,7 +20,7 @@ def luminance(color):
 
 
 @pytest.mark.parametrize("picture", [0.0, 0.2, 1.0])
-@pytest.mark.parametrize("color", [INK, view_text.CAPTION_COLOR, view_text.BRIGHTER_COLOR, view_text.DARKER_COLOR])
+@pytest.mark.parametrize("color", [INK, view.CAPTION_COLOR, view.BRIGHTER_COLOR, view.DARKER_COLOR])
 def test_captions_stand_out_from_their_plates_on_dark_and_white_pictures(picture, color):
     behind = PLATE[3] * luminance(PLATE) + (1.0 - PLATE[3]) * picture
     assert (luminance(color) + 0.05) / (behind + 0.05) > LEAST_CONTRAST

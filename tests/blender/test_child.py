@@ -15,8 +15,8 @@ import programs
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.processes.blender_process import child_command
-from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
+from ltsh_addon.blender.process.blender_process import SceneError, child_command
+from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -164,7 +164,7 @@ def test_cancelling_ends_the_child(tmp_path, temporary_root):
 def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary_root):
     path = saved_scene(tmp_path / "scene.blend")
     code = (
-        "import sys\nfrom ltsh_addon.blender.processes.child import *\n"
+        "import sys\nfrom ltsh_addon.blender.process.client import *\n"
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )
@@ -190,7 +190,7 @@ def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary
 def test_a_killed_parent_takes_its_child_along(tmp_path):
     path = saved_scene(tmp_path / "scene.blend")
     code = (
-        "from ltsh_addon.blender.processes.child import *\n"
+        "from ltsh_addon.blender.process.client import *\n"
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )

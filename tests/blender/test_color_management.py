@@ -11,10 +11,10 @@ import pytest
 import scene_parts
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.pixels import color_management
-from ltsh_addon.blender.processes.child import ExtractOptions, extract
-from ltsh_addon.comparison.compare import Options, compare_scene
-from ltsh_addon.imaging.color_space import CHROMATICITIES, identified
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.imaging.color import CHROMATICITIES, identified
+from ltsh_addon.pipeline.picture import Options, compare_scene
 
 CHOOSES_SPACES = bpy.app.version >= (5, 0, 0)
 SPACES = ("Linear Rec.709", "Linear Rec.2020", "ACEScg") if CHOOSES_SPACES else ("Linear Rec.709",)
@@ -35,7 +35,7 @@ def colored_room(space, *, surface=(0.7, 0.7, 0.7), **light):
 @pytest.mark.parametrize("space", SPACES)
 def test_the_space_is_named_and_its_matrix_is_blenders(space):
     colored_room(space)
-    found = color_management.working_space()
+    found = render_settings.working_space()
     named = identified(found["to_rec709"], found["name"])
     assert named.name == space and found["name"] in (space, "")
     for color in ((0.2, 0.7, 0.1), (1.0, 0.0, 0.0)):

@@ -5,7 +5,8 @@ import numpy as np
 import scene_parts
 from scene_parts import add_plane, add_sphere, principled
 
-from ltsh_addon.blender.pixels import cycles_reference, gbuffer
+from ltsh_addon.blender.extract import pixels
+from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.shading import shade
 
@@ -68,7 +69,7 @@ def test_halves_differ_and_agree(tmp_path):
 def test_chunks_add_up_to_one_render(tmp_path, monkeypatch):
     prepared = room()
     chunked = scene_parts.reference(tmp_path, prepared, 128)
-    monkeypatch.setattr(cycles_reference, "FIRST_CHUNK", 64)
+    monkeypatch.setattr(pixels, "FIRST_CHUNK", 64)
     whole = scene_parts.reference(tmp_path, prepared, 128)
     for lobe in whole:
         # The same samples, added in another order.

@@ -8,9 +8,10 @@ import bpy
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.demo import demo_objects, demo_scene
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.processes.blend_saving import check_whole
+from ltsh_addon.blender import demo as demo_module
+from ltsh_addon.blender import demo_meshes
+from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.saving import check_whole
 
 ROOT = Path(__file__).resolve().parents[2]
 SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
@@ -19,7 +20,7 @@ SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
 @pytest.fixture(scope="module")
 def demo_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("demo") / "demo.blend"
-    child.build_demo(path)
+    client.build_demo(path)
     return path
 
 
@@ -34,7 +35,7 @@ def test_a_file_that_was_cut_while_it_was_saved_is_refused(demo_file, tmp_path, 
     check_whole(demo_file)
     content, cut = demo_file.read_bytes(), tmp_path / "cut.blend"
     cut.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(child.SceneError, match="is the disk full"):
+    with pytest.raises(blender_process.SceneError, match="is the disk full"):
         check_whole(cut)
 
 
@@ -153,8 +154,8 @@ def test_nothing_lies_outside_the_file(demo):
 def test_images_show_what_was_computed(demo):
     """Row 0 of Blender's images is the bottom row; 8 bits per channel round by at most half a step."""
     for name, computed in (
-        ("screen", demo_scene.demo_textures.screen_picture()),
-        ("floor roughness", demo_scene.demo_textures.floor_textures()[0][..., None]),
+        ("screen", demo_meshes.screen_picture()),
+        ("floor roughness", demo_meshes.floor_textures()[0][..., None]),
     ):
         assert np.abs(pixels(bpy.data.images[name]) - np.clip(computed, 0.0, 1.0)).max() < 0.51 / 255.0
 
@@ -204,7 +205,7 @@ def scene_arrays():
 
 def test_two_builds_are_equal(demo, tmp_path):
     first = scene_arrays()
-    demo_scene.build(tmp_path / "again.blend")
+    demo_module.build(tmp_path / "again.blend")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "again.blend"), load_ui=False, use_scripts=False)
     second = scene_arrays()
     assert first.keys() == second.keys() and len(first) > 100
@@ -213,7 +214,7 @@ def test_two_builds_are_equal(demo, tmp_path):
 
 def test_shapes_are_closed_enough_to_shade(demo):
     """Every vertex is finite, every face has an area: degenerate faces would have no normal."""
-    for part in demo_objects.everything():
+    for part in demo_module.everything():
         assert np.isfinite(part.shape.vertices).all(), part.name
     for mesh in bpy.data.meshes:
         areas = np.empty(len(mesh.polygons))
@@ -224,6 +225,6 @@ def test_shapes_are_closed_enough_to_shade(demo):
 def test_a_build_that_cannot_be_saved_leaves_the_old_file(tmp_path):
     folder = tmp_path / "demo.blend"
     folder.mkdir()
-    with pytest.raises((OSError, child.SceneError)):
-        child.build_demo(folder)
+    with pytest.raises((OSError, blender_process.SceneError)):
+        client.build_demo(folder)
     assert [path.name for path in tmp_path.iterdir()] == ["demo.blend"]

@@ -7,11 +7,13 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import shading
-from ltsh_addon.blender.engine import engine_final, engine_panels, engine_snapshot, engine_view
-from ltsh_addon.blender.lights.shown_textures import ShownTextures
-from ltsh_addon.blender.materials import look_reader
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.viewport.view_lights import view_lights
+from ltsh_addon.blender.engine import render as render_module
+from ltsh_addon.blender.engine import settings as settings_module
+from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.lights.textures import ShownTextures
+from ltsh_addon.blender.materials import looks
+from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.scene import Border
 
@@ -57,7 +59,7 @@ def handlers_of_package():
 
 def test_unregister_leaves_nothing_behind():
     parts.empty_scene()
-    before = set(dir(bpy.types)), {panel: set(panel.COMPAT_ENGINES) for panel in engine_panels.shared_panels()}
+    before = set(dir(bpy.types)), {panel: set(panel.COMPAT_ENGINES) for panel in settings_module.shared_panels()}
     bpy.context.scene.render.engine = "CYCLES"
     ltsh_addon.register()
     assert hasattr(bpy.types, "LTSH_PT_view") and handlers_of_package()
@@ -65,7 +67,7 @@ def test_unregister_leaves_nothing_behind():
     assert bpy.ops.ltsh.preview() == {"FINISHED"} and bpy.context.scene.render.engine == "LTSH"
     ltsh_addon.unregister()
     assert set(dir(bpy.types)) == before[0]
-    assert {panel: set(panel.COMPAT_ENGINES) for panel in engine_panels.shared_panels()} == before[1]
+    assert {panel: set(panel.COMPAT_ENGINES) for panel in settings_module.shared_panels()} == before[1]
     assert not handlers_of_package() and not hasattr(bpy.types.Scene, "ltsh_view")
     assert bpy.context.scene.render.engine == "CYCLES"
 
@@ -90,7 +92,7 @@ def test_final_render_is_the_picture_that_shade_makes(addon, tmp_path):
     channels = render(addon, tmp_path / "final.exr")
     copy = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
-    extraction = child.extract(child.ExtractOptions(scene=copy))
+    extraction = client.extract(client.ExtractOptions(scene=copy))
     for prefix, technique in (("LTSH", "ltsh2"), ("LTC", "ltc"), ("LTSH 4", "ltsh4")):
         for name in shading.PASSES:
             shaded = shading.shade(extraction.samples, extraction.lights, technique, passes=(name,))
@@ -157,14 +159,14 @@ def test_a_scene_without_lights_fails_with_its_reason(addon, tmp_path):
     addon.render.engine = "LTSH"
     with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
         render(addon, tmp_path / "dark.exr")
-    assert not engine_snapshot._current
+    assert not render_module._current
 
 
 def test_only_the_render_region_is_handed_to_blender():
     image = np.arange(60.0).reshape(6, 10, 1)
     border = Border(left=2, top=1, width=5, height=3, full_width=10, full_height=6)
-    np.testing.assert_array_equal(engine_final.inside_border(image, border), image[1:4, 2:7])
-    flat = engine_final.blender_pixels(image)
+    np.testing.assert_array_equal(render_module.inside_border(image, border), image[1:4, 2:7])
+    flat = render_module.blender_pixels(image)
     # Blender's rows start at the bottom.
     np.testing.assert_array_equal(flat.reshape(6, 10)[0], image[5, :, 0])
 
@@ -186,8 +188,8 @@ def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(without_cy
         depsgraph = bpy.context.evaluated_depsgraph_get()
         lights, notes = view_lights(depsgraph, lambda instance: True, ShownTextures())
         assert len(lights) == 1 and not notes
-        assert look_reader.look_of(plane.active_material).corrected
-        assert engine_view._shown(without_cycles, "single", None, 1.0).exposure == 1.0
+        assert looks.look_of(plane.active_material).corrected
+        assert view._shown(without_cycles, "single", None, 1.0).exposure == 1.0
         channels = render(without_cycles, tmp_path / "final.exr")
         assert picture(channels, "ViewLayer", "LTSH Specular").max() > 0.01
     finally:

@@ -12,9 +12,9 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import shading
-from ltsh_addon.blender.engine import engine_final, engine_snapshot, render_engine
-from ltsh_addon.blender.engine.stoppable import stoppable
-from ltsh_addon.blender.processes import child
+from ltsh_addon.blender.engine import render as render_module
+from ltsh_addon.blender.engine.render import stoppable
+from ltsh_addon.blender.process import client
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.scene import Cancelled
 
@@ -46,7 +46,7 @@ def colors(path):
 
 def shaded(path, passes=shading.PASSES, **options):
     """What shading the samples of a .blend gives, (H, W, 3)."""
-    extraction = child.extract(child.ExtractOptions(scene=path, **options))
+    extraction = client.extract(client.ExtractOptions(scene=path, **options))
     result = shading.shade(extraction.samples, extraction.lights, "ltsh2", passes=passes)
     return extraction.exposure * extraction.film.image(result.combined)
 
@@ -129,11 +129,11 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
         asked.append(stage)
         return False
 
-    monkeypatch.setattr(render_engine.LTSH_RenderEngine, "_progress", lambda self: stop)
-    monkeypatch.setattr(render_engine.LTSH_RenderEngine, "_fail", lambda self, error: failures.append(error))
+    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_progress", lambda self: stop)
+    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_fail", lambda self, error: failures.append(error))
     bpy.ops.render.render()
     assert asked and not failures
-    assert not engine_snapshot._current
+    assert not render_module._current
     # The work ends, and with it its temporary folders, after the render.
     end = time.monotonic() + 60
     while leftovers(tmp_path) and time.monotonic() < end:
@@ -143,13 +143,13 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
 
 def test_progress_grows_to_the_end_and_can_stop(scene, tmp_path):
     path, stages = saved(tmp_path), []
-    job = engine_final.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", ("ltc", "ltsh4"))
-    engine_final.final_picture(job, path, lambda stage, fraction: stages.append((fraction, stage)))
+    job = render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", ("ltc", "ltsh4"))
+    render_module.final_picture(job, path, lambda stage, fraction: stages.append((fraction, stage)))
     fractions = [fraction for fraction, _ in stages]
     assert fractions == sorted(fractions) and fractions[0] >= 0.0 and 0.9 < fractions[-1] <= 1.0
     assert {"LTC", "LTSH 2", "LTSH 4"} <= {stage for _, stage in stages}
     with pytest.raises(Cancelled):
-        engine_final.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
+        render_module.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
 
 
 def test_work_that_never_asks_is_left_at_once():
@@ -180,7 +180,7 @@ def test_an_unexpected_error_fails_the_render(scene, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("made for this test")
 
-    monkeypatch.setattr(render_engine, "final_picture", broken)
+    monkeypatch.setattr(render_module, "final_picture", broken)
     with pytest.raises(RuntimeError, match="LTSH: ZeroDivisionError: made for this test"):
         bpy.ops.render.render()
     monkeypatch.undo()

@@ -8,8 +8,8 @@ import gpu
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport import horizon_pass, lighting, picture_pass, surface_pass, surface_uniforms
-from ltsh_addon.blender.viewport.lighting_source import Features
+from ltsh_addon.blender.viewport import lighting, renderer, surfaces, textures
+from ltsh_addon.blender.viewport.shaders import Features
 
 # Vulkan asks for 128 bytes of push constants and 16384 of a uniform buffer, Metal has 16 samplers per stage, and all
 # can draw into 8 textures; Blender's OpenGL path has 31 locations of attributes and varyings.
@@ -47,7 +47,7 @@ def recorded(monkeypatch):
     monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", create)
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
-    for module in (picture_pass, horizon_pass):
+    for module in (renderer, lighting):
         monkeypatch.setattr(module, "batch_for_shader", lambda *arguments: None)
 
     def run(function):
@@ -83,10 +83,10 @@ def test_the_lighting_pass_keeps_to_the_limits(technique, recorded):
 
 
 def test_surfaces_and_pictures_keep_to_the_limits(recorded):
-    for outputs in (surface_pass.SURFACES, surface_pass.NORMALS, surface_pass.EMISSION):
-        [info] = recorded(lambda outputs=outputs: surface_pass._shader(outputs))
+    for outputs in (surfaces.SURFACES, surfaces.NORMALS, surfaces.EMISSION):
+        [info] = recorded(lambda outputs=outputs: surfaces._shader(outputs))
         check(info)
-    for info in (*recorded(picture_pass.PicturePass), *recorded(horizon_pass.HorizonPass)):
+    for info in (*recorded(renderer.PicturePass), *recorded(lighting.HorizonPass)):
         check(info)
     # All values are vec4 or matrices of them, which std140 lays out as arrays of floats are in Python.
-    assert 16 * surface_uniforms.LOOK_SIZE <= BLOCK_BYTES
+    assert 16 * textures.LOOK_SIZE <= BLOCK_BYTES

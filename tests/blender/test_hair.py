@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.comparison.compare import Options, compare_scene
+from ltsh_addon.pipeline.picture import Options, compare_scene
 
 
 def add_curves(material):

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.pixels import extraction
-from ltsh_addon.blender.processes import blend_header, blender_process
-from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.process.blender_process import SceneError
 
 # `make soak` takes 10,000.
 MANY = int(os.environ.get("LTSH_MANY_LIGHTS", "500"))
@@ -143,14 +143,14 @@ def test_a_newer_file_is_refused_also_where_its_header_cannot_be_read_before(tmp
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=False)
     data = path.read_bytes()
-    version = blend_header.saved_with(path)
+    version = client.saved_with(path)
     digits = b"0999" if data[7:9].isdigit() else b"999"
     end = 17 if data[7:9].isdigit() else 12
     path.write_bytes(data[: end - len(digits)] + digits + data[end:])
-    assert version == bpy.app.version[:2] and blend_header.saved_with(path) == (9, 99)
+    assert version == bpy.app.version[:2] and client.saved_with(path) == (9, 99)
     expected = f"scene.blend: was saved by Blender 9.99, but this is Blender {version[0]}.{version[1]}, "
     with pytest.raises(SceneError, match=expected):
-        extraction.open_scene(path, [])
+        pixels.open_scene(path, [])
 
 
 def test_many_lights_add_up(run, tmp_path):

@@ -6,8 +6,8 @@ import pytest
 import scene_parts
 
 from ltsh_addon import cli
-from ltsh_addon.blender.processes import child
-from ltsh_addon.comparison.compare import Options, compare_scene, shade_scene
+from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.pipeline.picture import Options, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
 
@@ -87,8 +87,8 @@ OPERATIONS = {
     "cancelled while it shades": (lambda path: compare_scene(options(path), stop_at("LTC")), Cancelled),
     "cancelled before it writes": (lambda path: compare_scene(options(path), stop_at("write")), Cancelled),
     "an exception in the middle": (lambda path: compare_scene(options(path), fail_at("Cycles A")), RuntimeError),
-    "an unknown camera": (lambda path: shade_scene(options(path, camera="Nobody")), child.SceneError),
-    "building the example": (lambda path: child.build_demo(path.with_name("demo.blend")), None),
+    "an unknown camera": (lambda path: shade_scene(options(path, camera="Nobody")), blender_process.SceneError),
+    "building the example": (lambda path: client.build_demo(path.with_name("demo.blend")), None),
 }
 
 
@@ -122,7 +122,7 @@ def test_unsaved_changes_stay_in_the_session_and_out_of_the_result(tmp_path):
 def test_a_scene_without_light_stays_as_it_is(tmp_path):
     path = rich_file(tmp_path, light=False)
     before = datablock_hash.session_state()
-    with pytest.raises(child.SceneError, match="no area light"):
+    with pytest.raises(blender_process.SceneError, match="no area light"):
         shade_scene(options(path))
     check_same(before, datablock_hash.session_state())
 

@@ -11,14 +11,15 @@ import pytest
 from job_window import SECONDS, Hand, add_on_in_room, ended, image_pixels
 from kills import is_running
 
-from ltsh_addon.blender.interface import job_arguments, operators, results
+from ltsh_addon.blender.ui import job as job_module
+from ltsh_addon.blender.ui import operators, results
 
 ROOT = Path(__file__).resolve().parents[2]
 # Runs a job until its first stage, and waits to be killed or cancels it and ends.
 OWNER = """
 import json, threading, time
-from ltsh_addon.blender.interface.job import Job, new_folder
-from ltsh_addon.blender.interface.job_plan import Plan, Step
+from ltsh_addon.blender.ui.job import Job, new_folder
+from ltsh_addon.blender.ui.job import Plan, Step
 job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
 job.start(json.loads({runs!r}), background=False)
 while not job.finished and job.stage == "Starting":
@@ -59,7 +60,7 @@ def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
     assert hand.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
     assert operators.running_job() is None and ended(job)
     result = results.result_of(never_ends)
-    assert result.partial == job_arguments.NO_CYCLES
+    assert result.partial == job_module.NO_CYCLES
     assert image_pixels("LTSH ltsh4.combined").max() > 0.0
     # The choice is there again when Cycles is.
     assert never_ends.ltsh.second == "cycles"
@@ -116,7 +117,7 @@ def test_opening_another_file_ends_the_job(never_ends, tmp_path):
 @pytest.mark.parametrize("end", ["killed", "quit"])
 def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends, tmp_path, end):
     """The job belongs to another process here, which stands for that Blender."""
-    runs = job_arguments.runs(bpy.context, "compare", tmp_path / "room.blend")
+    runs = job_module.runs(bpy.context, "compare", tmp_path / "room.blend")
     command = programs.python(OWNER.format(runs=json.dumps(runs), end=end))
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
         line = next(line for line in owner.stdout if line.startswith("OWNER "))

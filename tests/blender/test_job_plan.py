@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ltsh_addon.blender.interface.job_plan import MOST, PRIOR_SECONDS, Plan, Step
+from ltsh_addon.blender.ui.job import MOST, PRIOR_SECONDS, Plan, Step
 
 STAGES = ("open", "samples", "A", "B", "images")
 

@@ -12,12 +12,12 @@ import programs
 import pytest
 import scene_parts
 
-from ltsh_addon.baking.bake import BakeOptions
-from ltsh_addon.blender.processes import blender_process, child, scene_facts
-from ltsh_addon.comparison.compare import Options, make_picture
-from ltsh_addon.jobs import batch
-from ltsh_addon.jobs.merge import merge
-from ltsh_addon.jobs.tasks import Job, tasks_of
+from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.pipeline import batch
+from ltsh_addon.pipeline.bake import BakeOptions
+from ltsh_addon.pipeline.batch import merge
+from ltsh_addon.pipeline.picture import Options, make_picture
+from ltsh_addon.pipeline.tasks import Job, tasks_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -111,12 +111,12 @@ def test_a_killed_blender_is_one_failed_task(room, tmp_path):
 
 
 def test_facts_are_those_of_the_frame_and_of_the_file(room):
-    facts = scene_facts.ask(room, (1, None), "all")
+    facts = client.scene_facts(room, (1, None), "all")
     assert [(fact["frame"], fact["camera"]) for fact in facts] == [(1, "Camera"), (3, "Camera")]
     assert all(sorted(fact["objects"]) == ["Bare", "Floor", "Slab"] for fact in facts)
-    assert scene_facts.ask(room, (None,), None)[0]["objects"] == []
-    with pytest.raises(child.SceneError, match="object 'Roof' is not in scene"):
-        scene_facts.ask(room, (None,), ("Roof",))
+    assert client.scene_facts(room, (None,), None)[0]["objects"] == []
+    with pytest.raises(blender_process.SceneError, match="object 'Roof' is not in scene"):
+        client.scene_facts(room, (None,), ("Roof",))
 
 
 def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path):
@@ -223,7 +223,7 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path):
 
 def test_json_is_alone_on_stdout_whatever_blender_prints():
     code = (
-        "import os, sys\nfrom ltsh_addon.blender.processes import standard_output\n"
+        "import os, sys\nfrom ltsh_addon.blender import registration as standard_output\n"
         "print('before', flush=True)\nstandard_output.reserve()\n"
         "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
     )

@@ -6,7 +6,7 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, into_collection, start
 
-from ltsh_addon.blender.pixels import gbuffer
+from ltsh_addon.cycles import lobes
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.shading import shade
 
@@ -26,7 +26,7 @@ def combined_by_group(folder, prepared, samples):
             name = f"Combined_{group}" if group else "Combined"
             # Chunks hold 16 samples first and the rest after: weighted as `render_reference` says.
             weights = np.array([16.0] + [(samples / 2.0 - 16.0) / (len(chunks) - 1)] * (len(chunks) - 1))
-            images = [gbuffer.read_layer(chunk, name, "RGB").reshape(-1, 3).astype(np.float64) for chunk in chunks]
+            images = [lobes.read_layer(chunk, name, "RGB").reshape(-1, 3).astype(np.float64) for chunk in chunks]
             halves.setdefault(group, []).append(np.average(images, axis=0, weights=weights))
     return {group: np.array(images) for group, images in halves.items()}
 

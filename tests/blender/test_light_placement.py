@@ -8,7 +8,8 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, assert_agrees, into_collection, start
 
-from ltsh_addon.blender.processes.child import ExtractOptions, SceneError, extract
+from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.blender.process.client import ExtractOptions, extract
 
 
 def names_of_lights():

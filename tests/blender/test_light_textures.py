@@ -8,7 +8,7 @@ import pytest
 import scene_parts
 from lit_plane import add_image, add_instancer, assert_agrees, into_collection, light_tree, start
 
-from ltsh_addon.blender.lights import light_textures
+from ltsh_addon.blender.lights import textures
 
 PLACEMENTS = {
     "rectangle": {},
@@ -100,7 +100,7 @@ def test_a_light_without_emission_is_none(tmp_path):
 
 
 def test_instances_have_their_own_look_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(light_textures, "MOST_LOOKS", 2)
+    monkeypatch.setattr(textures, "MOST_LOOKS", 2)
     start()
     collection = into_collection("Lamps", add_picture_light())
     for x in (-0.8, 0.0, 0.9):

@@ -9,8 +9,8 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.blender.pixels import extraction
-from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 LAMBERT = "ShaderNodeBsdfDiffuse"
@@ -178,11 +178,11 @@ def test_light_records_survive_json():
         corners=corners,
         receivers=(0, 3),
     )
-    found = AreaLight(**json.loads(json.dumps(extraction.light_record(light))))
+    found = AreaLight(**json.loads(json.dumps(pixels.light_record(light))))
     for name, value in vars(light).items():
         assert np.array_equal(getattr(found, name), value) and type(getattr(found, name)) is type(value), name
     plain = AreaLight("L", "DISK", **placed, radiance=[1.0, 1.0, 1.0], spread=1.0 / 7.0)
-    found = AreaLight(**json.loads(json.dumps(extraction.light_record(plain))))
+    found = AreaLight(**json.loads(json.dumps(pixels.light_record(plain))))
     assert found.corners is None and found.receivers is None and found.spread == 1.0 / 7.0
 
 

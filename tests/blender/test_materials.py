@@ -7,9 +7,10 @@ import quadrature
 import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
-from ltsh_addon.blender.materials.bsdf_lobes import note_unsupported
-from ltsh_addon.blender.materials.material_outputs import MaterialReport, inject_aovs
-from ltsh_addon.blender.pixels import gbuffer, render_settings
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.materials.aovs import MaterialReport, inject_aovs
+from ltsh_addon.blender.materials.bsdfs import note_unsupported
+from ltsh_addon.cycles import horizons, lobes
 
 # Texture coordinates and colors pass through float32 a few times.
 EXACT = 2e-6
@@ -82,7 +83,7 @@ def test_a_normal_map_turns_the_normal(tmp_path, plane_scene):
     material.node_tree.links.new(normal_map.outputs[0], node.inputs["Normal"])
     surface, _ = plane_scene(tmp_path, material)
     # The plane's tangent is x and its bitangent y.
-    expected = gbuffer.unit(2.0 * np.array([[0.65, 0.4, 0.95]]) - 1.0)
+    expected = horizons.unit(2.0 * np.array([[0.65, 0.4, 0.95]]) - 1.0)
     assert np.abs(surface.normal - expected).max() < 1e-5
     assert np.array_equal(surface.normal, surface.diffuse_normal)
 
@@ -157,8 +158,8 @@ def test_without_material_the_surface_is_cycles_default(tmp_path, plane_scene, s
     render_settings.render_exr(scene, tmp_path / "untouched.exr")
     untouched = scene_parts.read_channels(tmp_path / "untouched.exr")
     names = render_settings.pass_names()
-    expected = gbuffer.read_layer(untouched, names["diffuse_color"], "RGB").reshape(-1, 3)
-    glossy = gbuffer.read_layer(untouched, names["specular_color"], "RGB").any()
+    expected = lobes.read_layer(untouched, names["diffuse_color"], "RGB").reshape(-1, 3)
+    glossy = lobes.read_layer(untouched, names["specular_color"], "RGB").any()
     surface, _ = plane_scene(tmp_path)
     assert np.abs(surface.diffuse_albedo - expected).max() < EXACT and expected.min() > 0.5
     # Multiple scattering adds less than a percent to a dielectric.

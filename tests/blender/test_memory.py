@@ -11,8 +11,8 @@ import pytest
 import scene_parts
 
 from ltsh_addon import cli
-from ltsh_addon.blender.processes import memory
-from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.blender.process import memory
+from ltsh_addon.blender.process.blender_process import SceneError
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -12,7 +12,7 @@ from lit_plane import (
     start,
 )
 
-from ltsh_addon.blender.lights import mesh_light_faces
+from ltsh_addon.blender.lights import meshes
 
 # A ball of 6 segments and 3 rings.
 FACES_OF_THE_BALL = 18
@@ -94,7 +94,7 @@ def test_a_textured_screen_becomes_patches(tmp_path):
 
 
 def test_a_texture_over_many_faces_is_shaded_as_its_mean(monkeypatch):
-    monkeypatch.setattr(mesh_light_faces, "MOST_LOOKS", 8)
+    monkeypatch.setattr(meshes, "MOST_LOOKS", 8)
     start()
     material, node = lamp_material()
     tree = material.node_tree

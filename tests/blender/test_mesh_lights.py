@@ -17,9 +17,9 @@ from lit_plane import (
     start,
 )
 
-from ltsh_addon.blender.lights import mesh_light_faces
-from ltsh_addon.blender.pixels import cycles_reference
-from ltsh_addon.blender.processes.child import SceneError
+from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.lights import meshes
+from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.shading import shade
 
 L_SHAPE = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (0.3, 0.3, 0), (0.3, 1, 0), (0, 1, 0)]
@@ -107,7 +107,7 @@ def test_shading_agrees_with_cycles_on_a_mesh_light(tmp_path):
 
 
 def test_too_many_faces_are_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(mesh_light_faces, "MOST_POLYGONS", 10)
+    monkeypatch.setattr(meshes, "MOST_POLYGONS", 10)
     start()
     scene_parts.add_area_light("Key")
     add_lamp_ball()
@@ -235,6 +235,6 @@ def test_the_camera_sees_lamps_as_before(tmp_path):
     ball.location = (0.0, 0.0, 0.5)
     prepared = scene_parts.prepare()
     before = scene_parts.sample(tmp_path, prepared)[0][0][0]
-    cycles_reference.remove_occlusion(prepared[0])
+    pixels.remove_occlusion(prepared[0])
     after = scene_parts.sample(tmp_path, prepared)[0][0][0]
     assert np.array_equal(before.position, after.position)

@@ -8,10 +8,9 @@ import pytest
 from job_window import Hand, add_on_in_room, image_pixels
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.interface import job_arguments, job_stages, operators, results
-from ltsh_addon.blender.interface.job import Job
-from ltsh_addon.blender.interface.job_plan import Plan
-from ltsh_addon.blender.processes import blender_process
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.blender.ui import job, operators, results
+from ltsh_addon.blender.ui.job import Job, Plan
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def reported(monkeypatch):
 
 
 def planned(command):
-    return [step.stage for step in job_stages.steps(bpy.context, command)]
+    return [step.stage for step in job.steps(bpy.context, command)]
 
 
 def command_line(*arguments):
@@ -45,7 +44,7 @@ def command_line(*arguments):
 
 def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, reported):
     assert bpy.ops.ltsh.compare() == {"FINISHED"}
-    assert [job_stages.STARTING, *reported] == planned("compare")
+    assert [job.STARTING, *reported] == planned("compare")
     command_line("compare", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltc,ltsh4",
                  "--cycles-samples", "4")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "compare.exr")
@@ -64,7 +63,7 @@ def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, report
 def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, reported):
     scene.ltsh.techniques, scene.ltsh.anti_aliasing, scene.ltsh.resolution_percentage = {"ltsh2"}, 2, 50
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
-    assert [job_stages.STARTING, *reported] == planned("shade")
+    assert [job.STARTING, *reported] == planned("shade")
     command_line("shade", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltsh2", "--aa", "2",
                  "--resolution", "12x8")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "shade.exr")["ltsh2.diffuse"]
@@ -75,7 +74,7 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
     reported.clear()
     assert bpy.ops.ltsh.bake() == {"FINISHED"}
     # Materials without textures need no maps.
-    assert [job_stages.STARTING, *reported] == [stage for stage in planned("bake") if stage != "bake Floor"]
+    assert [job.STARTING, *reported] == [stage for stage in planned("bake") if stage != "bake Floor"]
     command_line("bake", tmp_path / "room.blend", "-o", tmp_path / "out", "--object", "Floor", "--size", "256",
                  "--margin", "2", "--view", "above", "--passes", "specular", "--techniques", "ltsh2")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "Floor.exr")["ltsh2.specular"]
@@ -164,14 +163,14 @@ def test_the_scene_and_its_file_stay_as_they_were(scene, tmp_path):
 
 
 def test_a_file_that_was_never_saved_uses_the_folder_of_the_preferences(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("ltsh_addon.blender.interface.preferences.default_output_folder", lambda: tmp_path / "own")
+    monkeypatch.setattr("ltsh_addon.blender.ui.settings.default_output_folder", lambda: tmp_path / "own")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
     room_scene = Path(bpy.data.filepath)
-    assert job_arguments.output_folder(scene, "shade") == room_scene.parent / "ltsh" / "shade"
+    assert job.output_folder(scene, "shade") == room_scene.parent / "ltsh" / "shade"
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    assert job_arguments.output_folder(bpy.context.scene, "shade") == tmp_path / "own" / "untitled" / "shade"
+    assert job.output_folder(bpy.context.scene, "shade") == tmp_path / "own" / "untitled" / "shade"
     bpy.data.scenes.new("Second")
-    assert job_arguments.output_folder(bpy.data.scenes["Second"], "bake").parts[-3:] == ("untitled", "Second", "bake")
+    assert job.output_folder(bpy.data.scenes["Second"], "bake").parts[-3:] == ("untitled", "Second", "bake")
 
 
 def test_objects_that_cannot_be_baked_are_left_out(scene):
@@ -182,5 +181,5 @@ def test_objects_that_cannot_be_baked_are_left_out(scene):
     other.data.uv_layers.remove(other.data.uv_layers[0])
     for ob in (floor, other):
         ob.select_set(True)
-    arguments = job_arguments.bake_arguments(bpy.context, Path("room.blend"))
+    arguments = job.bake_arguments(bpy.context, Path("room.blend"))
     assert [item for item in arguments if item.startswith("--object")] == ["--object=Floor"]

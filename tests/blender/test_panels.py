@@ -9,11 +9,10 @@ import scene_parts as parts
 from recorded_layout import FUNCTIONS, Layout, buttons, drawn, texts
 
 import ltsh_addon
-from ltsh_addon.blender.interface import availability, image_panels, operators, panels, results, viewer
-from ltsh_addon.blender.interface.job import Job
-from ltsh_addon.blender.interface.job_plan import Plan, Step
-from ltsh_addon.comparison import display_layers
+from ltsh_addon.blender.ui import comparison, operators, panels, preflight, results
+from ltsh_addon.blender.ui.job import Job, Plan, Step
 from ltsh_addon.imaging.exr import write_channels
+from ltsh_addon.pipeline import display_layers
 
 MAIN_3D, MAIN_RENDER = panels.MAIN
 JOBS = ("ltsh.shade", "ltsh.compare")
@@ -182,9 +181,7 @@ def test_what_is_missing_is_said_and_the_buttons_are_gray(scene):
 
 
 def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
-    monkeypatch.setattr(
-        "ltsh_addon.blender.interface.preflight.missing_libraries", lambda: "OpenEXR cannot be imported (x)"
-    )
+    monkeypatch.setattr("ltsh_addon.blender.ui.preflight.missing_libraries", lambda: "OpenEXR cannot be imported (x)")
     bpy.data.objects["Plane"].select_set(True)
     shown = drawn(MAIN_3D)
     assert "OpenEXR cannot be imported" in texts(shown)
@@ -194,7 +191,7 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
     for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
         with pytest.raises(RuntimeError, match="OpenEXR cannot be imported"):
             operator()
-    assert availability.missing_libraries() is None
+    assert preflight.missing_libraries() is None
 
 
 def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
@@ -226,23 +223,23 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
 
 def test_numbers_are_those_of_the_report(scene, tmp_path):
     add_results(scene, tmp_path)
-    shown = drawn(image_panels.CLASSES[0])
+    shown = drawn(panels.CLASSES[0])
     for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
-    narrow = texts(drawn(image_panels.CLASSES[0], width=220)).replace("\u00a0", " ")
+    narrow = texts(drawn(panels.CLASSES[0], width=220)).replace("\u00a0", " ")
     assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
 
 
 def test_results_that_are_partial_say_so(scene, tmp_path):
     add_results(scene, tmp_path, "Not complete: without Cycles", ("ltc", "ltsh4"))
-    assert "Not complete: without Cycles" in texts(drawn(image_panels.CLASSES[0]))
+    assert "Not complete: without Cycles" in texts(drawn(panels.CLASSES[0]))
 
 
 def test_the_image_editor_offers_the_pictures_that_are_there(scene, tmp_path):
     add_results(scene, tmp_path, names=("ltsh4", "cycles"))
-    viewer.refresh(scene)
-    panel = image_panels.LTSH_PT_IMAGE_results
+    comparison.refresh(scene)
+    panel = panels.LTSH_PT_IMAGE_results
     scene.ltsh.mode = "WIPE"
     shown = [item.what for item in drawn(panel)]
     assert shown.count("first") == shown.count("second") == 2 and "split" in shown and "error_scale" not in shown

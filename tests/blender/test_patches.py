@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.lights.patches import (
+from ltsh_addon.cycles.patches import (
     CUTS,
     ERROR,
     GRID,

@@ -94,9 +94,9 @@ def test_a_read_only_disk_is_named_before_anything_starts(room, small_disk, caps
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_folder_that_vanishes_meanwhile(room, tmp_path, capsys, monkeypatch, kept):
     """It is made again where it may be, else named: something else has its name now."""
-    from ltsh_addon.blender.processes import child
+    from ltsh_addon.blender.process import client
 
-    extract, out = child.extract, tmp_path / "out"
+    extract, out = client.extract, tmp_path / "out"
 
     def vanishing(*arguments, **options):
         found = extract(*arguments, **options)
@@ -105,7 +105,7 @@ def test_a_folder_that_vanishes_meanwhile(room, tmp_path, capsys, monkeypatch, k
             out.write_text("mine")
         return found
 
-    monkeypatch.setattr(child, "extract", vanishing)
+    monkeypatch.setattr(client, "extract", vanishing)
     code = cli.main(["compare", str(room), "-o", str(out), "--quiet", "--techniques", "ltc"])
     said = capsys.readouterr().err
     if kept:

@@ -8,10 +8,10 @@ from film_scenes import SIZE, compared, diffuse, plain_diffuse, tiles
 from scene_parts import add_plane
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.pixels import pixel_filter
-from ltsh_addon.blender.pixels.render_settings import enable_passes, render_exr
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.processes.child import ExtractOptions, extract
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.render_settings import enable_passes, render_exr
 
 FILTERS = [("BOX", 4.0), ("GAUSSIAN", 1.0), ("BLACKMAN_HARRIS", 1.5), ("BLACKMAN_HARRIS", 3.0)]
 
@@ -19,31 +19,31 @@ FILTERS = [("BOX", 4.0), ("GAUSSIAN", 1.0), ("BLACKMAN_HARRIS", 1.5), ("BLACKMAN
 @pytest.mark.parametrize(("kind", "width"), FILTERS)
 def test_quantiles_invert_the_integral_of_the_density(kind, width):
     integrate = pytest.importorskip("scipy.integrate")
-    half = pixel_filter.filter_density(kind, width, 0.0)[1]
+    half = render_settings.filter_density(kind, width, 0.0)[1]
 
     def density(x):
-        return float(pixel_filter.filter_density(kind, width, x)[0])
+        return float(render_settings.filter_density(kind, width, x)[0])
 
     whole = integrate.quad(density, -half, half)[0]
     for share in (0.001, 0.2, 0.5, 0.77, 0.999):
-        x = float(pixel_filter.filter_quantiles(kind, width, share))
+        x = float(render_settings.filter_quantiles(kind, width, share))
         assert abs(integrate.quad(density, -half, x)[0] / whole - share) < 1e-6
 
 
 def test_points_are_centers_for_one_and_have_the_spread_of_the_filter():
-    assert np.array_equal(pixel_filter.filter_points("BLACKMAN_HARRIS", 1.5, 1), [[0.0, 0.0]])
+    assert np.array_equal(render_settings.filter_points("BLACKMAN_HARRIS", 1.5, 1), [[0.0, 0.0]])
     x = np.linspace(-3.0, 3.0, 6001)
     for kind, width in FILTERS:
-        weight = pixel_filter.filter_density(kind, width, x)[0]
+        weight = render_settings.filter_density(kind, width, x)[0]
         spread = np.sqrt((weight * x**2).sum() / weight.sum())
-        points = pixel_filter.filter_points(kind, width, 1024)
+        points = render_settings.filter_points(kind, width, 1024)
         assert np.abs(points.mean(axis=0)).max() < 0.01 * spread
         assert np.abs(points.std(axis=0) / spread - 1.0).max() < 0.01
 
 
 def test_an_unknown_filter_is_refused():
     with pytest.raises(ValueError, match="pixel filter is 'MITCHELL'"):
-        pixel_filter.filter_points("MITCHELL", 1.0, 4)
+        render_settings.filter_points("MITCHELL", 1.0, 4)
 
 
 def stripes(kind, width):
@@ -113,8 +113,8 @@ def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path)
 def test_the_filter_of_the_file_is_put_back(tmp_path):
     scene = tiles()
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 1.75
-    with pytest.raises(child.SceneError):
-        with pixel_filter.pinned_pixel_filter(scene):
+    with pytest.raises(blender_process.SceneError):
+        with render_settings.pinned_pixel_filter(scene):
             assert 0.0 < scene.cycles.filter_width < 1e-3
-            raise child.SceneError("stopped")
+            raise blender_process.SceneError("stopped")
     assert (scene.cycles.pixel_filter_type, scene.cycles.filter_width) == ("GAUSSIAN", 1.75)

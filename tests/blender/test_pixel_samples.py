@@ -9,8 +9,9 @@ import quadrature
 import scene_parts
 from scene_parts import add_bump, add_plane, add_sphere, bsdf_material, principled
 
-from ltsh_addon.blender.materials.specular_horizon import end_at_horizons_of_cycles
-from ltsh_addon.blender.pixels import gbuffer, pixel_filter
+from ltsh_addon.blender import render_settings
+from ltsh_addon.cycles import gbuffer, horizons, lobes
+from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.shading import shade
 
 
@@ -31,7 +32,7 @@ def test_one_sample_per_pixel_is_at_the_center(tmp_path):
 
 def test_sub_sample_offsets_cover_the_pixel_evenly():
     for count in (4, 16, 64):
-        offsets = pixel_filter.filter_points("BOX", 1.0, count)
+        offsets = render_settings.filter_points("BOX", 1.0, count)
         assert offsets.shape == (count, 2) and np.abs(offsets).max() <= 0.5
         # The share of the points in any quarter of the pixel is right up to a few points.
         for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
@@ -52,7 +53,7 @@ def test_the_same_point_of_every_pixel_is_sampled(tmp_path, size, pixel_aspect):
     renders, _ = scene_parts.sample(tmp_path, prepared, sub_samples=3)
     (center, _, _), *_ = scene_parts.sample(tmp_path, prepared)[0]
     unit = 6.0 / max(size[0] * pixel_aspect, size[1])
-    for (surface, _, _), offset in zip(renders, pixel_filter.sub_pixel_offsets(prepared[0], 3), strict=True):
+    for (surface, _, _), offset in zip(renders, render_settings.sub_pixel_offsets(prepared[0], 3), strict=True):
         moved = (surface.position - center.position)[:, :2] / (unit * np.array([pixel_aspect, 1.0]))
         assert np.abs(moved - offset).max() < 2e-3  # pixels; Cycles' center and its float32 camera
 
@@ -98,7 +99,7 @@ def test_specular_normals_are_those_cycles_shades_with(tmp_path, correction):
     add_plane(material)
     add_sphere(material, location=(0.0, 0.0, 0.8))
     ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, scene_parts.prepare(), extra_passes=("normal",))
-    cycles = gbuffer.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
+    cycles = lobes.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
     difference = np.abs(surface.normal - cycles).max(axis=-1)
     bent = np.abs(surface.diffuse_normal - cycles).max(axis=-1) > 1e-3
     assert np.count_nonzero(bent) > 500 if correction else not bent.any()
@@ -116,7 +117,7 @@ def test_smooth_normals_of_coarse_meshes_are_bent_as_well(tmp_path, correction):
     material.cycles.use_bump_map_correction = correction
     add_sphere(material, radius=1.0, location=(0.0, 0.0, 0.6), segments=10)
     ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, scene_parts.prepare(), extra_passes=("normal",))
-    cycles = gbuffer.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
+    cycles = lobes.read_layer(channels, "Normal", "XYZ").reshape(-1, 3)[pixel]
     bent = np.abs(surface.diffuse_normal - cycles).max(axis=-1) > 1e-2
     assert np.count_nonzero(bent) > 20 if correction else not bent.any()
     assert np.abs(surface.normal - cycles).max() < 1e-5
@@ -164,8 +165,8 @@ def test_bump_mapped_lobes_are_shadowed_as_in_cycles(tmp_path, shape):
         add_plane(material) if shape == "plane" else add_sphere(material, radius=1.3)
         prepared = scene_parts.prepare()
         ((surface, pixel, _),), (channels,) = scene_parts.sample(tmp_path, prepared)
-        smooth = gbuffer.read_aov(channels, "smooth_normal").reshape(-1, 3)[pixel].astype(np.float64)
-        alpha2 = gbuffer.bump_alpha2(surface.diffuse_normal, smooth)[:, None] if lobe == "diffuse" else 0.0
+        smooth = lobes.read_aov(channels, "smooth_normal").reshape(-1, 3)[pixel].astype(np.float64)
+        alpha2 = horizons.bump_alpha2(surface.diffuse_normal, smooth)[:, None] if lobe == "diffuse" else 0.0
 
         def shadowing(directions, smooth=smooth, alpha2=alpha2):
             cosine = np.einsum("psk,pk->ps", directions, smooth)
@@ -232,10 +233,10 @@ def test_an_object_without_faces_is_no_obstacle(tmp_path):
 def test_reflections_of_valid_normals_leave_the_surface():
     """Independent of Cycles: the mirrored view ends exactly at the threshold, and good normals stay."""
     generator = np.random.default_rng(7)
-    true_normal, view, normal = (gbuffer.unit(generator.normal(size=(4000, 3))) for _ in range(3))
+    true_normal, view, normal = (horizons.unit(generator.normal(size=(4000, 3))) for _ in range(3))
     facing = np.sum(view * true_normal, axis=-1) > 0.02
     true_normal, view, normal = true_normal[facing], view[facing], normal[facing]
-    valid = gbuffer.valid_specular_normal(normal, true_normal, view)
+    valid = horizons.valid_specular_normal(normal, true_normal, view)
     assert np.allclose(np.linalg.norm(valid, axis=-1), 1.0, atol=1e-12)
 
     def elevation(axis):
@@ -257,4 +258,4 @@ def test_bump_alpha_is_an_eighth_of_the_squared_tangent():
     up = np.tile([0.0, 0.0, 1.0], (5, 1))
     tilted = np.stack([np.sin(angle), np.zeros(5), np.cos(angle)], axis=-1)
     expected = [0.0, 1.0 / 24.0, 3.0 / 8.0, 1.0, 1.0]
-    assert np.allclose(gbuffer.bump_alpha2(tilted, up), expected, atol=1e-12)
+    assert np.allclose(horizons.bump_alpha2(tilted, up), expected, atol=1e-12)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ltsh_addon.blender.lights.planar_polygons import flat_polygons, hides_itself, is_closed, is_inside, signed_volume
+from ltsh_addon.cycles.planar_polygons import flat_polygons, hides_itself, is_closed, is_inside, signed_volume
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 CUBE_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

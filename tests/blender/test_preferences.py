@@ -10,17 +10,17 @@ import bpy
 import pytest
 
 import ltsh_addon
-from ltsh_addon.blender.interface import availability
-from ltsh_addon.blender.interface import preferences as module
-from ltsh_addon.blender.interface.preferences import CORES_VARIABLE, MEMORY_VARIABLE, Preferences, preferences
-from ltsh_addon.shading import workers
+from ltsh_addon.blender.ui import preflight, settings
+from ltsh_addon.blender.ui.settings import MEMORY_VARIABLE, Preferences, preferences
+from ltsh_addon.shading import parallel
+from ltsh_addon.shading.parallel import CORES_VARIABLE
 
 
 def context_with(**chosen):
     """A context as of a Blender in which the add-on is enabled and some preferences were changed."""
     stored = {"cores": 0, "memory_mib": 0, "output_folder": "", "log_level": "WARNING", **chosen}
     addon = SimpleNamespace(preferences=SimpleNamespace(**stored))
-    return SimpleNamespace(preferences=SimpleNamespace(addons={module.ADDON: addon}))
+    return SimpleNamespace(preferences=SimpleNamespace(addons={settings.ADDON: addon}))
 
 
 @pytest.fixture
@@ -33,14 +33,14 @@ def enabled(monkeypatch):
 
 
 def test_without_being_enabled_there_are_defaults():
-    assert module.ADDON not in bpy.context.preferences.addons
+    assert settings.ADDON not in bpy.context.preferences.addons
     found = preferences(bpy.context)
-    assert found == Preferences(0, 0, module.default_output_folder(), "WARNING")
+    assert found == Preferences(0, 0, settings.default_output_folder(), "WARNING")
     assert found.output_folder.is_absolute()
 
 
 def test_defaults_are_those_of_the_registered_properties(enabled):
-    properties = module.LTSH_AddonPreferences.bl_rna.properties
+    properties = settings.LTSH_AddonPreferences.bl_rna.properties
     stored = {name: properties[name].default for name in ("cores", "memory_mib", "output_folder", "log_level")}
     assert preferences(context_with(**stored)) == preferences(bpy.context)
     for name in stored:
@@ -55,8 +55,8 @@ def test_an_output_folder_beside_the_file_is_made_absolute(tmp_path):
 
 
 def test_the_folder_of_an_extension_is_the_one_that_updates_keep(monkeypatch):
-    monkeypatch.setattr(module, "ADDON", "bl_ext.user_default.ltsh")
-    parts = Path(module.default_output_folder()).parts
+    monkeypatch.setattr(settings, "ADDON", "bl_ext.user_default.ltsh")
+    parts = Path(settings.default_output_folder()).parts
     assert parts[-5:] == ("extensions", ".user", "user_default", "ltsh", "results")
 
 
@@ -65,11 +65,11 @@ def test_limits_reach_this_process_and_its_children_until_disabled(enabled, monk
         monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(8))
     else:
         monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert (workers.cores(), os.environ[MEMORY_VARIABLE]) == (8, "512")
-    module.apply(context_with(cores=3, memory_mib=1000))
-    assert (workers.cores(), os.environ[CORES_VARIABLE], os.environ[MEMORY_VARIABLE]) == (3, "3", "1000")
-    module.apply(context_with(cores=100))
-    assert workers.cores() == 8 and os.environ[MEMORY_VARIABLE] == "512"
+    assert (parallel.cores(), os.environ[MEMORY_VARIABLE]) == (8, "512")
+    settings.apply(context_with(cores=3, memory_mib=1000))
+    assert (parallel.cores(), os.environ[CORES_VARIABLE], os.environ[MEMORY_VARIABLE]) == (3, "3", "1000")
+    settings.apply(context_with(cores=100))
+    assert parallel.cores() == 8 and os.environ[MEMORY_VARIABLE] == "512"
     ltsh_addon.unregister()
     assert CORES_VARIABLE not in os.environ and os.environ[MEMORY_VARIABLE] == "512"
 
@@ -77,17 +77,17 @@ def test_limits_reach_this_process_and_its_children_until_disabled(enabled, monk
 @pytest.mark.parametrize("value", ["0", "", "-2", "many", "1e3"])
 def test_a_limit_of_cores_that_makes_no_sense_is_none(monkeypatch, value):
     monkeypatch.delenv(CORES_VARIABLE, raising=False)
-    unlimited = workers.cores()
+    unlimited = parallel.cores()
     monkeypatch.setenv(CORES_VARIABLE, value)
-    assert workers.cores() == unlimited >= 1
+    assert parallel.cores() == unlimited >= 1
 
 
 def test_the_log_level_decides_what_is_told(enabled, capsys):
-    logger = logging.getLogger("ltsh_addon.shading.workers")
+    logger = logging.getLogger("ltsh_addon.shading.parallel")
     (handler,) = logging.getLogger("ltsh_addon").handlers
     handler.setStream(sys.stderr)
     for level, told in (("WARNING", False), ("INFO", True), ("ERROR", False)):
-        module.apply(context_with(log_level=level))
+        settings.apply(context_with(log_level=level))
         logger.info("a block is done")
         assert ("LTSH INFO: a block is done" in capsys.readouterr().err) is told
     ltsh_addon.unregister()
@@ -99,23 +99,23 @@ def test_the_log_level_decides_what_is_told(enabled, capsys):
 
 @pytest.fixture
 def asked_anew():
-    availability.missing_libraries.cache_clear()
+    preflight.missing_libraries.cache_clear()
     yield
-    availability.missing_libraries.cache_clear()
+    preflight.missing_libraries.cache_clear()
 
 
 def test_nothing_is_missing_here(asked_anew):
-    assert availability.missing_libraries() is None
+    assert preflight.missing_libraries() is None
 
 
 def test_a_missing_library_is_named_with_what_to_do(asked_anew, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    message = availability.missing_libraries()
+    message = preflight.missing_libraries()
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     assert "\n" not in message and "OpenEXR" in message and version in message and "install" in message
     # A panel asks at every redraw: the answer stays until the add-on is enabled again.
     monkeypatch.undo()
-    assert availability.missing_libraries() == message
+    assert preflight.missing_libraries() == message
     ltsh_addon.register()
     ltsh_addon.unregister()
-    assert availability.missing_libraries() is None
+    assert preflight.missing_libraries() is None

@@ -7,7 +7,7 @@ import scene_parts as parts
 from job_window import room
 
 import ltsh_addon
-from ltsh_addon.blender.interface import preflight
+from ltsh_addon.blender.ui import preflight
 
 COMMANDS = ("shade", "compare", "bake")
 

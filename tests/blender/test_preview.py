@@ -4,7 +4,7 @@ import bpy
 import pytest
 
 import ltsh_addon
-from ltsh_addon.blender.engine import engine_preview
+from ltsh_addon.blender.ui import preview
 
 
 def test_files_saved_during_a_preview_keep_the_artists_engine(addon, tmp_path):
@@ -94,10 +94,10 @@ def test_an_engine_chosen_by_hand_is_not_taken_for_a_preview(addon, tmp_path):
 def test_another_engine_chosen_by_hand_ends_the_preview(addon):
     addon.render.engine = "BLENDER_WORKBENCH"
     bpy.ops.ltsh.preview()
-    engine_preview._engine_changed()
+    preview._engine_changed()
     assert addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
     addon.render.engine = "CYCLES"
     # Blender calls it between two events, of which there are none here.
-    engine_preview._engine_changed()
+    preview._engine_changed()
     addon.render.engine = "LTSH"
-    assert not engine_preview.is_previewing(addon)
+    assert not preview.is_previewing(addon)

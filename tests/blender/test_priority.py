@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.blender.processes import blender_process, priority
+from ltsh_addon.blender.process import blender_process
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "setpriority"), reason="Windows has classes of priority instead")
 ROOT = Path(__file__).resolve().parents[2]
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SCRIPT = f"""
 import os, subprocess, sys
 sys.path.insert(0, {str(ROOT)!r})
-from ltsh_addon.blender.processes import priority
+from ltsh_addon.blender.process import blender_process as priority
 priority.weigh_session()
 group = open("/proc/self/autogroup").read() if os.path.exists("/proc/self/autogroup") else ""
 print(os.nice(0), group.rpartition(" ")[2].strip(), os.getsid(0), flush=True)
@@ -32,17 +32,17 @@ def test_a_job_and_what_it_starts_come_after_this_process(tmp_path, background):
     output, _ = process.communicate(timeout=60)
     lines = [line.split(" ") for line in output.splitlines()]
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    niceness = min(own + priority.NICENESS, 19) if background else own
+    niceness = min(own + blender_process.NICENESS, 19) if background else own
     assert [int(line[0]) for line in lines] == [niceness, niceness], output
     assert len({line[2] for line in lines}) == 2, "each has a session of its own, as in a job"
-    if priority.AUTOGROUP.exists() and niceness > 0:
+    if blender_process.AUTOGROUP.exists() and niceness > 0:
         assert [line[1] for line in lines] == [str(niceness)] * 2, output
 
 
 def test_a_process_that_has_ended_already_is_no_error():
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
-    priority.yield_to_us(process.pid)
+    blender_process.yield_to_us(process.pid)
 
 
 def test_a_busy_kernel_is_asked_again_and_one_without_weights_is_left_alone(monkeypatch):
@@ -57,14 +57,14 @@ def test_a_busy_kernel_is_asked_again_and_one_without_weights_is_left_alone(monk
                 raise answer
             return answer
 
-    monkeypatch.setattr(priority, "AUTOGROUP", Group())
-    monkeypatch.setattr(priority, "AUTOGROUP_SECONDS", 0.0)
+    monkeypatch.setattr(blender_process, "AUTOGROUP", Group())
+    monkeypatch.setattr(blender_process, "AUTOGROUP_SECONDS", 0.0)
     monkeypatch.setattr(os, "nice", lambda by: 10)
-    priority.weigh_session()
+    blender_process.weigh_session()
     assert asked == ["10"] * 3
     answers[:] = [FileNotFoundError()]
-    priority.weigh_session()
+    blender_process.weigh_session()
     assert answers == [] and len(asked) == 4
     monkeypatch.setattr(os, "nice", lambda by: 0)
-    priority.weigh_session()
+    blender_process.weigh_session()
     assert len(asked) == 4

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import quadrature
 
-from ltsh_addon.blender.materials import lobe_samples, reflectance
-from ltsh_addon.blender.materials.aovs import LOBE_KINDS
-from ltsh_addon.blender.materials.glass_albedos import glass_albedos
-from ltsh_addon.blender.materials.lobe_slots import Hits
+from ltsh_addon.cycles import closures, lobes
+from ltsh_addon.cycles.closures import glass_albedos
+from ltsh_addon.cycles.lobes import LOBE_KINDS, Hits
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 COSINES, COSINE_WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
@@ -60,20 +59,20 @@ def transmitted_share(cosine, alpha, ior):
 
 
 def test_a_tinted_metal_has_its_tint_where_the_model_says():
-    dip = reflectance.f82_dip(COLOR, TINT)
+    dip = closures.f82_dip(COLOR, TINT)
     cosine = 1.0 / 7.0
     schlick = COLOR + (1.0 - COLOR) * (1.0 - cosine) ** 5
     assert np.allclose(schlick - dip * cosine * (1.0 - cosine) ** 6, schlick * TINT, rtol=1e-12)
     c = COSINES[:, None]
     curve = COLOR + (1.0 - COLOR) * (1.0 - c) ** 5 - dip * c * (1.0 - c) ** 6
     mean = np.sum(2.0 * c * curve * COSINE_WEIGHTS[:, None], axis=0)
-    assert np.allclose(reflectance.metal_average(COLOR, dip), mean, rtol=1e-12)
+    assert np.allclose(closures.metal_average(COLOR, dip), mean, rtol=1e-12)
 
 
 @pytest.mark.parametrize("ior", [1.05, 1.5, 2.5])
 def test_a_tinted_dielectric_is_a_sum_of_the_curves_of_samples(ior):
-    f0 = 0.5 * reflectance.f0_of_ior(np.array([ior]))[:, None] * TINT
-    low, high, dip, dielectric, index = reflectance.dielectric_terms(f0, np.array([ior]), np.array([0.5]))
+    f0 = 0.5 * closures.f0_of_ior(np.array([ior]))[:, None] * TINT
+    low, high, dip, dielectric, index = closures.dielectric_terms(f0, np.array([ior]), np.array([0.5]))
     fresnel = quadrature.dielectric_fresnel(COSINES[:, None], ior)
     plain = ((ior - 1.0) / (ior + 1.0)) ** 2
     share = (fresnel - plain) / (1.0 - plain)
@@ -82,24 +81,24 @@ def test_a_tinted_dielectric_is_a_sum_of_the_curves_of_samples(ior):
 
 
 def test_the_specular_level_scales_the_reflectance_at_normal_incidence():
-    ior, f0 = reflectance.specular_level_applied(np.array([1.5, 1.5, 0.7, 1.5]), np.array([0.5, 1.0, 1.0, 0.0]))
+    ior, f0 = closures.specular_level_applied(np.array([1.5, 1.5, 0.7, 1.5]), np.array([0.5, 1.0, 1.0, 0.0]))
     base = np.square([0.2, 0.2, 0.3 / 1.7, 0.2])
     assert np.allclose(f0, base * [1.0, 2.0, 2.0, 0.0], rtol=1e-12)
-    assert np.allclose(reflectance.f0_of_ior(ior), f0, rtol=1e-12) and ior[2] < 1.0 and ior[3] == 1.0
+    assert np.allclose(closures.f0_of_ior(ior), f0, rtol=1e-12) and ior[2] < 1.0 and ior[3] == 1.0
 
 
 @pytest.mark.parametrize("ior", [1.1, 1.5, 2.0, 3.0])
 def test_the_fit_of_the_mean_reflectance_is_near_the_integral(ior):
     mean = np.sum(2.0 * COSINES * quadrature.dielectric_fresnel(COSINES, ior) * COSINE_WEIGHTS)
     # What Kulla and Conty's fit, which Cycles uses, is good for.
-    assert abs(reflectance.dielectric_average(np.array([ior]))[0] - mean) < 7e-3
+    assert abs(closures.dielectric_average(np.array([ior]))[0] - mean) < 7e-3
 
 
 def test_white_loses_nothing_and_black_gains_nothing_by_multiple_scattering():
     albedo, average = np.array([0.4, 0.9]), np.array([0.5, 0.95])
-    white = reflectance.multiple_scattering(np.ones((2, 3)), albedo, average)
+    white = closures.multiple_scattering(np.ones((2, 3)), albedo, average)
     assert np.allclose(white * albedo[:, None], 1.0, rtol=1e-12)
-    assert np.array_equal(reflectance.multiple_scattering(np.zeros((2, 3)), albedo, average), np.ones((2, 3)))
+    assert np.array_equal(closures.multiple_scattering(np.zeros((2, 3)), albedo, average), np.ones((2, 3)))
 
 
 def test_multiple_scattering_sums_its_bounces():
@@ -109,14 +108,14 @@ def test_multiple_scattering_sums_its_bounces():
     for _ in range(200):
         leaving += inside * average
         inside *= (1.0 - average) * mean
-    factor = reflectance.multiple_scattering(np.full((1, 3), mean), np.array([albedo]), np.array([average]))
+    factor = closures.multiple_scattering(np.full((1, 3), mean), np.array([albedo]), np.array([average]))
     assert np.allclose(factor, 1.0 + leaving / albedo, rtol=1e-12)
 
 
 @pytest.mark.parametrize("row, column", [(31, 31), (31, 8), (20, 10), (12, 25)])
 def test_albedos_are_right_at_the_nodes_of_the_table(row, column):
     roughness, cosine = row / 31.0, column / 31.0
-    albedo, average = reflectance.albedos(np.array([roughness]), np.array([cosine]))
+    albedo, average = closures.albedos(np.array([roughness]), np.array([cosine]))
     # The shipped lookup table is fitted to 0.1 %.
     assert abs(albedo[0] - reflected_share(cosine, roughness**2, np.ones_like)) < 2e-3
     views = [reflected_share(c, roughness**2, np.ones_like) for c in COSINES[::8]]
@@ -127,8 +126,8 @@ def test_albedos_are_right_at_the_nodes_of_the_table(row, column):
 def test_a_dielectric_layer_takes_its_albedo_away():
     roughness, cosine, coordinate = 9.0 / 15.0, 6.0 / 15.0, 7.0 / 15.0
     ior = (1.0 + coordinate**2) / (1.0 - coordinate**2)
-    f0 = np.full((1, 3), reflectance.f0_of_ior(ior))
-    found = reflectance.dielectric_albedo(f0, np.array([ior]), np.array([roughness]), np.array([cosine]))
+    f0 = np.full((1, 3), closures.f0_of_ior(ior))
+    found = closures.dielectric_albedo(f0, np.array([ior]), np.array([roughness]), np.array([cosine]))
     whole = reflected_share(cosine, roughness**2, np.ones_like)
     reflected = reflected_share(cosine, roughness**2, lambda c: quadrature.dielectric_fresnel(c, ior))
     assert np.allclose(found, reflected / whole, atol=2e-3)  # as the lookup table
@@ -136,7 +135,7 @@ def test_a_dielectric_layer_takes_its_albedo_away():
 
 def test_a_conductor_without_extinction_is_a_dielectric():
     index, c = np.array([1.5, 2.0, 3.0]), COSINES[:, None]
-    found = reflectance.conductor_reflectance(c, index, np.zeros(3))
+    found = closures.conductor_reflectance(c, index, np.zeros(3))
     assert np.allclose(found, quadrature.dielectric_fresnel(c, index), atol=1e-9)
 
 
@@ -151,11 +150,11 @@ METALS = {
 @pytest.mark.parametrize("metal", METALS)
 def test_metals_are_fitted_where_they_are_seen(metal):
     index, extinction = (np.array([value]) for value in METALS[metal])
-    low, high, dip, dielectric = reflectance.conductor_fit(index, extinction, exact=True)
+    low, high, dip, dielectric = closures.conductor_fit(index, extinction, exact=True)
     c = COSINES[:, None]
     curve = low + (high - low) * (1.0 - c) ** 5 - dip * c * (1.0 - c) ** 6
-    curve = curve + dielectric * quadrature.dielectric_fresnel(c, reflectance.CONDUCTOR_FIT_IOR)
-    error = np.abs(curve - reflectance.conductor_reflectance(c, index, extinction))
+    curve = curve + dielectric * quadrature.dielectric_fresnel(c, closures.CONDUCTOR_FIT_IOR)
+    error = np.abs(curve - closures.conductor_reflectance(c, index, extinction))
     # Measured: 0.004 for half angles below 72 degrees; the rest of the curve is steep.
     assert error[COSINES > 0.3].max() < 6e-3 and error.max() < 0.08
 
@@ -195,7 +194,7 @@ def test_the_diffuse_albedo_of_a_hit_is_split_and_kept():
         {"kind": np.full(3, LOBE_KINDS["glossy"]), "color": np.ones((3, 3)), "roughness": np.full(3, 0.3)},
         {"kind": np.full(3, LOBE_KINDS["diffuse"]), "color": np.full((3, 3), 0.5), "weight": np.array([0.6, 0.0, 0.0])},
     ]
-    samples, index = lobe_samples.samples_of_lobes(hits, slots)
+    samples, index = lobes.samples_of_lobes(hits, slots)
     assert np.array_equal(index, [0, 0, 0, 1, 1, 2])
     assert np.allclose(samples.diffuse_albedo[[0, 2]], albedo[0] * [[0.25], [0.75]])
     assert np.allclose(samples.diffuse_albedo[3], albedo[1]) and not samples.diffuse_albedo[[1, 4]].any()

@@ -116,6 +116,6 @@ def test_the_command_is_there_while_enabled(monkeypatch):
 
 
 def test_entry_point_of_the_extension_registers_the_package(enabled):
-    from ltsh_addon.blender.interface.preferences import LTSH_AddonPreferences
+    from ltsh_addon.blender.ui.settings import LTSH_AddonPreferences
 
     assert LTSH_AddonPreferences.is_registered and LTSH_AddonPreferences.bl_idname == "ltsh_addon"

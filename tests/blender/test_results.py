@@ -10,10 +10,11 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import imaging
-from ltsh_addon.blender.interface import operators_view, probe, results, settings_presets, viewer
-from ltsh_addon.comparison import display_layers
+from ltsh_addon.blender.ui import comparison, results, view_operators
+from ltsh_addon.blender.ui import settings as settings_module
+from ltsh_addon.imaging.color import signed_error_colors
 from ltsh_addon.imaging.exr import write_channels
-from ltsh_addon.imaging.false_color import signed_error_colors
+from ltsh_addon.pipeline import display_layers
 
 HEIGHT, WIDTH = 6, 10
 PICTURES = ("ltc", "ltsh4", "cycles")
@@ -27,7 +28,7 @@ def scene(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
     write_results(tmp_path)
     results.show(scene, tmp_path / "ltsh" / "compare" / "images")
-    assert viewer.refresh(scene)
+    assert comparison.refresh(scene)
     yield scene
     ltsh_addon.unregister()
 
@@ -70,20 +71,20 @@ def test_left_of_the_line_is_the_first_picture_and_right_the_second(scene, tmp_p
 def test_a_dragged_line_is_seen_before_the_settings_know_it(scene, tmp_path):
     pictures = write_results(tmp_path)
     scene.ltsh.split = 0.0
-    viewer.drag_split(scene, 0.5)
+    comparison.drag_split(scene, 0.5)
     expected = pictures["cycles.combined"].copy()
     columns = round(0.5 * WIDTH)
     expected[:, :columns] = pictures["ltsh4.combined"][:, :columns]
     np.testing.assert_array_equal(seen(), expected)
-    assert scene.ltsh.split == 0.0 and viewer.split_of(scene) == 0.5
-    viewer.drag_split(scene, None)
+    assert scene.ltsh.split == 0.0 and comparison.split_of(scene) == 0.5
+    comparison.drag_split(scene, None)
     np.testing.assert_array_equal(seen(), pictures["cycles.combined"])
 
 
 def test_moving_the_line_reads_no_file_again(scene, tmp_path):
     write_results(tmp_path)
     scene.ltsh.split = 0.2
-    images = [image for image in results.our_images(scene) if not viewer.is_viewer(image)]
+    images = [image for image in results.our_images(scene) if not comparison.is_viewer(image)]
     for image in images:
         image.pixels[0] = 7.0  # which is gone when Blender reads the file
     scene.ltsh.split = 0.8
@@ -130,9 +131,9 @@ def test_the_scale_of_the_difference_is_that_of_the_results_or_the_artists(scene
     result = results.result_of(scene)
     choice = results.choice_of(scene.ltsh, result)
     group = result.groups[""]
-    assert viewer.error_scale(scene.ltsh, group, choice) == group["scales"]["combined"] > 0.0
+    assert comparison.error_scale(scene.ltsh, group, choice) == group["scales"]["combined"] > 0.0
     scene.ltsh.error_scale = 0.25
-    assert viewer.error_scale(scene.ltsh, group, choice) == 0.25
+    assert comparison.error_scale(scene.ltsh, group, choice) == 0.25
 
 
 def test_the_probe_reads_every_picture_at_the_pixel(scene, tmp_path):
@@ -140,7 +141,7 @@ def test_the_probe_reads_every_picture_at_the_pixel(scene, tmp_path):
     result = results.result_of(scene)
     choice = results.choice_of(scene.ltsh, result)
     for point, place in (((0.0, 0.0), (0, 0)), ((1.0, 1.0), (WIDTH - 1, HEIGHT - 1)), ((0.55, 0.2), (5, 1))):
-        pixel, rows = probe.values_at(scene, result, choice, point)
+        pixel, rows = comparison.values_at(scene, result, choice, point)
         assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4", "Cycles"]
         for name, (_, values) in zip(PICTURES, rows, strict=True):
             expected = pictures[f"{name}.combined"][HEIGHT - 1 - place[1], place[0]]
@@ -153,7 +154,7 @@ def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path
     path = tmp_path / "room.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     np.testing.assert_array_equal(seen(), before)
-    viewer.settle()
+    comparison.settle()
     bpy.ops.wm.open_mainfile(filepath=str(path))
     assert bpy.context.scene.ltsh.first == "ltc"
     np.testing.assert_array_equal(seen(), before)
@@ -170,7 +171,7 @@ def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path
 def test_new_results_replace_the_old_pictures(scene, tmp_path):
     pictures = write_results(tmp_path, seed=2)
     results.show(scene, tmp_path / "ltsh" / "compare" / "images")
-    viewer.refresh(scene)
+    comparison.refresh(scene)
     scene.ltsh.mode = "A"
     np.testing.assert_array_equal(seen(), pictures["ltsh4.combined"])
     assert len([image for image in bpy.data.images if image.name.startswith("LTSH ltsh4")]) == 1
@@ -187,7 +188,7 @@ def test_results_that_vanish_do_no_harm(scene, tmp_path, damage):
         (folder / "index.json").write_text('{"command": ')
     # Setting a property would print the error of its update function, which nobody can catch.
     scene.ltsh["first"], scene.ltsh["pass_name"] = 1, 1
-    viewer.changed(scene.ltsh, bpy.context)
+    comparison.changed(scene.ltsh, bpy.context)
     if damage != "picture gone":
         assert results.result_of(scene) is None and not bpy.ops.ltsh.swap.poll()
         with pytest.raises(RuntimeError, match="There are no results yet"):
@@ -201,9 +202,9 @@ def test_two_scenes_have_results_of_their_own(scene, tmp_path):
     other = bpy.data.scenes.new("Other")
     pictures = write_results(tmp_path / "other", seed=3)
     results.show(other, tmp_path / "other" / "ltsh" / "compare" / "images")
-    viewer.refresh(other)
+    comparison.refresh(other)
     np.testing.assert_array_equal(seen(), first)
-    image = viewer.viewer_image(other)
+    image = comparison.viewer_image(other)
     assert image.name == "LTSH Comparison.001"
     assert abs(image.pixels[0] - pictures["ltsh4.combined"][-1, 0, 0]) == 0.0
 
@@ -236,7 +237,7 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
 
 
 def preset_files():
-    return sorted(Path(settings_presets.FOLDER, "presets", "ltsh").glob("*.py"))
+    return sorted(Path(settings_module.FOLDER, "presets", "ltsh").glob("*.py"))
 
 
 def test_presets_of_ours_set_everything_they_name(scene):
@@ -244,10 +245,10 @@ def test_presets_of_ours_set_everything_they_name(scene):
     seen_values = set()
     for path in preset_files():
         assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname="LTSH_PT_presets") == {"FINISHED"}
-        values = tuple(str(getattr(scene.ltsh, name)) for name in settings_presets.KEPT)
+        values = tuple(str(getattr(scene.ltsh, name)) for name in settings_module.KEPT)
         seen_values.add(values)
         named = [line.split("=")[0].strip() for line in path.read_text().splitlines() if line.startswith("settings.")]
-        assert set(named) <= {f"settings.{name}" for name in settings_presets.KEPT}
+        assert set(named) <= {f"settings.{name}" for name in settings_module.KEPT}
     assert len(seen_values) == 3
 
 
@@ -270,18 +271,18 @@ def test_every_setting_of_a_job_is_part_of_presets(scene):
     about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale", "probe"}
     of_the_file = {"output_folder", "result_folder", "bake_uv_map"}
     settings = set(scene.ltsh.__class__.__annotations__)
-    assert settings - about_view - of_the_file == set(settings_presets.KEPT)
+    assert settings - about_view - of_the_file == set(settings_module.KEPT)
 
 
 def test_a_manual_that_is_missing_is_told(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(operators_view, "MANUAL", tmp_path / "manual.md")
+    monkeypatch.setattr(view_operators, "MANUAL", tmp_path / "manual.md")
     with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
         bpy.ops.ltsh.manual()
 
 
 def test_the_manual_names_what_the_panels_show(scene):
     """Every button and every setting, by the words on it."""
-    text = operators_view.MANUAL.read_text(encoding="utf-8")
+    text = view_operators.MANUAL.read_text(encoding="utf-8")
     buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Pixel Probe", "Open in Image Editor",
                "Cancel", "Esc")  # fmt: skip
     names = [item.name for item in scene.ltsh.bl_rna.properties

@@ -6,7 +6,7 @@ import pytest
 import scene_parts
 
 import ltsh_addon
-from ltsh_addon.blender.interface import scene_copy, viewer
+from ltsh_addon.blender.ui import comparison, operators
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def seen():
 
 def test_no_thumbnail_is_drawn_and_the_preferences_stay(preferences, seen, tmp_path):
     bpy.context.scene.frame_current = 7
-    scene_copy.save_scene_copy(tmp_path / "copy.blend")
+    operators.save_scene_copy(tmp_path / "copy.blend")
     assert [kind for kind, _ in seen] == ["NONE"]
     assert preferences.filepaths.file_preview_type == "CAMERA" and not preferences.is_dirty
     assert bpy.data.filepath == str(tmp_path / "room.blend")
@@ -53,17 +53,17 @@ def test_no_thumbnail_is_drawn_and_the_preferences_stay(preferences, seen, tmp_p
 def test_the_preferences_stay_where_the_copy_cannot_be_saved(preferences, tmp_path, unsaved):
     preferences.is_dirty = unsaved
     with pytest.raises(RuntimeError):
-        scene_copy.save_scene_copy(tmp_path / "missing" / "copy.blend")
+        operators.save_scene_copy(tmp_path / "missing" / "copy.blend")
     assert preferences.filepaths.file_preview_type == "CAMERA" and preferences.is_dirty == unsaved
-    assert not viewer._state["kept"]
+    assert not comparison._state["kept"]
 
 
 def test_pictures_of_results_are_not_made_again(preferences, seen, tmp_path, monkeypatch):
-    monkeypatch.setattr(viewer.results, "result_of", lambda scene: object())
-    monkeypatch.setattr(viewer, "refresh", lambda scene: refreshed.append(scene))
-    refreshed, image = [], viewer.viewer_image(bpy.context.scene)
-    viewer._store(image, np.ones((8, 6, 4), np.float32), True)
-    scene_copy.save_scene_copy(tmp_path / "copy.blend")
+    monkeypatch.setattr(comparison.results, "result_of", lambda scene: object())
+    monkeypatch.setattr(comparison, "refresh", lambda scene: refreshed.append(scene))
+    refreshed, image = [], comparison.viewer_image(bpy.context.scene)
+    comparison._store(image, np.ones((8, 6, 4), np.float32), True)
+    operators.save_scene_copy(tmp_path / "copy.blend")
     assert seen[-1][1][image.name] == (6, 8) == tuple(image.size) and not refreshed
     # A file for people holds none of what can be made again.
     bpy.ops.wm.save_mainfile()

@@ -7,8 +7,8 @@ import pytest
 import scene_parts
 from scene_parts import add_plane, new_material
 
-from ltsh_addon.blender.materials.aovs import MAX_LOBES
-from ltsh_addon.blender.pixels import gbuffer
+from ltsh_addon.cycles import gbuffer
+from ltsh_addon.cycles.lobes import MAX_LOBES
 
 # Numbers pass through float32 nodes a few times.
 EXACT = 2e-6

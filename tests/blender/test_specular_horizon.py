@@ -7,8 +7,8 @@ import pytest
 import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
 
-from ltsh_addon.blender.materials.specular_horizon import end_at_horizons_of_cycles
-from ltsh_addon.blender.processes.child import note_coarse_meshes
+from ltsh_addon.blender.process.client import note_coarse_meshes
+from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading import shade

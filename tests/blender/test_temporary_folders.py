@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.blender.processes.temporary_folders import PREFIX, locked_folder
+from ltsh_addon.files import PREFIX, locked_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 # Makes a folder with a file, and waits for a line or is killed.
 MAKER = """
 import sys
-from ltsh_addon.blender.processes.temporary_folders import locked_folder
+from ltsh_addon.files import locked_folder
 with locked_folder() as folder:
     (folder / "file").write_bytes(b"x")
     print("made", flush=True)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.texels.uv_raster import NUDGE, UvTriangles, barycentric_of_nearest
+from ltsh_addon.cycles.uv import NUDGE, UvTriangles, barycentric_of_nearest
 
 WIDTH, HEIGHT = 61, 47
 

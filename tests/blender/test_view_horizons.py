@@ -10,14 +10,13 @@ from graphics_card import Canvas, edits_with_graphics, with_graphics
 from random_surfaces import EYE
 
 from ltsh_addon import shading
-from ltsh_addon.blender.materials.specular_horizon import SMALLEST_ANGLE, end_at_horizons_of_cycles, horizon_excess
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.viewport.gbuffer_textures import upload_samples
-from ltsh_addon.blender.viewport.horizon_pass import HorizonPass
-from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
-from ltsh_addon.blender.viewport.surface_pass import View
-from ltsh_addon.blender.viewport.uploaded_lights import upload_lights
-from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport.lighting import HorizonPass
+from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.surfaces import View
+from ltsh_addon.blender.viewport.textures import upload_lights, upload_samples
+from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, end_at_horizons_of_cycles, horizon_excess
 from ltsh_addon.scene import SurfaceSamples
 
 WIDTH, HEIGHT = 32, 16
@@ -148,7 +147,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
 def check_against_cycles(path, ended, pixel):
     """The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces."""
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = child.extract(child.ExtractOptions(scene=path))
+    found = client.extract(client.ExtractOptions(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])
     place = np.full(SIZE[0] * SIZE[1], -1)
     place[pixel] = np.arange(len(pixel))

@@ -7,8 +7,8 @@ import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
 
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.viewport import mesh_normals, mesh_tangents
+from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport import meshes
 
 # Heights of two quads side by side, neither of them plane.
 HEIGHTS = (0.0, 0.1, 0.0, 0.1, 0.0, 0.15)
@@ -49,8 +49,8 @@ def normals_at(mesh, points):
     vertex = np.array([loop.vertex_index for loop in mesh.loops])
     triangles = np.array([triangle.loops[:] for triangle in mesh.loop_triangles])
     place = np.array([mesh.vertices[index].co[:] for index in vertex], np.float32)
-    normal, flat = mesh_normals.interpolated_normals(mesh, vertex)
-    own, its_normal = mesh_normals.own_normals(mesh, flat, triangles, place, normal)
+    normal, flat = meshes.interpolated_normals(mesh, vertex)
+    own, its_normal = meshes.own_normals(mesh, flat, triangles, place, normal)
     corner_normals = normal[triangles].astype(np.float64)
     corner_normals[own] = its_normal[:, None]
     found = np.full((len(points), 3), np.nan)
@@ -71,7 +71,7 @@ def test_normals_are_those_that_cycles_interpolates(tmp_path):
     camera.location.x = 0.5 * (len(KINDS) - 1)
     path = tmp_path / "normals.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    samples = child.extract(child.ExtractOptions(scene=path)).samples
+    samples = client.extract(client.ExtractOptions(scene=path)).samples
     column = np.round(samples.position[:, 0]).astype(int)
     wrong = []
     for x, ob in enumerate(objects):
@@ -159,7 +159,7 @@ def test_tangents_are_those_of_mikktspace():
     expected = np.array([[*loop.tangent, loop.bitangent_sign] for loop in mesh.loops])
     normal = np.array([loop.normal for loop in mesh.loops], np.float32)
     triangles = np.arange(len(corner)).reshape(-1, 3)
-    found = mesh_tangents.corner_tangents(place[corner].astype(np.float32), normal, uv, triangles)
+    found = meshes.corner_tangents(place[corner].astype(np.float32), normal, uv, triangles)
     assert set(expected[:, 3]) == {-1.0, 1.0}
     np.testing.assert_allclose(found, expected, atol=1e-4)
 
@@ -167,5 +167,5 @@ def test_tangents_are_those_of_mikktspace():
 def test_without_area_in_uv_tangents_are_those_of_nothing():
     place = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     up, uv = np.tile(np.float32([0, 0, 1]), (3, 1)), np.full((3, 2), 0.5, np.float32)
-    found = mesh_tangents.corner_tangents(place, up, uv, np.array([[0, 1, 2]]))
+    found = meshes.corner_tangents(place, up, uv, np.array([[0, 1, 2]]))
     np.testing.assert_array_equal(found, np.tile([1.0, 0.0, 0.0, -1.0], (3, 1)))

@@ -7,8 +7,8 @@ from graphics_card import edits_with_graphics
 from view_pictures import image, normal_map, patches_too_far
 
 from ltsh_addon import shading
-from ltsh_addon.blender.materials import look_reader
-from ltsh_addon.blender.materials.look_reader import look_of
+from ltsh_addon.blender.materials import looks
+from ltsh_addon.blender.materials.looks import look_of
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 
@@ -196,7 +196,7 @@ def test_more_lobes_than_are_shown_are_named():
     parts.empty_scene()
     material, tree, output = parts.new_material("Onion")
     last = tree.nodes.new("ShaderNodeBsdfDiffuse")
-    for number in range(look_reader.MOST_LOBES + 1):
+    for number in range(looks.MOST_LOBES + 1):
         add, gloss = nodes_of(tree, "AddShader", "BsdfAnisotropic")
         gloss.inputs["Roughness"].default_value = 0.1 * (number + 1)
         tree.links.new(last.outputs[0], add.inputs[0])
@@ -204,8 +204,8 @@ def test_more_lobes_than_are_shown_are_named():
         last = add
     tree.links.new(last.outputs[0], output.inputs["Surface"])
     look = look_of(material)
-    assert len(look.lobes) == look_reader.MOST_LOBES
-    assert look.notes == (f"Onion: of its {look_reader.MOST_LOBES + 2} lobes only {look_reader.MOST_LOBES} are shown",)
+    assert len(look.lobes) == looks.MOST_LOBES
+    assert look.notes == (f"Onion: of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are shown",)
 
 
 def test_a_coat_that_is_not_resolved_is_named():

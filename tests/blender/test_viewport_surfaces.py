@@ -8,8 +8,8 @@ from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import SIZE, normal_map, patches_too_far, textured, viewport_picture
 
 from ltsh_addon import shading
-from ltsh_addon.blender.materials.look_reader import look_of
-from ltsh_addon.blender.viewport import view_text
+from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.materials.looks import look_of
 
 
 def color_image():
@@ -137,7 +137,7 @@ def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind, passe
 
 def test_long_lines_of_the_view_are_broken():
     text = "Marble: Base Color is not resolved, because a texture of noise feeds it"
-    lines = view_text.wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))
+    lines = view.wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))
     assert lines[-1] == ("short", "blue") and len(lines) > 2
     assert all(6.0 * len(part) <= 200.0 for part, _ in lines)
     assert " ".join(part.strip() for part, color in lines if color == "red") == text

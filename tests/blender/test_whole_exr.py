@@ -5,9 +5,9 @@ import OpenEXR
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.pixels import render_settings
-from ltsh_addon.blender.processes.whole_exr import is_whole
-from ltsh_addon.imaging.exr_rows import writing_rows
+from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.render_settings import is_whole
+from ltsh_addon.imaging.exr import writing_rows
 
 
 def parts(path):

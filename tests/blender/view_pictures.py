@@ -8,10 +8,10 @@ import scene_parts as parts
 from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
-from ltsh_addon.blender.processes import child
-from ltsh_addon.blender.viewport.scene_mirror import SceneMirror
-from ltsh_addon.blender.viewport.surface_pass import View
-from ltsh_addon.blender.viewport.view_renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.surfaces import View
 
 SIZE = (96, 72)
 COLUMNS = 4
@@ -61,7 +61,7 @@ def sampled_pictures(path, passes, rows):
     """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
     sees, or -1."""
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = child.extract(child.ExtractOptions(scene=path))
+    found = client.extract(client.ExtractOptions(scene=path))
     shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
     square = np.full(SIZE[0] * SIZE[1], -1)
     column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)

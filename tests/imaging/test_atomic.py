@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.imaging.atomic import check_takes_files, replacing, replacing_by_copy, write_bytes
-from ltsh_addon.ownership import machine
+from ltsh_addon.files import check_takes_files, machine, replacing, replacing_by_copy, write_bytes
 
 ROOT = Path(__file__).resolve().parents[2]
 # Writes half a file and ends as a killed process does, or waits for a line before it goes on.
 HALF = """
 import os, sys
-from ltsh_addon.imaging.atomic import replacing
+from ltsh_addon.files import replacing
 with replacing(sys.argv[1]) as temporary:
     temporary.write_bytes(b"half")
     print("half", flush=True)

@@ -4,8 +4,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.imaging.exr_rows import writing_rows
+from ltsh_addon.imaging.exr import read_channels, writing_rows
 
 NAMES = ("ltsh4.specular.R", "ltsh4.specular.G", "coverage.hit.V")
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.imaging.false_color import NOT_FINITE_COLOR, color_bar, signed_error_colors
+from ltsh_addon.imaging.color import NOT_FINITE_COLOR, color_bar, signed_error_colors
 
 
 def lightness(srgb):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.imaging import to_srgb8, write_png
-from ltsh_addon.imaging.tone import exposure_factor
+from ltsh_addon.imaging.color import exposure_factor
 
 
 def decode(data: bytes) -> tuple[np.ndarray, list[bytes]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.imaging import Tile, comparison_sheet, font, sheet
-from ltsh_addon.imaging.tone import exposure_factor, to_srgb8
+from ltsh_addon.imaging.color import exposure_factor, to_srgb8
 
 
 def picture(width, height, seed=0):

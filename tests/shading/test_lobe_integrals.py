@@ -7,7 +7,7 @@ import textbook
 
 from ltsh_addon import shading
 from ltsh_addon.shading import spherical_harmonics
-from ltsh_addon.shading.lobe_integrals import polygon_integrals
+from ltsh_addon.shading.lobes import polygon_integrals
 from ltsh_addon.shading.lookup_table import Lobe
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}

@@ -10,7 +10,7 @@ from test_polygon_lights import STAR, polygon_light
 from test_workers import children_only, short_tasks_for_children, started  # noqa: F401 (fixtures)
 
 from ltsh_addon import shading
-from ltsh_addon.shading import block_exchange, task
+from ltsh_addon.shading import integrator, parallel
 
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
 techniques = pytest.mark.parametrize("technique", TECHNIQUES)
@@ -78,7 +78,7 @@ def test_numbers_travel_only_where_a_light_asks_for_them():
     samples = numbered_samples(10)
     for receivers, expected in ((None, False), ((1,), True)):
         lights = (area_light(receivers=receivers),)
-        job = task.Task(lights, ("",), shading.load_table("ltc"), ("diffuse",), True)
-        side = block_exchange.ParentSide(job, samples, 10)
+        job = integrator.Task(lights, ("",), shading.load_table("ltc"), ("diffuse",), True)
+        side = parallel.ParentSide(job, samples, 10)
         assert ("receiver" in side.sent) == expected
         side.close()

@@ -14,6 +14,7 @@ from surface_scenes import area_light, four_lights, random_samples, single_sampl
 
 from ltsh_addon import shading
 from ltsh_addon.scene import Cancelled
+from ltsh_addon.shading import integrator
 
 shade = partial(shading.shade, dtype=np.float64)
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -34,7 +35,7 @@ def both(shaded):
 
 def small_blocks(monkeypatch, size):
     for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
-        monkeypatch.setattr(shading.integrator, name, (size, size))
+        monkeypatch.setattr(integrator, name, (size, size))
 
 
 @techniques

@@ -8,7 +8,7 @@ from surface_scenes import area_light, four_lights, random_samples, single_sampl
 from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
-from ltsh_addon.shading import edge_integrals, edge_loop, fresnel_kinds, ridge_table
+from ltsh_addon.shading import edge_integrals, float32, moments32
 from ltsh_addon.shading.lookup_table import LookupTable
 from ltsh_addon.shading.polygon import project_to_sphere
 
@@ -98,7 +98,7 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     many = replace(few, ior=few.ior + np.where(np.arange(300) < 150, 0.0, 1e-3 * np.arange(300)))
     apart = shading.shade(few, lights, name, workers=1).specular[:, :150]
     together = shading.shade(many, lights, name, workers=1).specular[:, :150]
-    assert len(np.unique(many.ior)) > fresnel_kinds.SEPARATE_IORS
+    assert len(np.unique(many.ior)) > float32.SEPARATE_IORS
     assert np.abs(apart - together).max() < 2e-6
 
 
@@ -114,9 +114,9 @@ def test_looking_straight_down_needs_no_tangent():
 def test_edge_loop_gives_the_moments(degree, corners):
     """Regular polygons around random directions: rounding of 6e-8 per edge, of moments up to 20."""
     polygons = regular_polygons(corners, 300, seed=degree)
-    moments, fragile = edge_loop.moments(polygons, degree, edge_loop.Scratch())
+    moments, fragile = moments32.moments(polygons, degree, moments32.Scratch())
     along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), degree)
-    expected = np.linalg.solve(edge_loop.form_matrix(degree), along_directions)
+    expected = np.linalg.solve(moments32.form_matrix(degree), along_directions)
     assert moments.dtype == np.float32
     assert fragile.mean() < 0.2
     assert np.abs(moments - expected)[:, ~fragile].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
@@ -125,11 +125,11 @@ def test_edge_loop_gives_the_moments(degree, corners):
 @pytest.mark.parametrize("most", [1, 513, 1000, 5000])
 def test_pieces_of_a_batch_have_the_sums_of_the_whole(most, monkeypatch):
     """1500 polygons in pieces of at least 512, against their moments at once."""
-    monkeypatch.setattr(edge_loop, "PIECE_CORNERS", 4 * most)
+    monkeypatch.setattr(moments32, "PIECE_CORNERS", 4 * most)
     polygons = regular_polygons(4, 1500, seed=5)
     weights = np.random.default_rng(6).normal(size=(2, 15, 1500)).astype(np.float32)
-    moments, expected_mask = edge_loop.moments(polygons, 4, edge_loop.Scratch())
-    sums, angle, fragile = edge_loop.weighted_moments(polygons, weights, 4, edge_loop.Scratch())
+    moments, expected_mask = moments32.moments(polygons, 4, moments32.Scratch())
+    sums, angle, fragile = moments32.weighted_moments(polygons, weights, 4, moments32.Scratch())
     expected = np.einsum("fkp,kp->fp", weights.astype(float), moments.astype(float))
     assert np.abs(sums - expected).max() < 15 * 1e-7 * np.abs(weights * moments).max()
     assert np.abs(angle - moments[0]).max() < 1e-6 and np.array_equal(fragile, expected_mask)
@@ -137,7 +137,7 @@ def test_pieces_of_a_batch_have_the_sums_of_the_whole(most, monkeypatch):
 
 @pytest.mark.parametrize(("count", "most"), [(0, 600), (1, 600), (512, 1), (1200, 600), (1201, 600), (100_000, 4111)])
 def test_pieces_make_up_the_whole_and_are_about_equal(count, most):
-    parts = edge_loop.pieces(count, most)
+    parts = moments32.pieces(count, most)
     assert [index for part in parts for index in range(count)[part]] == list(range(count))
     lengths = [part.stop - part.start for part in parts]
     assert max(lengths, default=0) <= max(most, 512)
@@ -147,8 +147,8 @@ def test_pieces_make_up_the_whole_and_are_about_equal(count, most):
 def test_edge_loop_gives_the_integrals_of_the_direction():
     polygons = regular_polygons(6, 300, seed=9)
     expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))
-    found, fragile = edge_loop.vector_irradiance(polygons, edge_loop.Scratch())
-    height, _ = edge_loop.cosine_integral(polygons, edge_loop.Scratch())
+    found, fragile = moments32.vector_irradiance(polygons, moments32.Scratch())
+    height, _ = moments32.cosine_integral(polygons, moments32.Scratch())
     assert np.abs(found - expected)[:, ~fragile].max() < 1e-6
     assert np.abs(height - expected[2])[~fragile].max() < 1e-6
 
@@ -175,8 +175,8 @@ def test_polygons_that_single_precision_cannot_do_are_reported(gap):
     fine = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
     polygons = np.stack([wall, tiny, fine]).transpose(2, 1, 0).astype(np.float32)
     for _, fragile in (
-        edge_loop.moments(polygons, 4, edge_loop.Scratch()),
-        edge_loop.cosine_integral(polygons, edge_loop.Scratch()),
+        moments32.moments(polygons, 4, moments32.Scratch()),
+        moments32.cosine_integral(polygons, moments32.Scratch()),
     ):
         assert fragile.tolist() == [True, True, False]
 
@@ -188,20 +188,20 @@ def test_premultiplied_weights_are_the_coefficients_lobe_integrals_use(name):
     cosine, roughness = generator.random((2, 200)).astype(np.float32)
     sine = np.sqrt(1.0 - cosine.astype(float) ** 2).astype(np.float32)
     curves = tuple(range(table.coefficients.shape[2]))
-    warp, weights, tilt = ridge_table.prepare(table).fetch(
-        curves, cosine, sine, roughness, np.ones(200), edge_loop.Scratch()
+    warp, weights, tilt = moments32.prepare(table).fetch(
+        curves, cosine, sine, roughness, np.ones(200), moments32.Scratch()
     )
     lobe = table.lookup(cosine.astype(float), roughness.astype(float))
     for row, expected in zip(warp, (lobe.xx, lobe.xz, lobe.yy, lobe.zz), strict=True):
         assert np.abs(row - expected).max() < 3e-6 * np.abs(expected).max()
     expected = lobe.coefficients
     if tilt is None:
-        matrix = table.ridge_weights @ edge_loop.form_matrix(table.degree)
+        matrix = table.ridge_weights @ moments32.form_matrix(table.degree)
         expected = np.einsum("fkp,kr->frp", expected, matrix)
     else:
         assert np.abs(tilt - lobe.tilt).max() < 1e-5
     assert np.abs(weights - expected).max() < 1e-5 * np.abs(expected).max()
-    assert isinstance(table, LookupTable) and ridge_table.prepare(table) is ridge_table.prepare(table)
+    assert isinstance(table, LookupTable) and moments32.prepare(table) is moments32.prepare(table)
 
 
 @pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])
@@ -209,10 +209,10 @@ def test_shaders_and_the_edge_loop_weigh_their_moments_alike(name):
     """One node of the table for 300 polygons."""
     table, node = shading.load_table(name), 40 * 64 + 20
     polygons = regular_polygons(4, 300, seed=8)
-    moments, fragile = edge_loop.moments(polygons, table.degree, edge_loop.Scratch())
+    moments, fragile = moments32.moments(polygons, table.degree, moments32.Scratch())
     along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), table.degree)
-    found = ridge_table.prepare(table).weights[..., node] @ moments
-    expected = ridge_table.along_directions(table).weights[..., node] @ along_directions
+    found = moments32.prepare(table).weights[..., node] @ moments
+    expected = moments32.along_directions(table).weights[..., node] @ along_directions
     assert np.abs(expected).max() > 0.1
     assert np.abs(found - expected)[:, ~fragile].max() < 2e-6
 
@@ -229,7 +229,7 @@ def test_degrees_beyond_the_fast_path_are_shaded_in_double():
     assert found.specular.dtype == np.float32
     assert np.abs(found.specular - expected.specular).max() < 1e-6
     with pytest.raises(ValueError, match="degree 6, the single precision path goes up to 4"):
-        ridge_table.prepare(same)
+        moments32.prepare(same)
 
 
 def test_other_types_are_refused():

@@ -15,7 +15,7 @@ from surface_scenes import four_lights, random_samples
 
 from ltsh_addon import shading
 from ltsh_addon.scene import Cancelled
-from ltsh_addon.shading import block_exchange, integrator, shared_block, worker, workers
+from ltsh_addon.shading import integrator, parallel, worker
 
 ROOT = Path(__file__).resolve().parents[2]
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -24,7 +24,7 @@ TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
 @pytest.fixture(autouse=True)
 def short_tasks_for_children(monkeypatch):
     """Children start for any task; blocks are small."""
-    monkeypatch.setattr(workers, "SECONDS_WORTH_A_CHILD", 0.0)
+    monkeypatch.setattr(parallel, "SECONDS_WORTH_A_CHILD", 0.0)
     for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
         monkeypatch.setattr(integrator, name, (17, 17))
 
@@ -39,20 +39,20 @@ def started(monkeypatch):
         found.append(original(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr(workers.subprocess, "Popen", popen)
+    monkeypatch.setattr(parallel.subprocess, "Popen", popen)
     return found
 
 
 @pytest.fixture
 def children_only(monkeypatch, started):
     """This process takes no block as long as a child that was started lives."""
-    original = workers._Queue.next
+    original = parallel._Queue.next
 
     def patient(self):
         here = threading.current_thread() is threading.main_thread()
         return None if here and any(process.poll() is None for process in started) else original(self)
 
-    monkeypatch.setattr(workers._Queue, "next", patient)
+    monkeypatch.setattr(parallel._Queue, "next", patient)
 
 
 def all_ended(processes):
@@ -164,11 +164,11 @@ def test_without_an_interpreter_this_process_does_it_all(python, monkeypatch, ca
 @pytest.mark.parametrize(("path", "found"), [("/a/python3.13", True), ("/b/blender", False), ("", False)])
 def test_only_a_python_runs_children(path, found, monkeypatch):
     monkeypatch.setattr(sys, "executable", path)
-    assert workers.interpreter() == (path if found else None)
+    assert parallel.interpreter() == (path if found else None)
 
 
 def test_few_samples_stay_in_this_process(monkeypatch, started):
-    monkeypatch.setattr(workers, "SECONDS_WORTH_A_CHILD", 0.5)
+    monkeypatch.setattr(parallel, "SECONDS_WORTH_A_CHILD", 0.5)
     shading.shade(random_samples(1000), four_lights(), "ltsh4", workers=8)
     assert not started
 
@@ -178,15 +178,15 @@ import sys, time
 sys.path[:0] = [{root!r}, {tests!r}]
 from surface_scenes import four_lights, random_samples
 from ltsh_addon import shading
-from ltsh_addon.shading import integrator, workers
-workers.SECONDS_WORTH_A_CHILD = 0.0
+from ltsh_addon.shading import integrator, parallel
+parallel.SECONDS_WORTH_A_CHILD = 0.0
 integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
-original = workers.subprocess.Popen
+original = parallel.subprocess.Popen
 def popen(*arguments, **options):
     process = original(*arguments, **options)
     print(process.pid, flush=True)
     return process
-workers.subprocess.Popen = popen
+parallel.subprocess.Popen = popen
 shading.shade(random_samples(100000), four_lights(), "reference", workers=2)
 """
 
@@ -207,9 +207,9 @@ def test_children_of_a_killed_parent_end():
 
 
 def test_shared_blocks_hold_arrays_side_by_side():
-    layout, size = shared_block.layout_of({"a": ((3, 2), np.float64), "b": ((5,), np.float32), "c": ((0, 3), np.int8)})
-    block = shared_block.SharedBlock(size)
-    ours, theirs = block.arrays(layout), shared_block.arrays_in(shared_block.attach(block.handle, size), layout)
+    layout, size = parallel.layout_of({"a": ((3, 2), np.float64), "b": ((5,), np.float32), "c": ((0, 3), np.int8)})
+    block = parallel.SharedBlock(size)
+    ours, theirs = block.arrays(layout), parallel.arrays_in(parallel.attach(block.handle, size), layout)
     for number, name in enumerate("abc"):
         ours[name][...] = number + 1
     for number, name in enumerate("abc"):
@@ -221,7 +221,7 @@ def test_shared_blocks_hold_arrays_side_by_side():
 def test_a_normal_that_stands_for_another_is_sent_once():
     samples = random_samples(20)
     task = integrator._task(tuple(four_lights()), "ltc", ("specular",), np.float32)
-    side = block_exchange.ParentSide(task, samples, 20)
+    side = parallel.ParentSide(task, samples, 20)
     assert side.same == {"geometric_normal": "normal"}
     assert not {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"} & set(side.sent)
     side.close()
@@ -255,19 +255,19 @@ for name in ("bl_ext", "bl_ext.user_default", "bl_ext.user_default.ltsh"):
 sys.modules["bl_ext.user_default.ltsh"].__path__ = [{root!r}]
 sys.path[:] = [entry for entry in sys.path if entry not in ("", {root!r})]
 package = "bl_ext.user_default.ltsh.ltsh_addon."
-shading, scene, workers, integrator = (
-    importlib.import_module(package + name) for name in ("shading", "scene", "shading.workers", "shading.integrator")
+shading, scene, parallel, integrator = (
+    importlib.import_module(package + name) for name in ("shading", "scene", "shading.parallel", "shading.integrator")
 )
 import numpy as np
-workers.SECONDS_WORTH_A_CHILD = 0.0
+parallel.SECONDS_WORTH_A_CHILD = 0.0
 integrator.BLOCK_LIMITS = (8, 8)
 by_children = []
-done = workers._Queue.done
+done = parallel._Queue.done
 def counted(self, *arguments):
     import threading
     by_children.append(threading.current_thread() is not threading.main_thread())
     done(self, *arguments)
-workers._Queue.done = counted
+parallel._Queue.done = counted
 up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
 position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
 samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)

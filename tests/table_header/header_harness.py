@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ltsh_addon import shading, table_export
+from ltsh_addon import shading
+from ltsh_addon.pipeline import export as export_module
 from ltsh_addon.shading.edge_integrals import MAX_DEGREE
 from ltsh_addon.shading.lookup_table import LookupTable
 from ltsh_addon.shading.spherical_harmonics import coefficient_count
@@ -191,7 +192,7 @@ def export(folder: Path) -> dict[str, LookupTable]:
     tables = {}
     for name, recipe in TABLES.items():
         tables[name] = synthetic_table(*recipe) if recipe else shading.load_table(name)
-        table_export.export_table(tables[name], name, name, folder)
+        export_module.export_table(tables[name], name, name, folder)
     return tables
 
 

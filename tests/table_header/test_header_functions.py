@@ -6,8 +6,8 @@ import pytest
 from header_quadrature import half_circle_gaps, quadrature
 
 from ltsh_addon import shading
+from ltsh_addon.shading.header import data_blocks
 from ltsh_addon.shading.polygon import clip_to_horizon
-from ltsh_addon.shading.table_header import data_blocks
 
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
 

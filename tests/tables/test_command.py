@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon.shading import TableError, load_table
-from tables import __main__ as command
+from tables import __main__
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,7 +29,7 @@ WRONG = [
 @pytest.mark.parametrize("arguments, message", WRONG)
 def test_bad_arguments_end_with_2(arguments, message, capsys):
     with pytest.raises(SystemExit) as caught:
-        command.main(arguments)
+        __main__.main(arguments)
     assert caught.value.code == 2
     streams = capsys.readouterr()
     assert streams.out == "" and message in streams.err and "usage: ltsh tables" in streams.err
@@ -92,7 +92,7 @@ def test_a_table_that_cannot_be_read_ends_with_1(monkeypatch, capsys):
     def broken(name):
         raise TableError(f"lookup table {name}: broken")
 
-    monkeypatch.setattr(command, "load_table", broken)
-    assert command.main(["validate", "ltc"]) == 1
+    monkeypatch.setattr(__main__, "load_table", broken)
+    assert __main__.main(["validate", "ltc"]) == 1
     streams = capsys.readouterr()
     assert streams.out == "" and "lookup table ltc: broken" in streams.err

@@ -7,12 +7,10 @@ import pytest
 
 from ltsh_addon.shading import brdf, load_table, spherical_harmonics
 from ltsh_addon.shading.lookup_table import roughness_nodes, theta_nodes
-from tables import fit, refine, table_file, walk
+from tables import fit, refine, walk
 from tables.brdfs import BECKMANN, GGX
-from tables.cells import Cells
 from tables.families import family_named
-from tables.fresnel_basis import FLAT
-from tables.projection import Points, project, relative_error, warped_basis
+from tables.projection import FLAT, Cells, Points, project, relative_error, warped_basis
 from tables.validate import hemisphere_samples, validate
 
 SIZE = 8
@@ -62,10 +60,10 @@ def test_the_written_table_is_readable_and_its_bytes_are_reproducible(coarse, tm
     fitted, _ = coarse
     first, second = tmp_path / "first.npz", tmp_path / "second.npz"
     for path in (first, second):
-        table_file.write_table(path, fitted)
+        fit.write_table(path, fitted)
     names = [path.read_bytes().replace(path.stem.encode(), b"") for path in (first, second)]
     assert len(names[0]) > 1000
-    table_file.write_table(second, fitted)
+    fit.write_table(second, fitted)
     assert second.read_bytes().replace(b"second", b"") == names[1]
     with zipfile.ZipFile(first) as archive:
         assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
@@ -78,7 +76,7 @@ def test_the_written_table_is_readable_and_its_bytes_are_reproducible(coarse, tm
 
 def test_even_a_coarse_fit_is_a_usable_table(coarse, tmp_path):
     """8 x 8 nodes are far apart; 64 x 64 nodes reach 0.037."""
-    table_file.write_table(tmp_path / "coarse.npz", coarse[0])
+    fit.write_table(tmp_path / "coarse.npz", coarse[0])
     statistics = validate(load_table(tmp_path / "coarse.npz"), count=5)
     assert statistics.mean < 0.06
     # The refinement looks between the nodes: the lookup loses little against coefficients solved at the point.
@@ -174,18 +172,18 @@ def test_a_fit_that_was_stopped_goes_on_and_gives_the_same_numbers(stop_after):
 
 def test_a_checkpoint_of_other_settings_or_a_broken_one_is_ignored(tmp_path):
     path = tmp_path / "fit.progress"
-    table_file.Checkpoint(path, {"size": 5}).save({"nodes": np.arange(3.0)})
-    assert table_file.Checkpoint(path, {"size": 5}).load()["nodes"].tolist() == [0.0, 1.0, 2.0]
-    assert table_file.Checkpoint(path, {"size": 6}).load() == {}
+    fit.Checkpoint(path, {"size": 5}).save({"nodes": np.arange(3.0)})
+    assert fit.Checkpoint(path, {"size": 5}).load()["nodes"].tolist() == [0.0, 1.0, 2.0]
+    assert fit.Checkpoint(path, {"size": 6}).load() == {}
     path.write_bytes(path.read_bytes()[:40])
-    assert table_file.Checkpoint(path, {"size": 5}).load() == {}
-    assert table_file.Checkpoint(tmp_path / "none", {}).load() == {}
+    assert fit.Checkpoint(path, {"size": 5}).load() == {}
+    assert fit.Checkpoint(tmp_path / "none", {}).load() == {}
 
 
 def test_rounding_to_float32_changes_no_figure(coarse, tmp_path):
     """The stored numbers are of order 1 to 100: their rounding moves errors by no more than 1e-5."""
     fitted, _ = coarse
-    table_file.write_table(tmp_path / "rounded.npz", fitted)
+    fit.write_table(tmp_path / "rounded.npz", fitted)
     table = load_table(tmp_path / "rounded.npz")
     nudged = {key: getattr(table, key).astype(np.float64) * (1.0 + 2.0**-24) for key in ("warp", "coefficients")}
     other = type(table)(**{**{k: getattr(table, k) for k in table.__dataclass_fields__}, **nudged})
@@ -197,7 +195,7 @@ def test_rounding_to_float32_changes_no_figure(coarse, tmp_path):
 def test_other_brdfs_can_be_fitted(tmp_path):
     """Beckmann, in two functions: its coarse table approximates Beckmann, and not GGX."""
     fitted = fit.fit(family_named("ltsh2"), 6, model=BECKMANN)
-    table_file.write_table(tmp_path / "beckmann.npz", fitted)
+    fit.write_table(tmp_path / "beckmann.npz", fitted)
     table = load_table(tmp_path / "beckmann.npz")
     assert "Beckmann" in table.metadata["brdf"]
     cosine, roughness = np.array([0.9, 0.7, 0.5]), np.array([0.5, 0.7, 0.9])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.shading import SHIPPED_TABLES, load_table
-from tables.fresnel_basis import COSINES, TABULATED_IOR, combine, fresnel_basis
+from tables.projection import COSINES, TABULATED_IOR, combine, fresnel_basis
 
 
 @pytest.fixture(scope="module")

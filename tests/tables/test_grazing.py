@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.shading import load_table
-from tables import __main__ as command
-from tables import grazing, validate
+from tables import __main__, grazing, validate
 
 
 @pytest.fixture(autouse=True)
@@ -52,11 +51,11 @@ def test_a_spoiled_table_stands_out_and_does_not_spoil_the_solved_lobe(tables):
 
 
 def test_the_command_prints_every_point_and_the_goal(capsys):
-    assert command.main(["optimum", "ltsh2", "--grazing"]) == 0
+    assert __main__.main(["optimum", "ltsh2", "--grazing"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 4 + 1 and lines[0].startswith("| `ltsh2` roughness") and "of 4 points" in lines[-1]
 
 
 def test_the_command_refuses_what_has_no_table_of_spherical_harmonics(capsys):
-    assert command.main(["optimum", "ltc", "--grazing"]) == 2
+    assert __main__.main(["optimum", "ltc", "--grazing"]) == 2
     assert "ltsh2 or ltsh4" in capsys.readouterr().err

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.shading import brdf
-from tables.hemisphere_quadrature import polar_samples
+from tables.brdfs import polar_samples
 from tables.validate import hemisphere_samples
 
 COSINE = np.array([1.0, 0.7, 0.4, 0.2, 0.05])

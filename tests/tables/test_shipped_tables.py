@@ -9,7 +9,7 @@ import pytest
 from ltsh_addon.shading import SHIPPED_TABLES, evaluate_lobe, integrate_polygon, load_table
 from tables.brdfs import GGX
 from tables.families import family_named
-from tables.table_file import settings
+from tables.fit import settings
 from tables.validate import fresnel_basis_error, validate, validate_corners
 
 ROOT = Path(__file__).resolve().parents[2]

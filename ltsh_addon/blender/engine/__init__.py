@@ -1,1 +1,1 @@
-"""The render engine LTSH."""
+"""The render engine: what F12 and the rendered view show."""

@@ -1,1 +1,1 @@
-"""From Blender's lights and emissive meshes to `AreaLight`."""
+"""Lights of the evaluated scene: area lights, glowing meshes, their textures, and what they light."""

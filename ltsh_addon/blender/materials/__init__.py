@@ -1,1 +1,1 @@
-"""From Blender's materials to weighted lobes: in Cycles' AOVs, in maps, as constants for the viewport."""
+"""Materials: one walk over nodes (`graph`), one table of BSDF nodes (`bsdfs`), and their readers."""

@@ -1,96 +1,234 @@
-"""The quantities that a 1-sample Cycles render writes through shader AOVs (arbitrary output variables). Needs no bpy.
-
-A hit has those of HIT_AOVS once, and those of LOBE_AOVS for each of its lobes, in slots that are numbered from 0.
-"""
+"""AOVs of materials, by which Cycles tells what shading needs."""
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass, field
 
-AOV_PREFIX = "ltsh_"
-MAX_LOBES = 8
-# Name of the quantity -> type of the AOV.
-HIT_AOVS = {
-    "hit": "VALUE",  # 1 where a surface was hit
-    "receiver": "VALUE",  # `AreaLight.receivers`
-    "correct_normal": "VALUE",  # 1 where Cycles bends specular normals (use_bump_map_correction)
-    "position": "COLOR",
-    "incoming": "COLOR",  # towards the camera
-    "smooth_normal": "COLOR",
-    "true_normal": "COLOR",
+import bpy
+
+from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from .bsdfs import TRANSPARENT_NODES, Leaf, bsdf_leaves, cut_alpha, emits, is_emission, is_group, lobe_of
+from .graph import ensure_nodes, fill_with_bsdf, is_constant, is_socket, live_link, material_output
+
+
+def write_aov(tree, name: str, value) -> None:
+    """A node in `tree` that writes `value`, a socket of it, a number or a color, into the AOV `name`."""
+    node = tree.nodes.new("ShaderNodeOutputAOV")
+    node.aov_name = AOV_PREFIX + name
+    target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
+    if is_socket(value):
+        tree.links.new(value, target)
+    elif isinstance(value, tuple):
+        target.default_value = (*value[:3], 1.0)
+    else:
+        target.default_value = float(value)
+
+
+def write_lobe(tree, slot: int, values: dict, names) -> None:
+    """Write the AOVs `names` of one lobe: of `values` (see `bsdf_lobes.lobe_of`), or what changes nothing."""
+    for name in names:
+        neutral = LOBE_AOVS[name][1]
+        write_aov(tree, lobe_aov(name, slot), values.get(name, 0.0 if neutral is None else neutral))
+
+
+def declare_aovs(view_layer) -> None:
+    """Add a pass to `view_layer` for every AOV that some material writes, and all that belong to a hit."""
+    trees = [material.node_tree for material in bpy.data.materials if material.node_tree] + list(bpy.data.node_groups)
+    written = {
+        node.aov_name.removeprefix(AOV_PREFIX)
+        for tree in trees
+        if tree.bl_idname == "ShaderNodeTree"
+        for node in tree.nodes
+        if node.bl_idname == "ShaderNodeOutputAOV" and node.aov_name.startswith(AOV_PREFIX)
+    }
+    for name in sorted(written | set(HIT_AOVS)):
+        aov = view_layer.aovs.add()
+        aov.name, aov.type = AOV_PREFIX + name, aov_kind(name)
+
+
+def remove_aovs(view_layer) -> None:
+    """Take the passes of `declare_aovs` out again."""
+    for aov in [aov for aov in view_layer.aovs if aov.name.startswith(AOV_PREFIX)]:
+        view_layer.aovs.remove(aov)
+
+
+def bends_normals(tree):
+    """A socket of `tree` that is 1, and 0 on hair, where Cycles never bends specular normals."""
+    flipped = tree.nodes.new("ShaderNodeMath")
+    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
+    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
+    return flipped.outputs[0]
+
+
+# Nodes that send rays from where they are evaluated, and what is said of them.
+TRACING_NODES = {
+    "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
+    "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
 }
-# Name of the quantity -> type of the AOV, and the value that changes nothing: an AOV that no material needs is left out
-# (None: never left out).
-LOBE_AOVS = {
-    "kind": ("VALUE", 0.0),  # one of LOBE_KINDS
-    "weight": ("VALUE", 1.0),  # product of the factors of mixes
-    "normal": ("COLOR", (0.0, 0.0, 0.0)),  # the Normal socket; zero: the smooth normal
-    "color": ("COLOR", None),  # of conductors the refractive index
-    "roughness": ("VALUE", None),
-    "metallic": ("VALUE", 0.0),
-    "ior": ("VALUE", 1.5),
-    "specular_level": ("VALUE", 0.5),
-    "tint": ("COLOR", (1.0, 1.0, 1.0)),  # of conductors the extinction coefficient
-    "multiple_scattering": ("VALUE", 0.0),  # 1 for Multiscatter GGX
-    "transmission": ("VALUE", 0.0),
-    "backfacing": ("VALUE", 0.0),
-    "sheen_weight": ("VALUE", 0.0),
-    "sheen_tint": ("COLOR", (1.0, 1.0, 1.0)),
-    "sheen_roughness": ("VALUE", 0.5),
-    "coat_weight": ("VALUE", 0.0),
-    "coat_roughness": ("VALUE", 0.03),
-    "coat_ior": ("VALUE", 1.5),
-    "coat_tint": ("COLOR", (1.0, 1.0, 1.0)),
-    "coat_normal": ("COLOR", (0.0, 0.0, 0.0)),
-}
-LOBE_KINDS = {
-    "none": 0.0,
-    "principled": 1.0,
-    "glossy": 2.0,
-    "diffuse": 3.0,
-    "translucent": 4.0,
-    "metal": 5.0,
-    "conductor": 6.0,
-    "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
-    "glass": 8.0,
-    "sheen": 9.0,
-}
+# Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
+RECEIVER_PROPERTY = "ltsh_receiver"
 
 
-def lobe_aov(name: str, slot: int) -> str:
-    """The AOV of the quantity `name` of LOBE_AOVS in a slot."""
-    return f"{name}_{slot}"
+@dataclass
+class MaterialReport:
+    """Warnings about materials."""
+
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, material_name: str, message: str) -> None:
+        """Note `message` about a material once."""
+        line = f"material {material_name!r}: {message}"
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+    def lines(self) -> list[str]:
+        """All warnings."""
+        return list(self.warnings)
 
 
-def aov_kind(name: str) -> str:
-    """Type of an AOV: of HIT_AOVS, or as `lobe_aov` names it."""
-    return HIT_AOVS[name] if name in HIT_AOVS else LOBE_AOVS[name.rpartition("_")[0]][0]
+def materials_in_use(surfaces: list, override=None) -> list:
+    """Original materials of the evaluated objects `surfaces`, each once; only `override` where one is set."""
+    if override is not None:
+        return [override.original]
+    found = {}
+    for ob in surfaces:
+        for slot in ob.material_slots:
+            if slot.material is not None:
+                found[slot.material.original.name_full] = slot.material.original
+    return list(found.values())
 
 
-def read_layer(channels: dict[str, np.ndarray], name: str, components: str) -> np.ndarray:
-    """Pass `name` as (H, W) float32, or (H, W, 3) for three components, from EXR `channels` of one view layer.
+def objects_without_material(surfaces: list) -> list:
+    """Original objects of `surfaces` with no material slot or an empty one."""
+    found = {}
+    for ob in surfaces:
+        slots = ob.material_slots
+        if len(slots) == 0 or any(slot.material is None for slot in slots):
+            found[ob.original.name_full] = ob.original
+    return list(found.values())
 
-    Blender writes `<view layer>.<pass>.<component>`; the view layer's name is of no interest.
+
+def give_default_material(objects: list):
+    """Put a material that looks like Cycles' default surface where none is assigned; the material, or None."""
+    if not objects:
+        return None
+    material = bpy.data.materials.new("Default surface")
+    ensure_nodes(material)
+    # Measured: a gray Diffuse BSDF in 4.5.15, a Principled BSDF with all its defaults in 5.2.3.
+    default = "ShaderNodeBsdfDiffuse" if bpy.app.version < (5, 0, 0) else "ShaderNodeBsdfPrincipled"
+    fill_with_bsdf(material.node_tree, default, (0.8, 0.8, 0.8, 1.0))
+    for ob in objects:
+        if len(ob.material_slots) == 0:
+            ob.data.materials.append(material)
+        for slot in ob.material_slots:
+            if slot.material is None:
+                slot.material = material
+    return material
+
+
+@dataclass(frozen=True)
+class MaterialLobes:
+    """The lobes of one material: those of its leaves that have one, and what each writes."""
+
+    material: object
+    leaves: tuple[Leaf, ...]
+    values: tuple[dict, ...]
+
+
+def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str] = frozenset()) -> None:
+    """Make every material write the quantities of `aovs`; cut transparency and volumes.
+
+    Materials light nothing, but for those with a full name in `emitters`, of whose emission nothing is said either.
     """
-    planes = []
-    for component in components:
-        suffix = f".{name}.{component}"
-        found = [key for key in channels if key.endswith(suffix) or key == suffix[1:]]
-        if len(found) != 1:
-            raise ValueError(
-                f"render result: {len(found)} channels named {suffix[1:]!r}, expected one; found {sorted(channels)}"
-            )
-        planes.append(channels[found[0]])
-    return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
+    found = []
+    for material in materials:
+        ensure_nodes(material)
+        emitter = material.name_full in emitters
+        if not emitter:
+            material.cycles.emission_sampling = "NONE"
+        lobes = lobes_of(material, emitter, report)
+        if lobes is not None:
+            found.append(lobes)
+            _write_hit(material)
+    # A slot has the same AOVs in all materials.
+    for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
+        users = [lobes for lobes in found if len(lobes.leaves) > slot]
+        names = sorted({name for lobes in users for name in lobes.values[slot]})
+        for lobes in users:
+            write_lobe(lobes.leaves[slot].tree, slot, lobes.values[slot], names)
 
 
-def read_aov(channels: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """The AOV `name` (see `aov_kind`): (H, W) or (H, W, 3) float32."""
-    return read_layer(channels, AOV_PREFIX + name, "RGB" if aov_kind(name) == "COLOR" else "X")
+def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes | None:
+    """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface."""
+
+    def warn(message):
+        report.warn(material.name, message)
+
+    tree = material.node_tree
+    output = material_output(tree)
+    if output is None:
+        output = tree.nodes.new("ShaderNodeOutputMaterial")
+    volume = live_link(output.inputs["Volume"])
+    if volume is not None:
+        tree.links.remove(volume)
+        warn("its volume is not shaded; left out of the Cycles reference as well")
+    for node in _tracing_nodes(tree):
+        warn(f"node {node.name!r} {TRACING_NODES[node.bl_idname]}")
+    leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
+    if not leaves:
+        # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
+        black = tree.nodes.new("ShaderNodeBsdfDiffuse")
+        black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
+        tree.links.new(black.outputs[0], output.inputs["Surface"])
+    elif all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
+        return None
+    if not emitter and any(emits(leaf.node) for leaf in leaves):
+        warn("emission is not shaded and lights nothing, in the Cycles reference neither")
+    pairs = []
+    for leaf in leaves:
+        if is_emission(leaf.node):
+            continue
+        cut_alpha(leaf.tree, leaf.node, warn)
+        values = lobe_of(leaf.node, warn)
+        if values:
+            share = {} if is_constant(leaf.weight, 1.0) else {"weight": leaf.weight}
+            pairs.append((leaf, {**values, **share}))
+    pairs = _largest(pairs, warn)
+    return MaterialLobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
 
 
-def lobe_names(channels: dict[str, np.ndarray]) -> list[list[str]]:
-    """For each slot in EXR `channels` the names of LOBE_AOVS that were written."""
-    written = {key.rpartition(".")[0].rpartition(AOV_PREFIX)[2] for key in channels if AOV_PREFIX in key}
-    slots = [[name for name in LOBE_AOVS if lobe_aov(name, slot) in written] for slot in range(MAX_LOBES)]
-    return [names for names in slots if names]
+def _tracing_nodes(tree) -> list:
+    """Nodes of TRACING_NODES in `tree` and its groups that feed something."""
+    found = []
+    for node in tree.nodes:
+        if is_group(node) and node.node_tree is not None:
+            found += _tracing_nodes(node.node_tree)
+        elif node.bl_idname in TRACING_NODES and not node.mute and any(socket.is_linked for socket in node.outputs):
+            found.append(node)
+    return found
+
+
+def _largest(pairs: list, warn) -> list:
+    """The MAX_LOBES pairs (leaf, values) of largest weight, as far as constants tell, in their order."""
+    if len(pairs) <= MAX_LOBES:
+        return pairs
+    order = sorted(range(len(pairs)), key=lambda index: -pairs[index][0].bound)
+    dropped = ", ".join(repr(pairs[index][0].node.name) for index in order[MAX_LOBES:])
+    warn(f"it has {len(pairs)} BSDF nodes, of which {MAX_LOBES} are shaded, not {dropped}")
+    return [pairs[index] for index in sorted(order[:MAX_LOBES])]
+
+
+def _write_hit(material) -> None:
+    """AOVs of what a hit has once, however many lobes."""
+    tree = material.node_tree
+    geometry = tree.nodes.new("ShaderNodeNewGeometry")
+    receiver = tree.nodes.new("ShaderNodeAttribute")
+    # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
+    receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
+    write_aov(tree, "hit", 1.0)
+    write_aov(tree, "receiver", receiver.outputs["Fac"])
+    write_aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
+    write_aov(tree, "position", geometry.outputs["Position"])
+    write_aov(tree, "incoming", geometry.outputs["Incoming"])
+    write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
+    write_aov(tree, "true_normal", geometry.outputs["True Normal"])

@@ -11,10 +11,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ...cycles import closures
+from ...cycles.lobes import read_layer
 from ...imaging.exr import read_channels
-from ..pixels import render_settings
-from . import sheen_albedos
-from .aovs import read_layer
+from .. import render_settings
 
 PIXELS = 512
 STRIPS = 20_000
@@ -46,15 +46,15 @@ def measure(pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def table_of(cosine: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> np.ndarray:
     """The table (NODES, NODES), by cosine and roughness, that fits the measurements (P,) best."""
-    count = sheen_albedos.NODES**2
+    count = closures.SHEEN_NODES**2
     square, right = np.zeros((count, count)), np.zeros(count)
-    found = sheen_albedos.corners(cosine.astype(np.float64), roughness.astype(np.float64))
+    found = closures.corners(cosine.astype(np.float64), roughness.astype(np.float64))
     for index, weight in found:
         np.add.at(right, index, weight * albedo)
         for other, other_weight in found:
             np.add.at(square, (index, other), weight * other_weight)
     table = np.linalg.lstsq(square, right, rcond=1e-12)[0]
-    return np.maximum(table, 0.0).reshape(sheen_albedos.NODES, -1).astype(np.float32)
+    return np.maximum(table, 0.0).reshape(closures.SHEEN_NODES, -1).astype(np.float32)
 
 
 def _add_surface(scene) -> None:
@@ -96,4 +96,4 @@ def _add_camera(scene) -> None:
 
 
 if __name__ == "__main__":
-    np.save(sheen_albedos.PATH, table_of(*measure()))
+    np.save(closures.PATH, table_of(*measure()))

@@ -1,1 +1,0 @@
-"""Lighting baked into textures: objects, texels, errors, the files of a bake."""

@@ -1,0 +1,359 @@
+"""F12: a final picture by the command line's own way, and the engine's class."""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+
+from ... import shading
+from ...scene import Cancelled
+from ...shading import TableError
+from ..materials.looks import world_radiance
+from ..process import client
+from ..process.blender_process import SceneError
+from ..saving import save_working_copy
+from ..ui.preview import ENGINE
+from . import view
+from .settings import TECHNIQUE_LABELS
+from .view import EngineView
+
+_current: dict = {}
+
+
+@persistent
+def _take(*_) -> None:
+    """Save a copy where a scene of the file has our engine."""
+    _drop()
+    if all(scene.render.engine != ENGINE for scene in bpy.data.scenes):
+        return
+    folder = tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True)
+    _current["folder"] = folder
+    path = Path(folder.name) / "scene.blend"
+    try:
+        save_working_copy(path, keep_engine=True)
+    except RuntimeError as error:
+        _current["error"] = " ".join(str(error).split()).removeprefix("Error: ")
+
+
+@persistent
+def _drop(*_) -> None:
+    """Delete the copy."""
+    folder = _current.pop("folder", None)
+    _current.clear()
+    if folder is not None:
+        folder.cleanup()
+
+
+def saved_copy() -> Path:
+    """The copy of the file as it was when the render started. Raises SceneError."""
+    if "error" in _current:
+        raise SceneError(f"a copy of the open file could not be saved for the render: {_current['error']}")
+    if "folder" not in _current:
+        raise SceneError("no copy of the open file was saved for the render; start the render again")
+    return Path(_current["folder"].name) / "scene.blend"
+
+
+HANDLERS = (("render_init", _take), ("render_complete", _drop), ("render_cancel", _drop))
+
+
+def _keep_copies() -> None:
+    """Add the handlers."""
+    for name, function in HANDLERS:
+        getattr(bpy.app.handlers, name).append(function)
+
+
+def _drop_copies() -> None:
+    """Remove the handlers and the copy."""
+    for name, function in HANDLERS:
+        functions = getattr(bpy.app.handlers, name)
+        if function in functions:
+            functions.remove(function)
+    _drop()
+
+
+Progress = Callable[[str, float], "bool | None"]
+ASK_SECONDS = 0.05
+
+
+def stoppable(work: Callable[[Progress], object], progress: Progress):
+    """What `work(report)` returns; it runs in a thread of its own and must not use bpy.
+
+    `progress(stage, fraction)` gets what the work reported last, again and again, in the thread of the caller. Raises
+    what the work raises, and Cancelled as soon as `progress` returns False: the work then ends at its next report.
+    """
+    state: dict = {"last": ("", 0.0)}
+    stop = threading.Event()
+
+    def report(stage: str, fraction: float) -> bool:
+        state["last"] = stage, fraction
+        return not stop.is_set()
+
+    def run() -> None:
+        try:
+            state["result"] = work(report)
+        except BaseException as error:
+            state["error"] = error
+
+    thread = threading.Thread(target=run, name="LTSH work", daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            if progress(*state["last"]) is False:
+                raise Cancelled(f"cancelled at {state['last'][0] or 'the start'}")
+            thread.join(ASK_SECONDS)
+    finally:
+        stop.set()
+    if "error" in state:
+        raise state["error"]
+    return state["result"]
+
+
+# Share of the progress bar that taking the samples gets.
+EXTRACTION_SHARE = 0.7
+PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
+EMISSION = "LTSH Emission"
+
+
+@dataclass(frozen=True)
+class FinalJob:
+    """What the render of one view layer needs to know of the scene."""
+
+    scene: str
+    view_layer: str
+    frame: int | None  # None: as in the copy of the file
+    sub_samples: int
+    technique: str
+    shown: str  # combined, specular or diffuse
+    other_techniques: tuple[str, ...] = ()  # with passes of their own
+    background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
+
+    def shaded_as(self) -> dict[str, str]:
+        """Names of passes start with -> technique."""
+        return {"LTSH": self.technique, **{TECHNIQUE_LABELS[name]: name for name in self.other_techniques}}
+
+
+def pass_names(prefixes) -> list[str]:
+    """Names of the render passes beside Combined."""
+    return [*(f"{prefix} {label}" for prefix in prefixes for label in PASS_LABELS.values()), EMISSION]
+
+
+@dataclass(frozen=True)
+class FinalPicture:
+    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, 3) by name."""
+
+    combined: np.ndarray
+    passes: dict[str, np.ndarray]
+    warnings: tuple[str, ...]
+
+
+def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
+    """Take samples of the .blend `scene_file` and shade them. Uses no bpy.
+
+    `progress(stage, fraction of the whole)` returns False to stop. Raises SceneError, TableError, Cancelled, OSError.
+    """
+    options = client.ExtractOptions(
+        scene=scene_file,
+        sub_samples=job.sub_samples,
+        frame=job.frame,
+        scene_name=job.scene,
+        view_layer=job.view_layer,
+        emission=True,
+    )
+    extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
+    names = list(dict.fromkeys(job.shaded_as().values()))
+    share = (1.0 - EXTRACTION_SHARE) / len(names)
+    images = {
+        name: _images(extraction, name, _part(progress, EXTRACTION_SHARE + index * share, share))
+        for index, name in enumerate(names)
+    }
+    passes = {
+        f"{prefix} {label}": images[name][part]
+        for prefix, name in job.shaded_as().items()
+        for part, label in PASS_LABELS.items()
+    }
+    emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
+    passes[EMISSION] = emission
+    shown = shading.PASSES if job.shown == "combined" else (job.shown,)
+    color = sum(images[job.technique][part] for part in shown)
+    if job.shown == "combined":
+        color = color + emission
+    coverage = inside_border(extraction.film.coverage(), extraction.border)
+    return FinalPicture(_over_background(color, coverage, job, extraction.exposure), passes, extraction.warnings)
+
+
+def _part(progress: Progress, start: float, share: float) -> Progress:
+    """A progress callback for a stage that takes `share` of the whole from `start` on."""
+    return lambda stage, fraction: progress(stage, start + share * fraction)
+
+
+def _images(extraction, technique: str, progress: Progress) -> dict[str, np.ndarray]:
+    """Radiance (H, W, 3) of each pass times the film's exposure."""
+    images = {}
+    for index, name in enumerate(shading.PASSES):
+        part = _part(progress, index / len(shading.PASSES), 1.0 / len(shading.PASSES))
+        shaded = shading.shade(
+            extraction.samples,
+            extraction.lights,
+            technique,
+            passes=(name,),
+            progress=lambda fraction, part=part: part(TECHNIQUE_LABELS[technique], fraction),
+        )
+        image = extraction.film.image(extraction.exposure * shaded.combined)
+        images[name] = inside_border(image, extraction.border)
+    return images
+
+
+def _over_background(color: np.ndarray, coverage: np.ndarray, job: FinalJob, exposure: float) -> np.ndarray:
+    """RGBA (H, W, 4) of `color`."""
+    if job.background is None:
+        return np.concatenate([color, coverage[..., None]], axis=-1)
+    behind = exposure * job.background * (1.0 - coverage)[..., None]
+    return np.concatenate([color + behind, np.ones((*coverage.shape, 1))], axis=-1)
+
+
+def inside_border(image: np.ndarray, border) -> np.ndarray:
+    """The part of `image` (H, W, ...) inside the render region: what Blender takes from engines, cropped or not."""
+    if border is None or border.cropped:
+        return image
+    return image[border.top : border.top + border.height, border.left : border.left + border.width]
+
+
+def blender_pixels(image: np.ndarray) -> np.ndarray:
+    """`image` (H, W, C), row 0 on top, as Blender's flat float32 list that starts at the bottom left."""
+    return np.ascontiguousarray(image[::-1], dtype=np.float32).ravel()
+
+
+# Blender redraws its status bar as often as it is told something.
+REPORT_SECONDS = 0.1
+_logger = logging.getLogger(__name__)
+
+
+class LTSH_RenderEngine(bpy.types.RenderEngine):
+    """Area lights with linearly transformed spherical harmonics."""
+
+    bl_idname = ENGINE
+    bl_label = "LTSH"
+    bl_use_preview = False
+    bl_use_shading_nodes_custom = False
+    bl_use_spherical_stereo = False
+    # With the GPU's context Blender's window would stand still during a final render.
+    bl_use_gpu_context = False
+
+    # -- viewport -----------------------------------------------------------------------------------------------------
+
+    def view_update(self, context, depsgraph):
+        """Take over what has changed in the scene."""
+        self._engine_view().update(context, depsgraph)
+
+    def view_draw(self, context, depsgraph):
+        """Draw the view."""
+        self._engine_view().draw(context, depsgraph)
+
+    def _engine_view(self) -> EngineView:
+        if self._view is None:
+            self._view = EngineView()
+        return self._view
+
+    # -- final render -------------------------------------------------------------------------------------------------
+
+    def __init__(self, *arguments, **keywords):
+        super().__init__(*arguments, **keywords)
+        self._view = None
+
+    def update_render_passes(self, scene=None, renderlayer=None):
+        """Tell Blender the passes, which the compositor then has as sockets."""
+        self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
+        for name in pass_names(_prefixes(scene.ltsh_view)):
+            self.register_pass(scene, renderlayer, name, 3, "RGB", "COLOR")
+
+    def render(self, depsgraph):
+        """Render one view layer of one frame."""
+        # What is raised here would be printed and the picture saved as if all were well.
+        try:
+            self._render(depsgraph)
+        except Cancelled:
+            pass
+        except (SceneError, TableError, OSError, ValueError, ImportError, MemoryError) as error:
+            self._fail(error)
+        except Exception as error:
+            _logger.exception("unexpected error in a final render")
+            self._fail(f"{type(error).__name__}: {error}")
+
+    def _fail(self, error) -> None:
+        message = f"LTSH: {' '.join(str(error).split()) or type(error).__name__}"
+        self.error_set(message)
+        # Only a reported error makes bpy.ops.render.render fail.
+        self.report({"ERROR"}, message)
+
+    def _render(self, depsgraph) -> None:
+        job = _job_of(self, depsgraph)
+        scene_file = saved_copy()
+        picture = stoppable(lambda report: final_picture(job, scene_file, report), self._progress())
+        for warning in picture.warnings:
+            self.report({"WARNING"}, warning)
+        for name in picture.passes:
+            self.add_pass(name, 3, "RGB", layer=job.view_layer)
+        height, width = picture.combined.shape[:2]
+        result = self.begin_result(0, 0, width, height, layer=job.view_layer)
+        passes = result.layers[0].passes
+        passes["Combined"].rect.foreach_set(blender_pixels(picture.combined))
+        for name, image in picture.passes.items():
+            passes[name].rect.foreach_set(blender_pixels(image))
+        self.end_result(result)
+
+    def _progress(self):
+        """A progress callback that shows where the render stands, and stops it when the user does."""
+        last = [0.0]
+
+        def progress(stage: str, fraction: float) -> bool:
+            now = time.monotonic()
+            if now - last[0] >= REPORT_SECONDS:
+                last[0] = now
+                self.update_progress(min(max(fraction, 0.0), 1.0))
+                self.update_stats("", f"LTSH: {stage}")
+            return not self.test_break()
+
+        return progress
+
+
+def _prefixes(settings) -> list[str]:
+    others = TECHNIQUE_LABELS.values() if settings.technique_passes else ()
+    return ["LTSH", *others]
+
+
+def _job_of(engine, depsgraph) -> FinalJob:
+    scene = depsgraph.scene
+    settings = scene.ltsh_view
+    return FinalJob(
+        scene=scene.name,
+        view_layer=depsgraph.view_layer.name,
+        frame=scene.frame_current if engine.is_animation else None,
+        sub_samples=settings.render_samples,
+        technique=settings.technique,
+        shown=settings.shown,
+        other_techniques=tuple(TECHNIQUE_LABELS) if settings.technique_passes else (),
+        background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
+    )
+
+
+def register() -> None:
+    """Add the engine and what its final renders need."""
+    bpy.utils.register_class(LTSH_RenderEngine)
+    _keep_copies()
+    view.register()
+
+
+def unregister() -> None:
+    """Remove what `register` added."""
+    view.unregister()
+    _drop_copies()
+    bpy.utils.unregister_class(LTSH_RenderEngine)

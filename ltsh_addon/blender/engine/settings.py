@@ -1,0 +1,320 @@
+"""Settings of the view, their panels, and the line that splits it."""
+
+from __future__ import annotations
+
+import bpy
+import gpu
+from gpu_extras.batch import batch_for_shader
+
+from ..ui.preview import ENGINE
+
+TECHNIQUES = (
+    ("ltc", "LTC", "Linearly transformed cosines (Heitz et al. 2016), as in EEVEE"),
+    ("ltsh2", "LTSH 2", "Linearly transformed spherical harmonics up to degree 2"),
+    ("ltsh4", "LTSH 4", "Linearly transformed spherical harmonics up to degree 4, the most accurate"),
+)
+TECHNIQUE_LABELS = {name: label for name, label, _ in TECHNIQUES}
+SHOWN_PASSES = (
+    ("combined", "Both", "Specular and diffuse reflection, emission and background"),
+    ("specular", "Specular", "Light that the glossy lobes reflect"),
+    ("diffuse", "Diffuse", "Light that the diffuse lobes reflect"),
+)
+MODES = (
+    ("single", "Single", "The technique alone"),
+    ("split", "Split", "The technique left of a line that can be dragged, the second technique right of it"),
+    ("difference", "Difference", "The technique minus the second: red is brighter, blue darker, white equal"),
+)
+CYCLES = "cycles"
+SECOND_PICTURES = (
+    *TECHNIQUES,
+    (CYCLES, "Cycles", "The picture that Compare with Cycles has made, where the view is through its camera"),
+)
+SECOND_LABELS = {name: label for name, label, _ in SECOND_PICTURES}
+
+
+def _redraw(settings, context) -> None:
+    """Show a changed setting at once: the viewport does not redraw for properties of add-ons."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+class LTSH_ViewSettings(bpy.types.PropertyGroup):
+    """Settings of the viewport and of final renders with the engine LTSH."""
+
+    technique: bpy.props.EnumProperty(
+        name="Technique", description="What shades the picture", items=TECHNIQUES, default="ltsh4", update=_redraw
+    )
+    shown: bpy.props.EnumProperty(
+        name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw
+    )
+    mode: bpy.props.EnumProperty(
+        name="Mode", description="One technique or two", items=MODES, default="single", update=_redraw
+    )
+    second_technique: bpy.props.EnumProperty(
+        name="Second",
+        description="What the technique is put beside",
+        items=SECOND_PICTURES,
+        default="ltc",
+        update=_redraw,
+    )
+    split_position: bpy.props.FloatProperty(
+        name="Split",
+        description="Where the line stands between the left edge and the right one",
+        min=0.0,
+        max=1.0,
+        default=0.5,
+        subtype="FACTOR",
+        update=_redraw,
+    )
+    difference_scale: bpy.props.FloatProperty(
+        name="Scale",
+        description="Difference of radiance that gets the full color",
+        min=1e-4,
+        soft_max=10.0,
+        default=0.25,
+        precision=3,
+        update=_redraw,
+    )
+    render_samples: bpy.props.IntProperty(
+        name="Render Samples",
+        description="Points per pixel of final renders, drawn from the pixel filter; 1 takes pixel centers",
+        min=1,
+        soft_max=64,
+        default=4,
+    )
+    technique_passes: bpy.props.BoolProperty(
+        name="Passes of All Techniques",
+        description="Final renders also have a specular and a diffuse pass of every technique",
+        default=False,
+    )
+    artist_engine: bpy.props.StringProperty(
+        name="Former Engine", description="The render engine to give back after the preview", options={"HIDDEN"}
+    )
+
+
+def draw_view_settings(layout, scene) -> None:
+    """The controls of what is seen; the same in every panel that shows them."""
+    settings = scene.ltsh_view
+    if settings.artist_engine:
+        layout.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK")
+    layout.prop(settings, "technique")
+    layout.prop(settings, "shown")
+    layout.prop(settings, "mode")
+    if settings.mode in ("split", "difference"):
+        layout.prop(settings, "second_technique")
+    if settings.mode == "split":
+        layout.prop(settings, "split_position", slider=True)
+    if settings.mode == "difference":
+        layout.prop(settings, "difference_scale")
+
+
+class _View:
+    bl_label = "LTSH Viewport"
+
+    @classmethod
+    def poll(cls, context):
+        return context.engine == ENGINE
+
+    def draw(self, context):
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        draw_view_settings(layout, context.scene)
+
+
+class LTSH_PT_view_sidebar(_View, bpy.types.Panel):
+    """What is seen, in the sidebar of the 3D view."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "LTSH"
+
+
+class LTSH_PT_view(_View, bpy.types.Panel):
+    """The engine's panel in the render properties."""
+
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "render"
+    COMPAT_ENGINES = {ENGINE}
+
+    def draw(self, context):
+        super().draw(context)
+        column = self.layout.column(heading="Final Render")
+        column.prop(context.scene.ltsh_view, "render_samples", text="Samples")
+        column.prop(context.scene.ltsh_view, "technique_passes")
+
+
+VIEW_CLASSES = (LTSH_ViewSettings, LTSH_PT_view_sidebar, LTSH_PT_view)
+
+
+def _register_view() -> None:
+    """Add the settings and their panel."""
+    for cls in VIEW_CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
+
+
+def _unregister_view() -> None:
+    """Remove what `register` added."""
+    del bpy.types.Scene.ltsh_view
+    for cls in reversed(VIEW_CLASSES):
+        bpy.utils.unregister_class(cls)
+
+
+# Settings of Cycles' renders in these tabs mean nothing to other engines.
+RENDER_TABS = ("render", "view_layer", "output")
+
+
+def _is_cycles(panel) -> bool:
+    """True for panels that Cycles' add-on brings along."""
+    return "cycles" in panel.__module__.split(".")
+
+
+def shared_panels() -> list[type]:
+    """Panels that are about what LTSH shades too: those that Cycles shows, but for its own render settings."""
+    panels = [panel for panel in _below(bpy.types.Panel) if ENGINE not in getattr(panel, "COMPAT_ENGINES", (ENGINE,))]
+    shown = [panel for panel in panels if "CYCLES" in panel.COMPAT_ENGINES]
+    if not shown:
+        # Cycles' add-on is off.
+        return [panel for panel in panels if "BLENDER_RENDER" in panel.COMPAT_ENGINES]
+    return [panel for panel in shown if not _is_cycles(panel) or _is_about_scene(panel)]
+
+
+def _is_about_scene(panel) -> bool:
+    """False for the settings of Cycles' own renders."""
+    tab, space = getattr(panel, "bl_context", ""), getattr(panel, "bl_space_type", "")
+    return (space == "PROPERTIES" and tab not in ("", *RENDER_TABS)) or space == "NODE_EDITOR"
+
+
+def _below(panel) -> list[type]:
+    """All classes derived from `panel`, each once."""
+    found = {}
+    for own in panel.__subclasses__():
+        found[own] = None
+        found.update(dict.fromkeys(_below(own)))
+    return list(found)
+
+
+# Panels that show themselves under our engine, and the engines that they had of their own (None: inherited ones).
+_changed: dict[type, set | None] = {}
+
+
+def _share_panels() -> None:
+    """Show them."""
+    for panel in shared_panels():
+        # A set of its own: Cycles' panels share one, those for its render settings included.
+        _changed[panel] = vars(panel).get("COMPAT_ENGINES")
+        panel.COMPAT_ENGINES = {*panel.COMPAT_ENGINES, ENGINE}
+
+
+def _unshare_panels() -> None:
+    """Hide them again."""
+    while _changed:
+        panel, engines = _changed.popitem()
+        if engines is None:
+            del panel.COMPAT_ENGINES
+        else:
+            panel.COMPAT_ENGINES = engines
+
+
+REACH = 8.0  # pixels of an unscaled interface
+HANDLE = 12.0
+
+
+def is_split(context) -> bool:
+    """True in 3D views that show a split picture."""
+    space = context.space_data
+    shown = space is not None and space.type == "VIEW_3D" and space.shading.type == "RENDERED"
+    return shown and context.engine == ENGINE and context.scene.ltsh_view.mode == "split"
+
+
+def _line_place(context) -> float:
+    return context.scene.ltsh_view.split_position * context.region.width
+
+
+class LTSH_GT_split(bpy.types.Gizmo):
+    """A vertical line that moves sideways."""
+
+    bl_idname = "LTSH_GT_split"
+
+    def test_select(self, context, location):
+        reach = REACH * context.preferences.system.ui_scale
+        return 0 if abs(location[0] - _line_place(context)) <= reach else -1
+
+    def draw(self, context):
+        """Draw the handle, an arrow to either side; the line is part of the picture."""
+        size = HANDLE * context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
+        x, y = _line_place(context), 0.5 * context.region.height
+        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+        gpu.state.blend_set("ALPHA")
+        shader.bind()
+        for grown, color in ((0.3 * size, (0.0, 0.0, 0.0, 0.6)), (0.0, (0.95, 0.95, 0.95, 1.0))):
+            shader.uniform_float("color", color)
+            corners = []
+            for side in (-1.0, 1.0):
+                inner, tip = x + side * (0.4 * size - 0.5 * grown), x + side * (1.2 * size + grown)
+                corners += [(inner, y + 0.8 * size + grown), (inner, y - 0.8 * size - grown), (tip, y)]
+            batch_for_shader(shader, "TRIS", {"pos": [(*corner, 0.0) for corner in corners]}).draw(shader)
+        gpu.state.blend_set("NONE")
+
+    def invoke(self, context, event):
+        self.start = context.scene.ltsh_view.split_position
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event, tweak):
+        width = max(context.region.width, 1)
+        context.scene.ltsh_view.split_position = min(max(event.mouse_region_x / width, 0.0), 1.0)
+        return {"RUNNING_MODAL"}
+
+    def exit(self, context, cancel):
+        if cancel:
+            context.scene.ltsh_view.split_position = self.start
+
+
+class LTSH_GGT_split(bpy.types.GizmoGroup):
+    """The line in every 3D view that is split."""
+
+    bl_idname = "LTSH_GGT_split"
+    bl_label = "LTSH split view"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "WINDOW"
+    bl_options = {"PERSISTENT", "SHOW_MODAL_ALL"}
+
+    @classmethod
+    def poll(cls, context):
+        return is_split(context)
+
+    def setup(self, context):
+        self.line = self.gizmos.new(LTSH_GT_split.bl_idname)
+        self.line.use_draw_modal = True
+
+
+SPLIT_CLASSES = (LTSH_GT_split, LTSH_GGT_split)
+
+
+def _register_split() -> None:
+    """Add the gizmo."""
+    for cls in SPLIT_CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def _unregister_split() -> None:
+    """Remove it."""
+    for cls in reversed(SPLIT_CLASSES):
+        bpy.utils.unregister_class(cls)
+
+
+def register() -> None:
+    """Add all of it to Blender."""
+    _register_view()
+    _share_panels()
+    _register_split()
+
+
+def unregister() -> None:
+    """Remove what `register` added."""
+    _unregister_split()
+    _unshare_panels()
+    _unregister_view()

@@ -1,0 +1,165 @@
+"""What the evaluated scene holds: surfaces, instances, and what emitters light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+
+
+def read_values(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
+    """An array of `shape` of the property `name` of all items of one of Blender's collections."""
+    values = np.empty(int(np.prod(shape)), dtype)
+    collection.foreach_get(name, values)
+    return values.reshape(shape)
+
+
+SURFACE_TYPES = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CURVES", "POINTCLOUD")
+
+
+class _InventoryEngine(bpy.types.RenderEngine):
+    bl_idname = "LTSH_INVENTORY"
+    bl_label = "LTSH inventory"
+    visit: Callable | None = None
+    outcome: list = []
+
+    def render(self, depsgraph):
+        # An exception here would be printed and swallowed by Blender: hand it over instead.
+        try:
+            _InventoryEngine.outcome.append((_InventoryEngine.visit(depsgraph), None))
+        except Exception as error:
+            _InventoryEngine.outcome.append((None, error))
+
+
+def with_render_depsgraph(scene, visit: Callable):
+    """The result of `visit(depsgraph)`, called with the depsgraph of a final render of `scene`."""
+    engine, filepath = scene.render.engine, scene.render.filepath
+    _InventoryEngine.visit, _InventoryEngine.outcome = visit, []
+    bpy.utils.register_class(_InventoryEngine)
+    try:
+        scene.render.engine = _InventoryEngine.bl_idname
+        bpy.ops.render.render(scene=scene.name)
+    finally:
+        scene.render.engine, scene.render.filepath = engine, filepath
+        # Blender 4.5 hangs at exit when an engine is still registered.
+        bpy.utils.unregister_class(_InventoryEngine)
+        _InventoryEngine.visit = None
+    if not _InventoryEngine.outcome:
+        raise RuntimeError(f"scene {scene.name!r}: Blender did not evaluate it for rendering, expected one view layer")
+    value, error = _InventoryEngine.outcome[0]
+    if error is not None:
+        raise error
+    return value
+
+
+@dataclass(frozen=True)
+class EmitterTraits:
+    """What an object gives its light besides power: its light group and the lobes it lights."""
+
+    group: str
+    diffuse: bool
+    glossy: bool
+
+    @classmethod
+    def of(cls, instance) -> EmitterTraits:
+        """Those of a depsgraph instance: as Cycles has it, the outermost instancer may withhold lobes, and its group
+        counts where the object itself has none."""
+        ob = instance.object
+        group, diffuse, glossy = ob.original.lightgroup, ob.visible_diffuse, ob.visible_glossy
+        if instance.is_instance and instance.parent is not None:
+            parent = instance.parent
+            group = group or parent.original.lightgroup
+            diffuse, glossy = diffuse and parent.visible_diffuse, glossy and parent.visible_glossy
+        return cls(group, diffuse, glossy)
+
+
+@dataclass(frozen=True)
+class MaterialSlot:
+    """A slot of a rendered surface; `material` is the original or None."""
+
+    material: object
+
+
+@dataclass(frozen=True)
+class RenderedSurface:
+    """An original object with a surface and what stood in its slots when evaluated.
+
+    The evaluated object itself may be gone: Blender makes those of instances for one step of the iteration.
+    """
+
+    original: object
+    material_slots: tuple[MaterialSlot, ...]
+
+    @classmethod
+    def of(cls, ob) -> RenderedSurface:
+        """That of an evaluated object."""
+        materials = [slot.material for slot in ob.material_slots]
+        slots = (MaterialSlot(None if material is None else material.original) for material in materials)
+        return cls(ob.original, tuple(slots))
+
+
+def surface_instancer(instance) -> RenderedSurface | None:
+    """The outermost instancer of a depsgraph instance where that has a surface itself."""
+    if instance.is_instance and instance.parent is not None and instance.parent.type in SURFACE_TYPES:
+        return RenderedSurface.of(instance.parent)
+    return None
+
+
+def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
+    """Objects with a surface, instances included, each once."""
+    found = {}
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        # Hair grows on emitters that are not shown themselves, and has their materials.
+        if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
+            key = (ob.original.name_full, ob.data.name_full if ob.data else "")
+            if key not in found:
+                found[key] = RenderedSurface.of(ob)
+    return list(found.values())
+
+
+def is_surface(instance) -> bool:
+    """True for what has surfaces that are shown."""
+    return instance.object.type in SURFACE_TYPES and instance.show_self
+
+
+def owner_of(instance):
+    """The object that brings the instance into the scene: itself, or what instances it."""
+    return instance.parent if instance.is_instance and instance.parent else instance.object
+
+
+def is_seen_by_cameras(instance) -> bool:
+    """False where the artist hides it from camera rays."""
+    return instance.object.visible_camera and owner_of(instance).visible_camera
+
+
+def data_pointer(ob) -> int:
+    """What is the same for evaluated objects that share their data."""
+    return ob.data.as_pointer() if ob.data is not None else 0
+
+
+def mesh_key(instance) -> tuple:
+    """What tells evaluated meshes apart: object, data and instancer, then the evaluated data itself.
+
+    Blender may use the place of freed data again, but then one of the first three has changed.
+    """
+    ob = instance.object
+    data = ob.data
+    parent = instance.parent.original.session_uid if instance.is_instance and instance.parent else 0
+    original = data.original.session_uid if data is not None and data.original is not None else 0
+    pointer = data_pointer(ob)
+    shared = isinstance(data, bpy.types.Mesh) and not ob.modifiers and not instance.is_instance
+    return (0 if shared else ob.original.session_uid, original, parent, pointer)
+
+
+def visibility(depsgraph, space):
+    """A test of depsgraph instances: are they seen in `space`? Only its local view makes a difference."""
+    if space is None or space.local_view is None:
+        return lambda instance: True
+
+    def in_local_view(instance) -> bool:
+        return owner_of(instance).original.local_view_get(space)
+
+    return in_local_view

@@ -1,0 +1,1 @@
+"""From an evaluated scene to samples, in the second Blender: pixels, texels."""

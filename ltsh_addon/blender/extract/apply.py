@@ -1,0 +1,96 @@
+"""The child's task that puts baked textures to use: a new .blend whose objects show them (runs in the child)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from ..materials.graph import cut, ensure_nodes, material_output
+from ..process.blender_process import SceneError
+from ..saving import save_copy
+from .pixels import open_scene
+
+GROUP_PREFIX = "LTSH Bake"
+
+
+def apply_bake(job: dict, progress) -> dict:
+    """Do the `job` (see `bake_child.apply_bake`): open the scene, give every baked object copies of its materials that
+    show the texture, save the file `job["path"]`; the manifest."""
+    warnings = []
+    progress("open scene", 0.0)
+    open_scene(Path(job["scene"]), warnings)
+    path = Path(job["path"])
+    for entry in job["textures"]:
+        ob = bpy.data.objects.get(entry["object"])
+        if ob is None:
+            raise SceneError(f"object {entry['object']!r} is gone from {job['scene']}")
+        group = _group(ob.name, _image(entry), entry["uv"])
+        _show(ob, group)
+    bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
+    save_copy(path, relative_remap=True)
+    return {"warnings": warnings}
+
+
+def _image(entry):
+    """The texture as an image datablock, in linear colors."""
+    first = entry["files"][0]
+    image = bpy.data.images.load(first["path"], check_existing=False)
+    image.name = entry["name"]
+    if len(entry["files"]) > 1:
+        image.source = "TILED"
+        for file in entry["files"][1:]:
+            image.tiles.new(tile_number=file["tile"])
+        image.filepath = first["path"].replace(f".{first['tile']}.", ".<UDIM>.")
+    try:
+        # From the file that is open: saving elsewhere adapts all such paths.
+        image.filepath = bpy.path.relpath(image.filepath)
+    except ValueError:
+        pass  # on another drive
+    # The name of the scene's linear space differs between color configurations.
+    for space in ("Linear Rec.709", "scene_linear"):
+        try:
+            image.colorspace_settings.name = space
+            break
+        except TypeError:
+            continue
+    return image
+
+
+def _group(name: str, image, uv_name: str):
+    """A node group that gives the texture as a color and as emission."""
+    group = bpy.data.node_groups.new(f"{GROUP_PREFIX} {name}", "ShaderNodeTree")
+    group.interface.new_socket("Emission", in_out="OUTPUT", socket_type="NodeSocketShader")
+    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    coordinates, texture = group.nodes.new("ShaderNodeUVMap"), group.nodes.new("ShaderNodeTexImage")
+    emission, output = group.nodes.new("ShaderNodeEmission"), group.nodes.new("NodeGroupOutput")
+    coordinates.uv_map, texture.image = uv_name, image
+    group.links.new(coordinates.outputs["UV"], texture.inputs["Vector"])
+    group.links.new(texture.outputs["Color"], emission.inputs["Color"])
+    group.links.new(emission.outputs[0], output.inputs["Emission"])
+    group.links.new(texture.outputs["Color"], output.inputs["Color"])
+    for number, node in enumerate((coordinates, texture, emission, output)):
+        node.location = (300.0 * number - 450.0, 0.0)
+    return group
+
+
+def _show(ob, group) -> None:
+    """Give `ob` copies of its materials whose surface is the group's emission; what was there stays beside it."""
+    if len(ob.material_slots) == 0:
+        ob.data.materials.append(None)
+    for slot in ob.material_slots:
+        shown = slot.material
+        # The mesh may have other users, which go on showing their materials.
+        slot.link = "OBJECT"
+        name = shown.name if shown is not None else ob.name
+        material = shown.copy() if shown is not None else bpy.data.materials.new(name)
+        material.name = f"{name} (baked {ob.name})"
+        ensure_nodes(material)
+        tree = material.node_tree
+        output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
+        node = tree.nodes.new("ShaderNodeGroup")
+        node.node_tree, node.label, node.width = group, group.name, 220.0
+        node.location = (output.location.x - 260.0, output.location.y + 220.0)
+        cut(tree, output.inputs["Surface"])
+        tree.links.new(node.outputs["Emission"], output.inputs["Surface"])
+        slot.material = material

@@ -1,0 +1,512 @@
+"""Samples, lights and Cycles' own bake of texels (runs in the child)."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...cycles.texels import BakeView, TexelMesh
+from ...cycles.uv import tiles_of
+from ...files import save_array
+from ...scene import FARTHEST
+from .. import render_settings
+from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
+from ..lights.area import collect_lights, seen_lights
+from ..materials.aovs import (
+    RECEIVER_PROPERTY,
+    MaterialLobes,
+    MaterialReport,
+    give_default_material,
+    lobes_of,
+    objects_without_material,
+)
+from ..materials.graph import ensure_nodes
+from ..materials.maps import MaterialPlan
+from ..materials.values import SavedImages
+from ..process.blender_process import SceneError, listed
+from ..render_settings import working_space
+from . import pixels
+from .pixels import remove_occlusion
+
+UV_LAYER = "ltsh_texels"
+NOT_BAKED = -1e9
+SEEDS = {"A": 1, "B": 7919}
+CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
+
+
+class ObjectError(Exception):
+    """An object cannot be baked; the message is one line and names it."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Rows of a tile: first row (from below), number of rows, and the size of the whole tile."""
+
+    tile: int
+    first_row: int
+    rows: int
+    width: int
+    height: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.tile}_{self.first_row}"
+
+    def placed(self, uv: np.ndarray) -> np.ndarray:
+        """uv (N, 2) so that the block fills the unit square."""
+        column, row = (self.tile - 1001) % 10, (self.tile - 1001) // 10
+        v = (uv[:, 1] - row) * (self.height / self.rows) - self.first_row / self.rows
+        return np.stack([uv[:, 0] - column, v], axis=-1)
+
+
+def chosen_objects(scene, view_layer, wanted) -> list:
+    """Objects to bake: "all" meshes that render, the "selected" ones, or those named. Raises SceneError."""
+    if isinstance(wanted, str):
+        objects = [
+            ob for ob in view_layer.objects
+            if ob.type == "MESH" and not ob.hide_render and (wanted == "all" or ob.select_get())
+        ]  # fmt: skip
+        if not objects:
+            raise SceneError(
+                f"scene {scene.name!r}: no mesh that renders"
+                + (" is selected; select one in the file or name it" if wanted == "selected" else ", nothing to bake")
+            )
+        return objects
+    missing = [name for name in wanted if name not in view_layer.objects]
+    if missing:
+        names = listed((ob.name for ob in view_layer.objects if ob.type == "MESH"), missing[0])
+        raise SceneError(f"object {missing[0]!r} is not in scene {scene.name!r}; meshes there: {names}")
+    return [view_layer.objects[name] for name in wanted]
+
+
+def check_object(ob) -> None:
+    """Raise ObjectError for what can be told without evaluating the object."""
+    if ob.type != "MESH":
+        raise ObjectError(f"object {ob.name!r} is a {ob.type}, expected a mesh: convert it to one")
+    if ob.library is not None or ob.data.library is not None:
+        library = (ob.library or ob.data.library).filepath
+        raise ObjectError(f"object {ob.name!r} is linked from {library}: bake it there, or make it local")
+    if ob.hide_render:
+        raise ObjectError(f"object {ob.name!r} is hidden in renders: show it")
+
+
+def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
+    """UDIM tiles of a mesh object; none where they cannot be told without evaluating it."""
+    if ob.type != "MESH" or ob.modifiers or len(ob.data.loops) == 0:
+        return []
+    layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
+    if layer is None:
+        return []
+    uv = _uv_of(layer, len(ob.data.loops))
+    if (np.floor(uv.min(axis=0)) == 0.0).all() and (uv.max(axis=0) <= 1.0).all():
+        return [1001]
+    ob.data.calc_loop_triangles()
+    triangles = read_values(ob.data.loop_triangles, "loops", (3 * len(ob.data.loop_triangles),), np.int32)
+    return tiles_of(uv[triangles].reshape(-1, 3, 2))[0]
+
+
+def read_mesh(ob, depsgraph, uv_name: str | None) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
+    """The object `ob` as `depsgraph` evaluates it, the name of its UV map, and all of its UV maps (T, 3, 2) by name, ""
+    for the one that renders. Raises ObjectError."""
+    evaluated = ob.evaluated_get(depsgraph)
+    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
+    try:
+        return _read(ob, mesh, np.array(evaluated.matrix_world, dtype=np.float64), uv_name)
+    finally:
+        evaluated.to_mesh_clear()
+
+
+def _read(ob, mesh, matrix, uv_name):
+    mesh.calc_loop_triangles()
+    count = len(mesh.loop_triangles)
+    if count == 0:
+        raise ObjectError(f"object {ob.name!r} has no faces, nothing to bake")
+    layer = mesh.uv_layers.get(uv_name) if uv_name else mesh.uv_layers.active
+    if layer is None:
+        names = ", ".join(repr(other.name) for other in mesh.uv_layers) or "none"
+        wanted = f"no UV map {uv_name!r}" if uv_name else "no UV map"
+        raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or name another with --uv")
+    loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
+    positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+    normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)
+    maps = {other.name: _uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
+    uv = maps[layer.name]
+    linear = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-30:
+        raise ObjectError(f"object {ob.name!r}: its transform has no inverse, expected a scale other than 0")
+    if max(np.abs(matrix).max(), np.abs(positions[vertices]).max()) > FARTHEST:
+        raise ObjectError(f"object {ob.name!r} is farther away, or larger, than {FARTHEST:g} m: move it, or scale it")
+    world_normals = normals[loops].astype(np.float64) @ np.linalg.inv(linear)
+    world_normals /= np.maximum(np.linalg.norm(world_normals, axis=-1, keepdims=True), 1e-30)
+    slots = max(len(ob.material_slots), 1)
+    found = TexelMesh(
+        corners=(positions[vertices].astype(np.float64) @ linear.T + matrix[:3, 3]).reshape(count, 3, 3),
+        normals=world_normals.reshape(count, 3, 3),
+        uv=uv,
+        material=np.minimum(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), slots - 1),
+        vertices=vertices.reshape(count, 3),
+    )
+    a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
+    if not np.any((b - a)[:, 0] * (c - a)[:, 1] != (b - a)[:, 1] * (c - a)[:, 0]):
+        raise ObjectError(f"object {ob.name!r}: all faces of UV map {layer.name!r} have no area: unwrap it")
+    if not tiles_of(uv)[0]:
+        raise ObjectError(
+            f"object {ob.name!r}: all of UV map {layer.name!r} lies outside of the texture, expected some of it "
+            "between 0 and 1, or whole faces in UDIM tiles: move it"
+        )
+    rendered = next((other.name for other in mesh.uv_layers if other.active_render), layer.name)
+    return found, layer.name, {**maps, "": maps[rendered]}
+
+
+def _uv_of(layer, count):
+    return read_values(layer.uv, "vector", (count, 2), np.float32)
+
+
+class ObjectBake:
+    """Bakes maps of one object through Cycles, block by block."""
+
+    def __init__(self, scene, ob, uv_name: str, plans: list[MaterialPlan]):
+        self.scene, self.ob, self.uv_name, self.plans = scene, ob, uv_name, plans
+        if uv_name not in ob.data.uv_layers:
+            raise ObjectError(
+                f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers, where textures cannot be baked: "
+                "apply the modifiers"
+            )
+        active = ob.data.uv_layers.active_index
+        layer = ob.data.uv_layers.new(name=UV_LAYER, do_init=False)
+        if layer is None:
+            raise ObjectError(f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one")
+        ob.data.uv_layers.active_index = active
+        # A name in use gets a number.
+        self.layer_name, self.images = layer.name, {}
+        for plan in plans:
+            plan.prepare()
+
+    def close(self) -> None:
+        """Take the UV map and the images out again."""
+        self.ob.data.uv_layers.remove(self.ob.data.uv_layers[self.layer_name])
+        for plan in self.plans:
+            plan.remove()
+        for image in self.images.values():
+            bpy.data.images.remove(image)
+
+    def maps(self, block: Block) -> np.ndarray:
+        """(N, rows, W, 3) float32, row 0 below: map n of every material at once."""
+        found = []
+        for number in range(max((plan.count for plan in self.plans), default=0)):
+            for plan in self.plans:
+                plan.show(number)
+            # A seed of its own: whatever was baked before, the bytes are the same.
+            self.scene.cycles.seed, self.scene.cycles.samples = 0, 1
+            found.append(self._bake(block, "EMIT", set()))
+        return np.array(found)
+
+    def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
+        """(2, rows, W, 3): Cycles' direct light, colors included, as two halves with their own seeds."""
+        for plan in self.plans:
+            plan.show(None)
+        halves = []
+        for seed in SEEDS.values():
+            self.scene.cycles.seed, self.scene.cycles.samples = seed, samples
+            halves.append(self._bake(block, CYCLES_TYPES[kind], {"DIRECT", "COLOR"}))
+        return np.array(halves)
+
+    def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
+        image = self._image(block)
+        image.pixels.foreach_set(np.full(block.rows * block.width * 4, NOT_BAKED, np.float32))
+        self._place(block)
+        for plan in self.plans:
+            plan.target(image)
+        options = {"pass_filter": pass_filter} if pass_filter else {}
+        with bpy.context.temp_override(
+            scene=self.scene, active_object=self.ob, object=self.ob, selected_objects=[self.ob]
+        ):
+            bpy.ops.object.bake(
+                type=kind, margin=0, use_clear=False, uv_layer=self.layer_name, target="IMAGE_TEXTURES",
+                save_mode="INTERNAL", use_selected_to_active=False, **options,
+            )  # fmt: skip
+        pixels = np.empty(block.rows * block.width * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        return np.ascontiguousarray(pixels.reshape(block.rows, block.width, 4)[..., :3])
+
+    def _image(self, block):
+        size = block.width, block.rows
+        if size not in self.images:
+            image = bpy.data.images.new("ltsh bake", *size, alpha=True, float_buffer=True, is_data=True)
+            self.images[size] = image
+        return self.images[size]
+
+    def _place(self, block):
+        layers = self.ob.data.uv_layers
+        count = len(self.ob.data.loops)
+        uv = _uv_of(layers[self.uv_name], count).astype(np.float64)
+        layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
+        self.ob.data.update()
+
+
+def view_of(wanted, camera, bent: bool) -> BakeView:
+    """The view `wanted`: "camera", "above" or a position (3,)."""
+    if wanted == "above":
+        return BakeView("above")
+    if wanted == "camera":
+        matrix = np.array(camera.matrix_world, dtype=np.float64)
+        if camera.data.type == "ORTHO":
+            axis = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
+            return BakeView("direction", tuple(axis.tolist()), bent)
+        return BakeView("point", tuple(matrix[:3, 3].tolist()), bent)
+    return BakeView("point", tuple(wanted), bent)
+
+
+# What may differ between jobs that one open file serves.
+_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images", "watch_parent", "temporary")
+
+
+@dataclass(frozen=True)
+class ReadMesh:
+    """Mesh and UV maps of an object, in files."""
+
+    mesh: Path  # as TexelMesh.load reads it
+    uv_name: str
+    uv_names: tuple[str, ...]  # "" for the one that renders
+    uv_maps: Path  # .npz, (T, 3, 2) by the number of the name
+
+    def uv_map(self, name: str) -> np.ndarray:
+        """(T, 3, 2)."""
+        with np.load(self.uv_maps) as data:
+            return data[str(self.uv_names.index(name))]
+
+
+@dataclass
+class BakeScene:
+    """The open file; `meshes` or `problems` have each of the objects that were named when it was opened."""
+
+    scene: object
+    camera: str
+    view: BakeView
+    lights: list
+    warnings: list[str]
+    names: list[str]
+    meshes: dict[str, ReadMesh]
+    problems: dict[str, str]
+    lobes: dict[str, tuple[MaterialLobes | None, list[str]]]  # with warnings, by full name of the material
+    folder: tempfile.TemporaryDirectory = field(repr=False)
+
+    def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
+        """The maps that the material slots of an object need, and warnings about its materials."""
+        uv_names, made, warnings = set(self.meshes[ob.name].uv_names), {}, []
+        for slot in ob.material_slots:
+            material = slot.material
+            if material.name_full not in made:
+                lobes, lines = self.lobes[material.name_full]
+                values = lobes.values if lobes is not None else ()
+                trees = tuple(leaf.tree for leaf in lobes.leaves) if lobes is not None else ()
+                made[material.name_full] = MaterialPlan(material, values, trees, images, uv_names)
+                warnings += lines
+        return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))
+
+
+_kept: dict[str, tuple] = {}
+
+
+def opened_scene(job: dict, progress) -> BakeScene:
+    """The file of `job` (see `bake_child.BakeJob`), opened unless it is already, as it stands on the disk."""
+    status = Path(job["scene"]).stat()
+    key = {name: value for name, value in job.items() if name not in _OF_ONE_JOB}
+    key = repr(sorted(key.items())), status.st_mtime_ns, status.st_size, pixels.files_opened()
+    if _kept.get("key") == key:
+        kept = _kept["scene"]
+        if not isinstance(job["objects"], str) and set(job["objects"]) <= set(kept.names):
+            return kept
+    close()
+    progress("open scene", 0.0)
+    found = _open(job)
+    _kept.update(key=(*key[:-1], pixels.files_opened()), scene=found)
+    return found
+
+
+def close() -> None:
+    """Forget the open file."""
+    kept = _kept.pop("scene", None)
+    _kept.clear()
+    if kept is not None:
+        kept.folder.cleanup()
+
+
+def _open(job: dict) -> BakeScene:
+    warnings: list[str] = []
+    pixels.open_scene(Path(job["scene"]), warnings, job["scripts"])
+    scene = bpy.context.scene
+    render_settings.go_to_frame(scene, job["frame"])
+    camera = _camera(scene, job)
+    view_layer = render_settings.choose_view_layer(scene, warnings)
+    names = job["objects"]
+    if not isinstance(names, str):
+        names = list(dict.fromkeys([*names, *job["following"]]))
+    objects = chosen_objects(scene, view_layer, names)
+    render_settings.neutralize(scene, view_layer, camera, warnings)
+    render_settings.prepare_surfaces(warnings)
+    if view_layer.material_override is not None:
+        override = view_layer.material_override.name
+        warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
+        view_layer.material_override = None
+    folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
+    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name))
+    give_default_material(bare)
+    lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
+    for material in bpy.data.materials:
+        if material.name_full not in inventory.emitting_materials:
+            material.cycles.emission_sampling = "NONE"
+    inventory.receivers.mark()
+    lights = seen_lights(scene, inventory)
+    warnings.extend(inventory.warnings)
+    if not lights:
+        raise pixels.no_light(scene, inventory.warnings)
+    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    view = view_of(job["view"], camera, bent=job["cycles_samples"] > 0)
+    _look_from(scene, camera, job)
+    remove_occlusion(scene)
+    name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
+    return BakeScene(scene, name, view, lights, warnings, names, meshes, problems, lobes, folder)
+
+
+def _camera(scene, job):
+    """The camera of the view, or one that only stands where a render needs one."""
+    if job["view"] == "camera":
+        return render_settings.choose_camera(scene, job["camera"])
+    camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return camera
+
+
+def _look_from(scene, camera, job) -> None:
+    """Make Cycles' bake see the surfaces as `view_of` does."""
+    scene.render.bake.view_from = "ABOVE_SURFACE" if job["view"] == "above" else "ACTIVE_CAMERA"
+    if not isinstance(job["view"], str):
+        camera.location = job["view"]
+    bpy.context.view_layer.update()
+
+
+def _inspect(scene, objects, uv_name, folder):
+    """Lights, meshes of objects by name, what is wrong with the others by name, and surfaces without material."""
+
+    def visit(depsgraph):
+        meshes, problems = {}, {}
+        # Asked for here, where the depsgraph is that of a render.
+        rendered = {surface.original.name_full: surface for surface in rendered_surfaces(depsgraph)}
+        for number, ob in enumerate(objects):
+            try:
+                check_object(ob)
+                found = read_mesh(ob, depsgraph, uv_name)
+                if ob.name_full not in rendered:
+                    raise ObjectError(f"object {ob.name!r} is not rendered: its collection is excluded or hidden")
+                meshes[ob.name] = _saved(*found, folder, number)
+            except ObjectError as error:
+                problems[ob.name] = str(error)
+        bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
+        return collect_lights(depsgraph), meshes, problems, bare
+
+    return with_render_depsgraph(scene, visit)
+
+
+def _saved(mesh, uv_name, uv_maps, folder, number) -> ReadMesh:
+    path, maps = folder / f"mesh_{number}.npz", folder / f"uv_{number}.npz"
+    mesh.save(path)
+    np.savez(maps, **{str(position): values for position, values in enumerate(uv_maps.values())})
+    return ReadMesh(path, uv_name, tuple(uv_maps), maps)
+
+
+def _lobes(objects, emitting) -> dict[str, tuple[MaterialLobes | None, list[str]]]:
+    """Lobes of the materials of objects, and warnings, by full name of the material."""
+    found = {}
+    for material in (slot.material for ob in objects for slot in ob.material_slots):
+        if material.name_full not in found:
+            report = MaterialReport()
+            ensure_nodes(material)
+            lobes = lobes_of(material, material.name_full in emitting, report)
+            found[material.name_full] = lobes, report.lines()
+    return found
+
+
+def extract_bake(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `bake_child.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
+    started = time.monotonic()
+    opened = opened_scene(job, progress)
+    names = opened.names if isinstance(job["objects"], str) else job["objects"]
+    images = SavedImages(folder) if job["look_up_images"] else None
+    records = []
+    for number, name in enumerate(names):
+        record = {"name": name, "problem": opened.problems.get(name), "warnings": []}
+        if record["problem"] is None:
+            try:
+                record |= _object(opened, name, images, job, folder / f"object_{number}", progress)
+            except (ObjectError, RuntimeError) as error:
+                record["problem"] = " ".join(str(error).split())
+        records.append(record)
+    return {
+        "blender_version": bpy.app.version_string,
+        "frame": opened.scene.frame_current,
+        "lights": [pixels.light_record(light) for light in opened.lights],
+        "color_space": working_space(),
+        "warnings": opened.warnings,
+        "view": vars(opened.view),
+        "camera": opened.camera,
+        "objects": records,
+        "seconds": time.monotonic() - started,
+    }
+
+
+def _object(opened, name, images, job, folder, progress) -> dict:
+    """Write what belongs to one object into `folder`; its record."""
+    ob, read = bpy.context.view_layer.objects[name], opened.meshes[name]
+    plans, warnings = opened.plans(ob, images)
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(read.mesh, folder / "mesh.npz")
+    distinct = list({id(plan): plan for plan in plans}.values())
+    record = {"folder": folder.name, "uv": read.uv_name, "materials": [plan.record() for plan in plans]}
+    record |= {"warnings": warnings, "receiver": int(ob.get(RECEIVER_PROPERTY, 0))}
+    used = sorted({texture["uv"] for plan in plans for texture in plan.textures})
+    record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
+    for uv_name, file in record["uv_maps"].items():
+        save_array(folder / file, read.uv_map(uv_name))
+    record["maps"] = any(plan.count for plan in distinct)
+    if record["maps"] or job["cycles_samples"]:
+        _bake(opened.scene, ob, read, distinct, job, record["maps"], folder, progress)
+    return record
+
+
+def _bake(scene, ob, read, plans, job, with_maps, folder, progress) -> None:
+    """Write the maps and Cycles' bake of the tiles of an object that are wanted and not finished."""
+    bake = ObjectBake(scene, ob, read.uv_name, plans)
+    try:
+        with np.load(read.mesh) as data:
+            blocks = blocks_of(data["uv"], job["width"], job["height"], job["block_rows"])
+        finished = {tile for name, tile in job["finished"] if name == ob.name}
+        blocks = [Block(*values) for values in blocks if values[0] not in finished]
+        if job["tile"] is not None:
+            blocks = [block for block in blocks if block.tile == job["tile"]]
+        for number, block in enumerate(blocks):
+            progress(f"bake {ob.name}", number / len(blocks))
+            if with_maps:
+                save_array(folder / f"maps_{block.name}.npy", bake.maps(block))
+            if job["cycles_samples"]:
+                for kind in job["passes"]:
+                    halves = bake.radiance(block, kind, max(1, job["cycles_samples"] // 2))
+                    save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+    finally:
+        bake.close()
+
+
+def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, int, int, int, int]]:
+    """(tile, first row, rows, width, height) of every block of every UDIM tile in use."""
+    return [
+        (tile, first, min(block_rows, height - first), width, height)
+        for tile in tiles_of(uv)[0]
+        for first in range(0, height, block_rows)
+    ]

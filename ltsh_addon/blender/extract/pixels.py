@@ -1,0 +1,287 @@
+"""Samples, lights and the Cycles reference of a picture (runs in the child)."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .. import render_settings
+from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
+from ..lights.area import LightInventory, collect_lights, seen_lights
+from ..lights.meshes import SIDE_PROPERTY, let_light_through
+from ..materials.aovs import (
+    MaterialReport,
+    declare_aovs,
+    give_default_material,
+    inject_aovs,
+    materials_in_use,
+    objects_without_material,
+    remove_aovs,
+)
+from ..process import client, memory
+from ..process.blender_process import SceneError, listed
+from ..render_settings import (
+    enable_passes,
+    filter_name,
+    pinned_pixel_filter,
+    render_exr,
+    shifted_pixels,
+    sub_pixel_offsets,
+    working_space,
+)
+
+
+def render_pixel_samples(
+    scene, view_layer, folder: Path, sub_samples: int, progress, extra_passes: tuple[str, ...] = ()
+) -> list[str]:
+    """Names of the files in `folder`, one per sub-sample; the points are `sub_pixel_offsets`."""
+    declare_aovs(view_layer)
+    enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
+    scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
+    files, offsets = [], sub_pixel_offsets(scene, sub_samples)
+    with pinned_pixel_filter(scene):
+        for index, offset in enumerate(offsets):
+            progress("samples", index / sub_samples)
+            files.append(f"samples_{index:04d}.exr")
+            with shifted_pixels(scene, offset):
+                render_exr(scene, folder / files[-1])
+    remove_aovs(view_layer)
+    return files
+
+
+SEEDS = {"A": 1, "B": 7919}
+FIRST_CHUNK = 16
+CHUNK_SECONDS = 4.0
+MAX_CHUNKS = 8
+
+
+def remove_occlusion(scene) -> None:
+    """Make every surface, instances included, invisible to all rays but the camera's.
+
+    Objects that shine must stay visible to the rays that they light: these go through them instead.
+    """
+    for ob in bpy.data.objects:
+        if ob.type not in SURFACE_TYPES:
+            continue
+        ob.visible_shadow = ob.visible_transmission = False
+        if SIDE_PROPERTY not in ob:
+            ob.visible_diffuse = ob.visible_glossy = False
+    let_light_through(scene)
+
+
+def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
+    """For each half the list of [file name in `folder`, samples in it]; a half has cycles_samples / 2 samples.
+
+    The camera rays are those of `render_pixel_samples`, so that edges agree: with several sub-samples each gets its
+    share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
+    progress only about once a minute.
+    """
+    remove_occlusion(scene)
+    enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
+    samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
+    share = max(1, samples // sub_samples)
+    with pinned_pixel_filter(scene):
+        if sub_samples == 1:
+            return [_render_half(scene, folder, half, seed, samples, progress) for half, seed in SEEDS.items()]
+        return [_render_shifted(scene, folder, half, seed, offsets, share, progress) for half, seed in SEEDS.items()]
+
+
+def _render_shifted(scene, folder: Path, half: str, seed: int, offsets, share: int, progress) -> list[list]:
+    """One file per sub-sample, each with the next `share` samples of one sequence."""
+    cycles = scene.cycles
+    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, share * len(offsets), True
+    files = []
+    for index, offset in enumerate(offsets):
+        progress(f"Cycles {half}", index / len(offsets))
+        cycles.sample_offset, cycles.sample_subset_length = index * share, share
+        files.append([f"cycles_{half}_{index:04d}.exr", share])
+        with shifted_pixels(scene, offset):
+            render_exr(scene, folder / files[-1][0])
+    cycles.use_sample_subset = False
+    return files
+
+
+def _render_half(scene, folder: Path, half: str, seed: int, samples: int, progress) -> list[list]:
+    cycles = scene.cycles
+    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, samples, True
+    files, done, chunk = [], 0, min(FIRST_CHUNK, samples)
+    while done < samples:
+        progress(f"Cycles {half}", done / samples)
+        started = time.monotonic()
+        cycles.sample_offset, cycles.sample_subset_length = done, min(chunk, samples - done)
+        name = f"cycles_{half}_{len(files):04d}.exr"
+        render_exr(scene, folder / name)
+        files.append([name, cycles.sample_subset_length])
+        done += cycles.sample_subset_length
+        if len(files) == 1 and done < samples:
+            seconds_left = (time.monotonic() - started) * (samples - done) / done
+            chunks = min(MAX_CHUNKS, max(1, round(seconds_left / CHUNK_SECONDS)))
+            chunk = -(-(samples - done) // chunks)
+    cycles.use_sample_subset = False
+    return files
+
+
+def missing_files() -> list[str]:
+    """A warning for each library and each image file in use that is missing."""
+    warnings = []
+    for library in bpy.data.libraries:
+        path = bpy.path.abspath(library.filepath)
+        if not Path(path).is_file():
+            warnings.append(f"library {library.name!r}: {library.filepath} is missing, and what it held with it")
+    for image in bpy.data.images:
+        if image.source != "FILE" or image.packed_file is not None or not image.users or not image.filepath:
+            continue
+        if not Path(bpy.path.abspath(image.filepath, library=image.library)).is_file():
+            warnings.append(f"image {image.name!r}: {image.filepath} is missing, Cycles shows it in one false color")
+    return warnings
+
+
+_files_opened = 0
+
+
+def files_opened() -> int:
+    """How many times `open_scene` was called: what was read from a file holds until the next time."""
+    return _files_opened
+
+
+# So many of a kind are named in an error.
+NAMED = 5
+
+
+def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
+    """Open the .blend `path` in memory; scripts in it run only if asked for."""
+    global _files_opened
+    _files_opened += 1
+    try:
+        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=scripts)
+    except RuntimeError as error:
+        raise SceneError(
+            f"{path}: Blender {bpy.app.version_string} cannot open it, is it whole? ({_reason(error, path)})"
+        ) from None
+    saved, here = tuple(bpy.data.version)[:2], bpy.app.version[:2]
+    if saved > here:
+        raise SceneError(client.newer(path, saved, here))
+    if bpy.app.autoexec_fail:
+        warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
+    warnings.extend(missing_files())
+
+
+def _reason(error: RuntimeError, path: Path) -> str:
+    """What Blender says is wrong with a file, without the file's name."""
+    text = " ".join(str(error).split()).removeprefix("Error: ")
+    for named in (f'Loading "{path}" failed: ', f"Failed to read blend file '{path}': ", f' in file "{path}"'):
+        text = text.replace(named, "")
+    return text
+
+
+def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
+    """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
+    render_settings.neutralize(scene, view_layer, camera, warnings)
+    render_settings.prepare_surfaces(warnings)
+
+    def visit(depsgraph):
+        surfaces = rendered_surfaces(depsgraph)
+        override = view_layer.material_override
+        bare = [] if override else objects_without_material(surfaces)
+        return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
+
+    inventory, materials, bare = with_render_depsgraph(scene, visit)
+    default = give_default_material(bare)
+    report = MaterialReport()
+    inject_aovs(materials + ([default] if default else []), report, inventory.emitting_materials)
+    inventory.receivers.mark()
+    inventory.lights = seen_lights(scene, inventory)
+    warnings.extend(inventory.warnings)
+    if not inventory.lights:
+        raise no_light(scene, inventory.warnings)
+    warnings.extend(report.lines())
+    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    return inventory
+
+
+def no_light(scene, reasons: list[str]) -> SceneError:
+    """The error of a scene in which no light can be shaded, with the first `reasons`."""
+    found = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
+    text = f"found lights {_some(found, ', ')}" if found else "found no lights at all"
+    if reasons:
+        text += f" ({_some([line.partition('; left out')[0] for line in reasons], '; ')})"
+    return SceneError(f"scene {scene.name!r}: no area light that renders, {text}; add an area light")
+
+
+def _some(items: list[str], separator: str) -> str:
+    more = [f"and {len(items) - NAMED} more"] if len(items) > NAMED else []
+    return separator.join([*items[:NAMED], *more])
+
+
+def extract(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `child.extract`), write EXRs into `folder`; the manifest as a dictionary."""
+    started, warnings, seconds = time.monotonic(), [], {}
+    progress("open scene", 0.0)
+    open_scene(Path(job["scene"]), warnings, job.get("scripts", False))
+    scene = _scene_named(job.get("scene_name"))
+    render_settings.go_to_frame(scene, job["frame"])
+    camera = render_settings.choose_camera(scene, job["camera"])
+    view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
+    picture = _picture(scene, job)
+    if job.get("techniques"):
+        size, compared = (picture["width"], picture["height"]), job["cycles_samples"] > 0
+        memory.check(*size, job["sub_samples"], job["techniques"], compared, job["memory_mib"])
+    inventory = prepare_scene(scene, view_layer, camera, warnings)
+    seconds["start"] = time.monotonic() - started
+
+    started = time.monotonic()
+    extra_passes = ("emit",) if job.get("emission") else ()
+    samples = render_pixel_samples(scene, view_layer, folder, job["sub_samples"], progress, extra_passes)
+    seconds["samples"] = time.monotonic() - started
+
+    started, reference = time.monotonic(), None
+    if job["cycles_samples"] > 0:
+        reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
+    seconds["cycles"] = time.monotonic() - started
+    return {
+        "blender_version": bpy.app.version_string,
+        "frame": scene.frame_current,
+        "camera": camera.name,
+        **picture,
+        "lights": [light_record(light) for light in inventory.lights],
+        "warnings": warnings,
+        "samples": samples,
+        "reference": reference,
+        "passes": render_settings.pass_names(),
+        "seconds": seconds,
+    }
+
+
+def _scene_named(name: str | None):
+    """The scene `name` of the open file; None: the one it was saved with."""
+    if name is None:
+        return bpy.context.scene
+    if name not in bpy.data.scenes:
+        scenes = listed((scene.name for scene in bpy.data.scenes), name)
+        raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
+    return bpy.data.scenes[name]
+
+
+def _picture(scene, job: dict) -> dict:
+    """Set the size; what the manifest says about the picture."""
+    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    border = render_settings.render_border(scene)
+    cropped = border is not None and border.cropped
+    return {
+        "width": border.width if cropped else width,
+        "height": border.height if cropped else height,
+        "border": None if border is None else vars(border),
+        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
+        "pixel_filter": filter_name(scene),
+        "exposure": scene.cycles.film_exposure,
+        "color_space": working_space(),
+    }
+
+
+def light_record(light) -> dict:
+    """`light` as JSON has it; AreaLight(**record) reads it back."""
+    record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}
+    return {**record, "detail": [light_record(part) for part in light.detail]}

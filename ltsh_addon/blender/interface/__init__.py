@@ -1,1 +1,0 @@
-"""What artists see: panels, operators, results in the Image Editor, preferences."""

@@ -1,0 +1,482 @@
+"""Meshes that glow, as polygon lights."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import bpy
+import numpy as np
+
+from ...cycles import planar_polygons
+from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
+from ...cycles.planar_polygons import FlatPolygon
+from ...scene import AreaLight
+from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, read_values, surface_instancer
+from ..materials.graph import ensure_nodes, live_link, material_output
+from .emission import PIXELS, Emission, Studio, emission_behind
+from .linking import Receivers
+
+
+@dataclass
+class Placement:
+    """One instance of an object that shines: evaluated mesh in world space."""
+
+    vertices: np.ndarray  # (N, 3)
+    triangles: np.ndarray  # (T, 3) counterclockwise around the side that Cycles calls front
+    slots: np.ndarray  # (T,) index of the material slot
+    matrix: np.ndarray  # (4, 4)
+    mesh: object = None  # copy of the evaluated mesh, where a texture must be looked at
+
+
+@dataclass
+class MeshLight:
+    """An object whose materials may emit, before anybody has looked at them."""
+
+    ob: object  # original
+    light: AreaLight  # a stand-in with all that does not depend on the polygon
+    materials: list  # original material or None per slot
+    emission: list[Emission]  # per slot
+    placements: list[Placement] = field(default_factory=list)
+    instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
+
+    @property
+    def varies(self) -> bool:
+        return any(emission.varies for emission in self.emission)
+
+    @property
+    def emitting_materials(self) -> list[str]:
+        """Full names of the materials that may emit."""
+        pairs = zip(self.materials, self.emission, strict=True)
+        return [material.name_full for material, emission in pairs if emission.emits]
+
+
+def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies: bool = True) -> list[MeshLight]:
+    """Objects that a render of `depsgraph` sees with materials that may emit; `override` replaces all materials.
+
+    Without `copies` of their meshes, textures cannot be looked at, and no data is made.
+    """
+    found: dict[tuple, MeshLight | None] = {}
+    known: dict[str, Emission] = {}
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if ob.type not in SURFACE_TYPES or not instance.show_self or not _is_rendered(ob):
+            continue
+        traits = EmitterTraits.of(instance)
+        slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
+        key = (ob.original.name_full, ob.data.name_full if ob.data else "", slots, traits)
+        if key not in found:
+            found[key] = _mesh_light(ob, traits, override, receivers, known)
+            if found[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
+                warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
+                found[key] = None
+        if found[key] is not None:
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            placement = _placement(ob, matrix, found[key], depsgraph if copies else None)
+            if placement is not None:
+                found[key].placements.append(placement)
+                instancer = surface_instancer(instance)
+                if instancer is not None:
+                    found[key].instancers[instancer.original.name_full] = instancer
+    return [light for light in found.values() if light is not None and light.placements]
+
+
+def _is_rendered(ob) -> bool:
+    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
+    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
+
+
+def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
+    slots = [override] * max(1, len(ob.material_slots)) if override else [slot.material for slot in ob.material_slots]
+    materials = [None if material is None else material.original for material in slots]
+    emission = [_emission_of(material, known) for material in materials]
+    if not any(part.emits for part in emission) or not (traits.diffuse or traits.glossy):
+        return None
+    nothing = np.zeros(3)
+    light = AreaLight(
+        name=ob.original.name,
+        shape="RECTANGLE",
+        center=nothing,
+        half_u=nothing,
+        half_v=nothing,
+        direction=nothing,
+        radiance=nothing,
+        group=traits.group,
+        affects_diffuse=traits.diffuse,
+        affects_specular=traits.glossy,
+        receivers=receivers.of(ob.original),
+    )
+    return MeshLight(ob.original, light, materials, emission)
+
+
+def _emission_of(material, known: dict[str, Emission]) -> Emission:
+    if material is None:
+        return Emission()
+    if material.name_full not in known:
+        tree = material.node_tree if bpy.app.version >= (5, 0, 0) or material.use_nodes else None
+        output = material_output(tree) if tree else None
+        known[material.name_full] = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
+    return known[material.name_full]
+
+
+def displaces(material) -> bool:
+    """True if something feeds the Displacement socket of `material`."""
+    output = material_output(material.node_tree)
+    return output is not None and live_link(output.inputs["Displacement"]) is not None
+
+
+def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement | None:
+    mesh = ob.to_mesh()
+    try:
+        if mesh is None or not np.isfinite(matrix).all():
+            return None
+        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+        mesh.calc_loop_triangles()
+        count = len(mesh.loop_triangles)
+        triangles = read_values(mesh.loop_triangles, "vertices", (count, 3), np.int32)
+        slots = read_values(mesh.loop_triangles, "material_index", (count,), np.int32)
+    finally:
+        ob.to_mesh_clear()
+    slots = np.clip(slots, 0, len(light.materials) - 1)
+    if not len(slots) or not any(light.emission[slot].emits for slot in np.unique(slots)):
+        return None
+    copy = None
+    if light.varies and depsgraph is not None:
+        copy = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=depsgraph)
+    world = vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
+    triangles = triangles.astype(np.int64)
+    if np.linalg.det(matrix[:3, :3]) < 0.0:
+        triangles = triangles[:, ::-1]
+    return Placement(world, triangles, slots, matrix, copy)
+
+
+# Custom property of objects that let light through in the reference: those that shine, and instancers of such. It is
+# 1 where only the front of their faces shines, -1 the back, 0 both.
+SIDE_PROPERTY = "ltsh_emitting_side"
+MOST_POLYGONS = 2000
+# Polygons of one object with a texture that are looked at one by one; beyond, the largest stand for all.
+MOST_LOOKS = 256
+STAND_INS = 32
+FEW_POLYGONS = 16
+
+
+@contextmanager
+def _undisplaced(found: list[MeshLight]):
+    """Meanwhile no material moves the faces out of the camera's sight."""
+    methods = {
+        material.name_full: (material, material.displacement_method)
+        for mesh_light in found
+        for material in mesh_light.materials
+        if material is not None
+    }
+    try:
+        for material, _ in methods.values():
+            material.displacement_method = "BUMP"
+        yield
+    finally:
+        for material, method in methods.values():
+            material.displacement_method = method
+
+
+def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
+    """The lights that the objects `found` are, seen from the camera at `eye` (3,).
+
+    Objects that shine get the custom property SIDE_PROPERTY.
+    """
+    for mesh_light in found:
+        _note_what_is_lost(mesh_light, warn)
+    with _undisplaced(found):
+        return _lights_of_all(found, studio, eye, warn)
+
+
+def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
+    lights, known = [], {}
+    for mesh_light in found:
+        radiance = [
+            _material_radiance(studio, material, known) if emission.emits and not emission.varies else np.zeros((2, 3))
+            for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True)
+        ]
+        side = _emitting_side(mesh_light, eye, warn)
+        parts = _polygons(mesh_light, radiance)
+        count = sum(len(polygons) for _, polygons in parts) * (2 if side == 0 else 1)
+        if count > MOST_POLYGONS:
+            warn(
+                f"object {mesh_light.ob.name!r}: it emits from {count} flat faces, more than {MOST_POLYGONS}; it "
+                "lights nothing, in the Cycles reference neither; give it fewer faces or light the scene by area lights"
+            )
+            continue
+        own = _constant_lights(mesh_light, parts, radiance, side)
+        own += _textured_lights(mesh_light, parts, side, studio, warn)
+        if own:
+            mark_transparent(mesh_light.ob, side, mesh_light.materials)
+            lights.extend(own)
+    return lights
+
+
+def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[AreaLight]:
+    """The lights of the objects `found` without a look at them: `radiance_of(material)` (3,) is known."""
+    lights = []
+    for mesh_light in found:
+        radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
+        side = _emitting_side(mesh_light, eye, warn)
+        own = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+        if len(own) > MOST_POLYGONS:
+            warn(f"object {mesh_light.ob.name!r}: it emits from {len(own)} flat faces, more than {MOST_POLYGONS}")
+        else:
+            lights.extend(own)
+    return lights
+
+
+def mark_transparent(ob, side: int, materials: list) -> None:
+    """Give the original `ob` SIDE_PROPERTY `side`, and its `materials` one that only tells them apart from others."""
+    ob[SIDE_PROPERTY] = side
+    for material in materials:
+        if material is not None:
+            material[SIDE_PROPERTY] = 0
+
+
+def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
+    for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
+        if emission.emits and emission.directional:
+            nodes = ", ".join(sorted(emission.directional))
+            warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
+        if emission.emits and material.displacement_method != "BUMP" and displaces(material):
+            warn(f"material {material.name!r}: it emits from where its faces are without displacement")
+
+
+def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
+    """SIDE_PROPERTY of an object."""
+    sides = set()
+    for placement in mesh_light.placements:
+        vertices = placement.vertices
+        triangles = planar_polygons.welded(vertices, placement.triangles)
+        closed = planar_polygons.is_closed(triangles)
+        if planar_polygons.hides_itself(vertices, triangles, closed):
+            warn(f"object {mesh_light.ob.name!r}: its faces may stand in their own light, shaded as if they did not")
+        outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
+        sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
+    return sides.pop() if len(sides) == 1 else 0
+
+
+def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[FlatPolygon]]]:
+    """Emitting polygons of each placement, labeled by material slot."""
+    shines = np.array([emission.varies or bool(np.any(value)) for emission, value in _slots(mesh_light, radiance)])
+    parts = []
+    for placement in mesh_light.placements:
+        chosen = shines[placement.slots]
+        polygons = planar_polygons.flat_polygons(
+            placement.vertices, placement.triangles[chosen], placement.slots[chosen]
+        )
+        parts.append((placement, polygons))
+    return parts
+
+
+def _slots(mesh_light: MeshLight, radiance):
+    return zip(mesh_light.emission, radiance, strict=True)
+
+
+def _sides(side: int) -> tuple[int, ...]:
+    return (1, -1) if side == 0 else (side,)
+
+
+def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[AreaLight]:
+    lights = []
+    for _, polygons in parts:
+        for polygon in polygons:
+            for way in _sides(side):
+                value = radiance[polygon.label][0 if way > 0 else 1]
+                if np.any(value):
+                    lights.append(polygon_light(mesh_light.light, polygon, way, value))
+    return lights
+
+
+def polygon_light(stand_in: AreaLight, polygon: FlatPolygon, way: int, radiance: np.ndarray) -> AreaLight:
+    """`stand_in` as the side `way` (1 or -1 times the normal) of `polygon`, half_u along its longest edge."""
+    corners = polygon.corners if way > 0 else polygon.corners[::-1]
+    direction = way * polygon.normal
+    edges = np.roll(corners, -1, axis=0) - corners
+    longest = edges[np.argmax(np.linalg.norm(edges, axis=-1))]
+    u = longest - np.dot(longest, direction) * direction
+    u /= np.linalg.norm(u)
+    v = np.cross(direction, u)
+    place = (corners - corners[0]) @ np.stack([u, v], axis=-1)
+    low, high = place.min(axis=0), place.max(axis=0)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    return replace(
+        stand_in,
+        shape="POLYGON",
+        center=corners[0] + middle[0] * u + middle[1] * v,
+        half_u=half[0] * u,
+        half_v=half[1] * v,
+        direction=direction,
+        radiance=radiance,
+        corners=corners,
+    )
+
+
+def _material_radiance(studio: Studio, material, known: dict) -> np.ndarray:
+    """What `material` emits (2, 3) from the front and the back of a face, the same all over it."""
+    if material.name_full not in known:
+        mesh = bpy.data.meshes.new("Look at a material")
+        mesh.from_pydata([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [], [(0, 1, 2, 3)])
+        mesh.materials.append(material)
+        up, u, v = np.array([0.0, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.5, 0.0])
+        with _shown(studio, mesh, np.eye(4)):
+            images = [studio.look(np.zeros(3), u, v, way * up, pixels=4)[0] for way in (1.0, -1.0)]
+        known[material.name_full] = np.array([image.mean(axis=(0, 1)) for image in images])
+    return known[material.name_full]
+
+
+def _shown(studio: Studio, mesh, matrix: np.ndarray):
+    ob = bpy.data.objects.new("Look at a mesh", mesh)
+    # Its light must not fall on itself.
+    ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = ob.visible_shadow = False
+    return studio.show(ob, matrix)
+
+
+def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, warn) -> list[AreaLight]:
+    """Lights of the polygons whose material emits differently from place to place."""
+    textured = [
+        (placement, [polygon for polygon in polygons if mesh_light.emission[polygon.label].varies])
+        for placement, polygons in parts
+    ]
+    count = sum(len(polygons) for _, polygons in textured)
+    if count == 0:
+        return []
+    if count > MOST_LOOKS:
+        return _mean_lights(mesh_light, textured, side, studio, warn)
+    most = max(1, GRID * GRID // (count * len(_sides(side))))
+    lights, errors = [], []
+    for placement, polygons in textured:
+        with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
+            for polygon in polygons:
+                for way in _sides(side):
+                    light = polygon_light(mesh_light.light, polygon, way, np.ones(3))
+                    image, covered = _look_at_polygon(studio, light, PIXELS if count <= FEW_POLYGONS else PIXELS // 4)
+                    patches = cut_into_patches(image, covered, most)
+                    lights.extend(split_light(light, patches))
+                    errors.append(patches.error)
+    if max(errors) > ERROR:
+        patches = sum(len(light.patches) for light in lights)
+        warn(
+            f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
+            f"which differ from it by {100.0 * max(errors):.0f} % on average"
+        )
+    return lights
+
+
+def _dressed(mesh_light: MeshLight, placement: Placement):
+    mesh = placement.mesh
+    mesh.materials.clear()
+    for material in mesh_light.materials:
+        mesh.materials.append(material)
+    return mesh
+
+
+def _look_at_polygon(studio: Studio, light: AreaLight, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance (H, W, 3) of the rectangle around `light`, and the pixels (H, W) inside its outline."""
+    image, seen = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
+    rows, columns = seen.shape
+    x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
+    offset = light.corners - light.center
+    outline = np.stack(
+        [offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)],
+        axis=-1,
+    )
+    inside = seen & _contains(outline, x, y)
+    return image, inside if inside.any() else seen
+
+
+def _contains(outline: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """True where the points (x, y) are inside the polygon (V, 2): an odd number of edges to their right."""
+    inside = np.zeros(x.shape, bool)
+    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return inside
+
+
+def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> list[AreaLight]:
+    """One light per polygon, with the mean radiance of the largest polygons of its material and side."""
+    sums: dict[tuple[int, int], np.ndarray] = {}
+    lights = []
+    for placement, polygons in textured:
+        largest = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())[:STAND_INS]
+        with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
+            for polygon in largest:
+                for way in _sides(side):
+                    light = polygon_light(mesh_light.light, polygon, way, np.ones(3))
+                    image, covered = _look_at_polygon(studio, light, PIXELS // 16)
+                    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
+                    share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
+                    sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
+    for _, polygons in textured:
+        for polygon in polygons:
+            for way in _sides(side):
+                *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
+                if area > 0.0 and np.any(light_sum):
+                    lights.append(polygon_light(mesh_light.light, polygon, way, np.array(light_sum) / area))
+    warn(f"object {mesh_light.ob.name!r}: its texture on more than {MOST_LOOKS} faces is shaded as its mean")
+    return lights
+
+
+MOST_TRANSPARENT_FACES = 1024
+
+
+def let_light_through(scene) -> None:
+    """Make the faces of all objects with SIDE_PROPERTY transparent to all but camera rays, and emit from their side."""
+    materials = {material.name_full: material for material in bpy.data.materials if SIDE_PROPERTY in material}
+    for ob in bpy.data.objects:
+        if SIDE_PROPERTY in ob:
+            found = [slot.material for slot in ob.material_slots]
+            found += [layer.material_override for layer in scene.view_layers]
+            materials.update((material.name_full, material) for material in found if material is not None)
+    if materials:
+        scene.cycles.transparent_max_bounces = MOST_TRANSPARENT_FACES
+    for material in materials.values():
+        ensure_nodes(material)
+        _let_through(material)
+
+
+def _let_through(material) -> None:
+    tree = material.node_tree
+    output = material_output(tree)
+    if output is None or live_link(output.inputs["Surface"]) is None:
+        return
+    original = live_link(output.inputs["Surface"]).from_socket
+    clear = tree.nodes.new("ShaderNodeBsdfTransparent").outputs[0]
+    both = tree.nodes.new("ShaderNodeAddShader")
+    tree.links.new(original, both.inputs[0])
+    tree.links.new(clear, both.inputs[1])
+    one_sided = _mix(tree, _is_dark_side(tree), both.outputs[0], clear)
+    is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
+    tree.links.new(_mix(tree, is_camera_ray, one_sided, original), output.inputs["Surface"])
+    # What the file says here only changes how well Cycles samples the light.
+    material.cycles.emission_sampling = "FRONT_BACK"
+
+
+def _mix(tree, factor, first, second):
+    node = tree.nodes.new("ShaderNodeMixShader")
+    for source, target in zip((factor, first, second), node.inputs, strict=True):
+        tree.links.new(source, target)
+    return node.outputs[0]
+
+
+def _is_dark_side(tree):
+    """A socket that is 1 on the side of a face that SIDE_PROPERTY does not name: side (2 backfacing - 1) > 0."""
+    side = tree.nodes.new("ShaderNodeAttribute")
+    side.attribute_type, side.attribute_name = "OBJECT", SIDE_PROPERTY
+    back = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
+    signed = _math(tree, "MULTIPLY_ADD", back, 2.0, -1.0)
+    return _math(tree, "GREATER_THAN", _math(tree, "MULTIPLY", signed, side.outputs["Fac"]), 0.0)
+
+
+def _math(tree, operation: str, *values):
+    node = tree.nodes.new("ShaderNodeMath")
+    node.operation = operation
+    for value, target in zip(values, node.inputs, strict=False):
+        if isinstance(value, float):
+            target.default_value = value
+        else:
+            tree.links.new(value, target)
+    return node.outputs[0]

@@ -1,0 +1,160 @@
+"""Lights with textures, as patches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import bpy
+import numpy as np
+
+from ...cycles.images import ImageTexture
+from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
+from ...scene import AreaLight
+from ..materials.values import BYTE_SPACES, FLOAT_SPACES, MOST_PIXELS, Value
+from .emission import PIXELS, Studio
+
+# Lights of one data block, with the same texture, that are looked at one by one; the others get what the first has.
+MOST_LOOKS = 100
+# Below this half angle in rad Cycles takes the first terms of a series instead of tan h - h.
+SMALL_SPREAD = 0.05
+
+
+@dataclass(frozen=True)
+class UnseenLight:
+    """An area light whose node tree has a say in its radiance."""
+
+    data: object  # the original light data block
+    matrix: np.ndarray  # (4, 4) in the world
+    varies: bool  # over the light's surface, as far as its nodes tell
+
+
+def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
+    """`lights` with those at the positions `unseen` replaced by what they look like; dark ones go."""
+    result, seen = [], {}
+    for position, light in enumerate(lights):
+        if position not in unseen:
+            result.append(light)
+            continue
+        source = unseen[position]
+        own = seen.setdefault(source.data.name_full, [])
+        if not own or (source.varies and len(own) < MOST_LOOKS):
+            own.append(_factor(light, source, studio))
+            factor, covered = own[-1]
+        else:
+            factor, covered = own[0]
+            if source.varies:
+                warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the texture of the first")
+        result.extend(_with_factor(light, factor, covered, warn))
+    return result
+
+
+def spread_peak(spread: float) -> float:
+    """By what the radiance of a light of `spread` rad exceeds, straight ahead, that of one of 180 degrees."""
+    half = 0.5 * spread
+    if spread >= np.pi - 1e-6:
+        return 1.0
+    tangent = np.tan(half)
+    return float(3.0 * tangent / half**3 if half <= SMALL_SPREAD else tangent / (tangent - half))
+
+
+def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
+    """What the node tree multiplies the radiance by (H, W, 3), and the pixels (H, W) on the light.
+
+    Columns run along half_u, row 0 is at +half_v.
+    """
+    ob = bpy.data.objects.new("Look at a light", source.data)
+    ob.visible_camera = True
+    pixels = PIXELS if source.varies else 8
+    with studio.show(ob, source.matrix):
+        image, _ = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
+    if np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0:
+        image = image[::-1]
+    plain = light.radiance * spread_peak(light.spread)
+    factor = np.divide(image, plain, out=np.zeros_like(image), where=plain != 0.0)
+    rows, columns = image.shape[:2]
+    covered = np.ones((rows, columns), bool)
+    if light.is_round:
+        # Pixels that the edge goes through are partly dark.
+        x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+        covered = np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
+    return factor, covered
+
+
+def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn) -> list[AreaLight]:
+    patches = cut_into_patches(factor * light.radiance, covered)
+    if patches.error > ERROR:
+        warn(
+            f"light {light.name!r}: its texture is shaded as {len(patches.smallest)} patches of constant radiance, "
+            f"which differ from it by {100.0 * patches.error:.0f} % on average"
+        )
+    return split_light(light, patches)
+
+
+# Of one light: each costs as much as a light.
+MOST_PATCHES = 64
+# Points along each side at which an image is read, each the mean of SUB x SUB.
+POINTS, SUB = 128, 2
+
+
+class ShownTextures:
+    """Patches of the images on lights, kept for as long as neither the images nor the nodes change."""
+
+    def __init__(self):
+        self._patches: dict[tuple, Patches | None] = {}
+
+    def clear(self) -> None:
+        """Read all images again."""
+        self._patches.clear()
+
+    def split(self, light: AreaLight, factor: Value, notes: list[str]) -> list[AreaLight] | None:
+        """`light` times `factor` as patches, named in `notes` where they are coarse; None: not resolved."""
+        patches = self._patches_of(light, factor)
+        if patches is None:
+            return None
+        if patches.error > ERROR:
+            notes.append(
+                f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
+                f"{100.0 * patches.error:.0f} % off on average"
+            )
+        shown = (patch for whole in split_light(light, patches) for patch in whole.patches)
+        return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
+
+    def _patches_of(self, light: AreaLight, factor: Value) -> Patches | None:
+        use = factor.image
+        key = (use.image.session_uid, use.mapping, use.closest, use.extension, light.is_round,
+               factor.matrix.tobytes(), factor.offset.tobytes())  # fmt: skip
+        if key not in self._patches:
+            texture = _texture(use)
+            self._patches[key] = None if texture is None else _cut(texture, factor, light.is_round)
+        return self._patches[key]
+
+
+def _texture(use) -> ImageTexture | None:
+    """The pixels of an image; None where only Cycles knows its colors."""
+    image = use.image.original
+    spaces = FLOAT_SPACES if image.is_float else BYTE_SPACES
+    srgb = spaces.get(image.colorspace_settings.name)
+    width, height = image.size
+    if srgb is None or not 0 < width * height <= MOST_PIXELS:
+        return None
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels = pixels.reshape(height, width, 4)
+    if (pixels[..., 3] != 1.0).any():
+        return None
+    return ImageTexture(pixels[..., :3], use.extension, "Closest" if use.closest else "Linear", srgb)
+
+
+def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:
+    count = POINTS * SUB
+    place = (np.arange(count) + 0.5) / count
+    u, v = np.meshgrid(place, 1.0 - place)
+    mapping = np.array(factor.image.mapping)
+    uv = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ mapping.T
+    colors = factor.offset + texture.colors(uv) @ factor.matrix[:, :3].T + factor.matrix[:, 3]
+    image = colors.reshape(POINTS, SUB, POINTS, SUB, 3).mean(axis=(1, 3))
+    covered = np.ones((POINTS, POINTS), bool)
+    if is_round:
+        x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
+        covered = np.hypot(x, y) < 1.0
+    return cut_into_patches(image, covered, MOST_PATCHES)

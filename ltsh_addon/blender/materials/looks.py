@@ -1,0 +1,404 @@
+"""Materials and worlds as the viewport shows them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import bpy
+import numpy as np
+
+from ...cycles.lobes import SMALLEST_WEIGHT
+from ..render_settings import cycles_setting
+from .bsdfs import (
+    LOBE_SOCKETS,
+    METALLIC,
+    METALLIC_SOCKETS,
+    MULTIPLE_SCATTERING_NODES,
+    NEAREST_ALPHA,
+    PRINCIPLED,
+    TRANSPARENT_NODES,
+    is_emission,
+)
+from .graph import Source, material_output, source_of
+from .values import ImageUse, Value, constant, value_at
+
+# Quantities that may come from an image; all others are constants.
+IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
+NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
+           "transmission": 0.0, "weight": 1.0}  # fmt: skip
+# The kind of a lobe that is the coat of another one; all others are those of `aovs.LOBE_KINDS`.
+COAT = "coat"
+
+
+@dataclass(frozen=True)
+class Coat:
+    """What covers the lobe of a Principled BSDF: all constants."""
+
+    weight: float
+    roughness: float
+    ior: float
+    tint: np.ndarray  # (3,)
+    follows_normal: bool  # has the normal map of the lobe; else no one
+
+
+@dataclass(frozen=True)
+class ViewFactor:
+    """What the nodes Fresnel and Layer Weight say of the cosine c between the view and the smooth normal."""
+
+    kind: str  # "fresnel": of a dielectric; "facing": 1 - c^parameter
+    parameter: float  # "fresnel": the index of refraction
+    is_complement: bool = False  # 1 minus that
+
+    @classmethod
+    def of(cls, kind: str, parameter: float, is_blend: bool = False) -> ViewFactor:
+        """From the node's number: an index of refraction, or the Blend of a Layer Weight node."""
+        if not is_blend:
+            return cls(kind, max(parameter, 1e-5))
+        if kind == "fresnel":
+            return cls(kind, 1.0 / max(1.0 - parameter, 1e-5))
+        blend = float(np.clip(parameter, 0.0, 1.0 - 1e-5))
+        return cls(kind, 2.0 * blend if blend < 0.5 else 0.5 / (1.0 - blend))
+
+    def complement(self) -> ViewFactor:
+        """1 minus this."""
+        return replace(self, is_complement=not self.is_complement)
+
+
+@dataclass(frozen=True)
+class Look:
+    """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
+
+    kind: str  # of `aovs.LOBE_KINDS`, or COAT
+    values: dict[str, Value]  # by the names of NEUTRAL
+    normal: Value | None = None  # of a tangent space normal map
+    normal_strength: float = 1.0
+    scattered: bool = False  # Multiscatter GGX
+    corrected: bool = True  # Cycles bends specular normals toward the eye
+    weight: float = 1.0
+    view_factor: ViewFactor | None = None  # times the weight
+    coat: Coat | None = None  # over it; of the kind COAT itself
+    emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    notes: tuple[str, ...] = ()
+    further: tuple[Look, ...] = ()  # lobes that are added to this one
+
+    @property
+    def lobes(self) -> tuple[Look, ...]:
+        """This lobe and the further ones."""
+        return (self, *self.further)
+
+    def value(self, name: str) -> Value:
+        """The quantity `name`, or what changes nothing."""
+        return self.values.get(name) or constant(NEUTRAL[name])
+
+    @property
+    def images(self) -> dict[str, ImageUse]:
+        """Images by slot of IMAGE_SLOTS."""
+        found = {name: value.image for name, value in self.values.items() if name in IMAGE_SLOTS and value.image}
+        return {**found, "normal": self.normal.image} if self.normal is not None else found
+
+    @property
+    def uv_map(self) -> str:
+        """The UV map of its images ("": the active one)."""
+        return next((use.uv_map for use in self.images.values()), "")
+
+
+def is_missing(image) -> bool:
+    """True for images without pixels: their file is not there, or cannot be read."""
+    return not all(image.size)
+
+
+def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
+    """A diffuse surface."""
+    return Look("diffuse", {"color": constant(color)}, notes=notes)
+
+
+def default_look() -> Look:
+    """What Cycles shows where no material is assigned: gray, with a Principled BSDF's defaults from 5.0 on."""
+    if bpy.app.version < (5, 0, 0):
+        return plain_look(0.8)
+    return Look("principled", {"color": constant(0.8), "roughness": constant(0.5)})
+
+
+# Quantity of `aovs.LOBE_AOVS` -> viewport setting of the material that stands in for it.
+STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
+# Nodes whose value depends on the view; the outputs of the second have the names of kinds of `ViewFactor`.
+VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
+# Each costs as much as the first.
+MOST_LOBES = 8
+
+
+def look_of(material) -> Look:
+    """How the viewport shades `material`."""
+    if material is None:
+        return default_look()
+    if bpy.app.version < (5, 0, 0) and not material.use_nodes:
+        return plain_look(material.diffuse_color)
+    tree = material.node_tree
+    output = material_output(tree) if tree is not None else None
+    if output is None:
+        return plain_look(0.0)
+    walk = _Leaves()
+    walk.follow(source_of(tree, output.inputs["Surface"]), Share())
+    return _Reader(material, walk).look()
+
+
+def _is_same(first: Source | None, second: Source | None) -> bool:
+    """Do both sockets have the same node before them?"""
+    return first is not None and second is not None and first.node == second.node and first.groups == second.groups
+
+
+@dataclass(frozen=True)
+class Share:
+    """The share of a node in a material: a product of which one factor may come from an image, one from the view."""
+
+    constant: float = 1.0
+    image: Value | None = None
+    curve: ViewFactor | None = None
+    shining: float = 1.0  # times what emits, where transparency takes the rest
+
+    @property
+    def estimate(self) -> float:
+        """About how much it is on average."""
+        return self.constant * 0.5 ** ((self.image is not None) + (self.curve is not None))
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """What of it is a quantity of a `Look`."""
+        return {} if self.image is None else {"weight": self.image}
+
+    def split(self, factor: Value | ViewFactor | None) -> tuple[Share, Share] | None:
+        """The shares of both sides of a mix with `factor`; None where that cannot be said."""
+        if isinstance(factor, ViewFactor) and self.curve is None:
+            return replace(self, curve=factor.complement()), replace(self, curve=factor)
+        if not isinstance(factor, Value):
+            return None
+        if factor.is_constant:
+            part = float(np.clip(factor.offset[0], 0.0, 1.0))
+            return replace(self, constant=self.constant * (1.0 - part)), replace(self, constant=self.constant * part)
+        if self.image is None:
+            return replace(self, image=factor.mapped(-np.eye(3), 1.0)), replace(self, image=factor)
+        return None
+
+
+class _Leaves:
+    """The shader nodes of a material with their shares; of unknown factors both sides get half."""
+
+    def __init__(self):
+        self.found: list[tuple[Source, Share]] = []
+        self.guessed: list[str] = []
+        self.is_transparent = False
+
+    def follow(self, source: Source | None, share: Share) -> None:
+        if source is None or source.node is None or share.estimate <= 0.0:
+            return
+        kind = source.node.bl_idname
+        if kind == "ShaderNodeMixShader":
+            self._follow_mix(source, share)
+        elif kind == "ShaderNodeAddShader":
+            self.follow(source.input(0), share)
+            self.follow(source.input(1), share)
+        elif kind in TRANSPARENT_NODES:
+            self.is_transparent = True
+        else:
+            self.found.append((source, share))
+
+    def _follow_mix(self, source: Source, share: Share) -> None:
+        first, second = source.input(1), source.input(2)
+        factor = _factor_of(source)
+        shares = share.split(factor)
+        if shares is None:
+            self.guessed.append(source.node.name)
+            shares = share.split(constant(0.5))
+        clear = [side is not None and _is_transparent(side) for side in (first, second)]
+        if any(clear):
+            # Surfaces are opaque here: the other side has the share of both.
+            shares = tuple(replace(share, shining=share.shining * part.estimate / share.estimate) for part in shares)
+        self.follow(first, shares[0])
+        self.follow(second, shares[1])
+
+
+def _is_transparent(source: Source) -> bool:
+    return source.node is not None and source.node.bl_idname in TRANSPARENT_NODES
+
+
+def _factor_of(source: Source) -> Value | ViewFactor | None:
+    """The factor of a Mix Shader node."""
+    factor = value_at(source.tree, source.node.inputs[0], source.groups)
+    if factor is not None:
+        return factor
+    behind = source.input(0)
+    if behind is None or behind.node is None or behind.node.bl_idname not in VIEW_FACTORS:
+        return None
+    normal = behind.input("Normal")
+    parameter = value_at(behind.tree, behind.node.inputs[0], behind.groups)
+    if normal is None or normal.node is not None or parameter is None or not parameter.is_constant:
+        return None
+    is_blend = behind.node.bl_idname == "ShaderNodeLayerWeight"
+    kind = behind.socket.name.lower() if is_blend else "fresnel"
+    return ViewFactor.of(kind, float(parameter.offset[0]), is_blend)
+
+
+class _Reader:
+    """From the leaves of a material to its look."""
+
+    def __init__(self, material, walk: _Leaves):
+        self.material, self.notes = material, []
+        self.emitters = [(source, share) for source, share in walk.found if is_emission(source.node)]
+        self.leaves = [(source, share) for source, share in walk.found if not is_emission(source.node)]
+        if walk.is_transparent and self.leaves:
+            self.note("transparency is not shown")
+        for name in walk.guessed:
+            self.note(f"factor of {name!r} is not resolved")
+
+    def note(self, message: str) -> None:
+        """Name something that the viewport does not show as it is."""
+        self.notes.append(f"{self.material.name}: {message}")
+
+    def look(self) -> Look:
+        """The heaviest lobe with the others behind it."""
+        emission = np.zeros(3)
+        for source, share in self.emitters:
+            emission = emission + self._shining(share, self._emission(source, "Color", "Strength"))
+        lobes: list[Look] = []
+        for source, share in sorted(self.leaves, key=lambda pair: -pair[1].estimate):
+            if source.node.bl_idname == PRINCIPLED:
+                glow = self._emission(source, "Emission Color", "Emission Strength")
+                emission = emission + self._shining(share, glow)
+            lobes += self._lobes_of(source, share)
+        if not lobes:
+            lobes = [plain_look(0.0)]
+        if len(lobes) > MOST_LOBES:
+            self.note(f"of its {len(lobes)} lobes only {MOST_LOBES} are shown")
+        first, *further = lobes[:MOST_LOBES]
+        return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
+
+    def _shining(self, share: Share, emission: np.ndarray) -> np.ndarray:
+        if emission.any() and (share.image is not None or share.curve is not None):
+            self.note("its emission varies: half of it is shown")
+        return share.shining * share.estimate * emission
+
+    def _lobes_of(self, source: Source, share: Share) -> list[Look]:
+        """The lobes of one BSDF node."""
+        node = source.node
+        sockets = LOBE_SOCKETS.get(node.bl_idname)
+        if node.bl_idname == METALLIC:
+            sockets = METALLIC_SOCKETS[node.fresnel_type]
+        if sockets is None:
+            self.note(f"{node.bl_label} is not shown, its viewport color is")
+            values = {"color": constant(self.material.diffuse_color), **share.values}
+            return [Look("diffuse", values, weight=share.constant, view_factor=share.curve)]
+        look = self._lobe(source, *sockets, share)
+        coat = self._coat(source, look) if look.kind == "principled" else None
+        if coat is None:
+            return [look]
+        look = replace(look, coat=coat)
+        values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior), "weight": look.value("weight")}
+        # Its multiple scattering is always there.
+        shine = replace(look, kind=COAT, values=values, scattered=True)
+        return [look, shine if coat.follows_normal else replace(shine, normal=None)]
+
+    def _lobe(self, source: Source, kind: str, names: dict[str, str], share: Share) -> Look:
+        node = source.node
+        values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
+        values = self._on_one_uv_map({**values, **share.values})
+        distribution = getattr(node, "distribution", "")
+        if distribution in NEAREST_ALPHA:
+            values["roughness"] = values["roughness"].mapped(NEAREST_ALPHA[distribution] ** 0.5 * np.eye(3))
+            self.note(f"distribution {distribution} is shown as GGX")
+        if kind == "principled":
+            weight = value_at(source.tree, node.inputs["Sheen Weight"], source.groups)
+            if weight is None or not weight.is_constant or weight.offset[0] > 0.0:
+                self.note("sheen is not shown")
+        normal, strength = self._normal(source, values)
+        scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
+        corrected = cycles_setting(self.material, "use_bump_map_correction")
+        look = Look(kind, values, normal, strength, scattered, corrected, share.constant, share.curve)
+        for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
+            self.note(f"image {name!r} is missing, it is pink")
+        return look
+
+    def _coat(self, source: Source, look: Look) -> Coat | None:
+        """What covers a Principled BSDF, None where nothing does."""
+        weight = float(self._value(source, "", "Coat Weight").offset[0])
+        if weight <= SMALLEST_WEIGHT:
+            return None
+        sockets = ("Coat Roughness", "Coat IOR", "Coat Tint")
+        roughness, ior, tint = (self._value(source, "", name).offset for name in sockets)
+        normal, follows = source.input("Coat Normal"), False
+        if normal is not None and normal.node is not None:
+            follows = look.normal is not None and _is_same(normal, source.input("Normal"))
+            if not follows:
+                self.note("Coat Normal is not resolved")
+        roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)
+        return Coat(weight, roughness, ior, np.maximum(tint, 0.0) * np.ones(3), follows)
+
+    def _value(self, source: Source, name: str, socket_name: str) -> Value:
+        value = value_at(source.tree, source.node.inputs[socket_name], source.groups)
+        if value is not None and (value.is_constant or name in IMAGE_SLOTS):
+            return value
+        self.note(f"{socket_name} is not resolved")
+        if name in STAND_INS:
+            return constant(getattr(self.material, STAND_INS[name]))
+        default = source.node.inputs[socket_name].default_value
+        return constant(default if value is None else value.offset)
+
+    def _on_one_uv_map(self, values: dict[str, Value]) -> dict[str, Value]:
+        """`values` with stand-ins for the images on other UV maps than the first."""
+        first, result = None, {}
+        for name, value in values.items():
+            if value.image is not None:
+                first = value.image.uv_map if first is None else first
+                if value.image.uv_map != first:
+                    self.note(f"the image of {name} is on another UV map and not shown")
+                    value = constant(getattr(self.material, STAND_INS[name]) if name in STAND_INS else NEUTRAL[name])
+            result[name] = value
+        return result
+
+    def _normal(self, source: Source, values: dict[str, Value]) -> tuple[Value | None, float]:
+        """The normal map at the Normal socket and its strength."""
+        normal = source.input("Normal") if "Normal" in source.node.inputs else None
+        if normal is None or normal.node is None:
+            return None, 1.0
+        node = normal.node
+        if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
+            self.note(f"normals from {node.name!r} are not resolved")
+            return None, 1.0
+        color, strength = (value_at(normal.tree, node.inputs[name], normal.groups) for name in ("Color", "Strength"))
+        maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
+        if color is None or strength is None or not strength.is_constant or len(maps - {""}) > 1:
+            self.note(f"normals from {node.name!r} are not resolved")
+            return None, 1.0
+        if color.image is None:
+            return None, 1.0
+        return color, float(strength.offset[0])
+
+    def _emission(self, source: Source, color_name: str, strength_name: str) -> np.ndarray:
+        if color_name not in source.node.inputs:
+            return np.zeros(3)
+        parts = [value_at(source.tree, source.node.inputs[name], source.groups) for name in (strength_name, color_name)]
+        if all(part is not None and part.is_constant for part in parts):
+            return parts[0].offset * parts[1].offset
+        if parts[0] is None or not parts[0].is_constant or np.any(parts[0].offset):
+            self.note("its emission varies and is not shown")
+        return np.zeros(3)
+
+
+def world_radiance(world) -> tuple[np.ndarray, bool]:
+    """Radiance (3,) of the background, and whether that is all that there is to it.
+
+    Where the world's nodes are more than one Background node of constants its viewport color stands in.
+    """
+    if world is None:
+        return np.zeros(3), True
+    tree = world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None
+    if tree is None:
+        return np.array(world.color, np.float64), True
+    output = material_output(tree)
+    source = source_of(tree, output.inputs["Surface"]) if output is not None else None
+    if source is None or source.node is None:
+        return np.zeros(3), True
+    if source.node.bl_idname == "ShaderNodeBackground":
+        parts = [value_at(source.tree, source.node.inputs[name], source.groups) for name in ("Color", "Strength")]
+        if all(part is not None and part.is_constant for part in parts):
+            return parts[0].offset * parts[1].offset, True
+    return np.array(world.color, np.float64), False

@@ -1,0 +1,412 @@
+"""Values behind sockets: constants, image textures, and what nodes make of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ...cycles.images import EXTENSIONS, INTERPOLATIONS
+from ...files import save_array
+from ..render_settings import working_space
+from .graph import Source, source_behind, source_of
+
+LUMA = np.array([0.2126, 0.7152, 0.0722])  # of Rec.709, by which Blender makes numbers of colors
+
+
+@dataclass(frozen=True)
+class ImageUse:
+    """A flat image on a UV map ("": the active one); `mapping` (2, 3) takes (u, v, 1) to image coordinates."""
+
+    image: Any
+    uv_map: str
+    mapping: tuple[tuple[float, float, float], tuple[float, float, float]]
+    closest: bool
+    extension: str  # one of EXTENSIONS
+
+
+@dataclass(frozen=True)
+class Value:
+    """offset + matrix (R, G, B, A), or offset alone where there is no image."""
+
+    offset: np.ndarray  # (3,)
+    matrix: np.ndarray | None = None  # (3, 4)
+    image: ImageUse | None = None
+
+    @property
+    def is_constant(self) -> bool:
+        return self.image is None
+
+    def mapped(self, matrix: np.ndarray, offset=0.0) -> Value:
+        """`matrix` (3, 3) times this plus `offset`."""
+        image_matrix = None if self.matrix is None else matrix @ self.matrix
+        return Value(matrix @ self.offset + offset, image_matrix, self.image)
+
+    def as_number(self) -> Value:
+        """The color as a number."""
+        return self.mapped(np.broadcast_to(LUMA, (3, 3)))
+
+
+def is_gray(value: Value) -> bool:
+    """True where all components are the same."""
+    rows = value.offset[:, None] if value.matrix is None else np.column_stack([value.matrix, value.offset])
+    return bool(np.all(rows == rows[:1]))
+
+
+def constant(number) -> Value:
+    """A number or the first three components of a color."""
+    return Value(np.array(np.broadcast_to(np.ravel(number)[:3], (3,)), np.float64))
+
+
+def combined(first: Value | None, second: Value | None, first_share, second_share) -> Value | None:
+    """The sum of both under constant shares; None unless at most one has an image."""
+    if first is None or second is None:
+        return None
+    if not first.is_constant and not second.is_constant:
+        if first.image != second.image:
+            return None
+        matrix = first_share * first.matrix + second_share * second.matrix
+        return Value(first_share * first.offset + second_share * second.offset, matrix, first.image)
+    carrier, share, other, other_share = first, first_share, second, second_share
+    if first.is_constant:
+        carrier, share, other, other_share = second, second_share, first, first_share
+    return carrier.mapped(share * np.eye(3), other_share * other.offset)
+
+
+def product(first: Value | None, second: Value | None) -> Value | None:
+    """The product; None unless at most one has an image."""
+    if first is None or second is None:
+        return None
+    if not first.is_constant:
+        first, second = second, first
+    return second.mapped(np.diag(first.offset)) if first.is_constant else None
+
+
+def value_at(tree, socket, groups: tuple = ()) -> Value | None:
+    """The value at the input `socket` of `tree`, as the kind of value that it takes; None: unknown."""
+    value = value_of_source(source_of(tree, socket, groups))
+    if value is not None and socket.type == "VALUE":
+        return value if is_gray(value) else value.as_number()
+    return value
+
+
+def value_of_source(source: Source | None) -> Value | None:
+    """The value that `source` gives; None: unknown."""
+    if source is None:
+        return None
+    if source.node is None:
+        return constant(source.socket.default_value) if hasattr(source.socket, "default_value") else None
+    reader = READERS.get(source.node.bl_idname)
+    return None if reader is None else reader(source)
+
+
+def _input(source: Source, name) -> Value | None:
+    return value_at(source.tree, source.node.inputs[name], source.groups)
+
+
+def _own_value(source: Source) -> Value:
+    return constant(source.node.outputs[0].default_value)
+
+
+def _image(source: Source) -> Value | None:
+    node = source.node
+    if node.image is None or node.projection != "FLAT" or node.image.source not in ("FILE", "GENERATED"):
+        return None
+    if node.interpolation not in ("Closest", "Linear"):
+        return None
+    place = coordinates(source.input("Vector"))
+    if place is None:
+        return None
+    uv_map, mapping = place
+    use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension)
+    matrix = np.zeros((3, 4))
+    if source.socket.name == "Alpha":
+        matrix[:, 3] = 1.0
+    else:
+        matrix[:, :3] = np.eye(3)
+    return Value(np.zeros(3), matrix, use)
+
+
+IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+
+
+def coordinates(source: Source | None):
+    """(UV map, mapping) of a texture's vector; None for all but UV maps under Mapping nodes of constants."""
+    if source is None:
+        return None
+    node = source.node
+    if node is None:
+        # A texture without a vector takes the active UV map.
+        return ("", IDENTITY) if source.socket.hide_value else None
+    if node.bl_idname == "ShaderNodeUVMap" and not node.from_instancer:
+        return node.uv_map, IDENTITY
+    if node.bl_idname == "ShaderNodeTexCoord" and source.socket.name == "UV" and not node.from_instancer:
+        return "", IDENTITY
+    if node.bl_idname != "ShaderNodeMapping" or node.vector_type not in ("POINT", "TEXTURE"):
+        return None
+    inner = coordinates(source.input("Vector"))
+    parts = [value_at(source.tree, node.inputs[name], source.groups) for name in ("Location", "Rotation", "Scale")]
+    if inner is None or any(part is None or not part.is_constant for part in parts):
+        return None
+    return inner[0], _mapping(node.vector_type, *(part.offset for part in parts), inner[1])
+
+
+def _mapping(kind: str, location, rotation, scale, inner):
+    """The affine map (2, 3) of a Mapping node after `inner`; None where it turns out of the plane."""
+    if rotation[0] != 0.0 or rotation[1] != 0.0:
+        return inner
+    cosine, sine = math.cos(rotation[2]), math.sin(rotation[2])
+    turned = [[cosine * scale[0], -sine * scale[1]], [sine * scale[0], cosine * scale[1]]]
+    own = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
+    if kind == "TEXTURE":
+        own = np.linalg.pinv(own)
+    whole = own @ np.vstack([inner, [0.0, 0.0, 1.0]])
+    return tuple(tuple(float(number) for number in row) for row in whole[:2])
+
+
+def _separate(source: Source) -> Value | None:
+    if getattr(source.node, "mode", "RGB") != "RGB":
+        return None
+    value = _input(source, 0)
+    channel = next(index for index, socket in enumerate(source.node.outputs) if socket == source.socket)
+    pick = np.zeros((3, 3))
+    pick[:, channel] = 1.0
+    return None if value is None else value.mapped(pick)
+
+
+def _combine(source: Source) -> Value | None:
+    if getattr(source.node, "mode", "RGB") != "RGB":
+        return None
+    parts = [_input(source, index) for index in range(3)]
+    if any(part is None or not part.is_constant for part in parts):
+        return None
+    return constant([part.offset[0] for part in parts])
+
+
+def _to_number(source: Source) -> Value | None:
+    value = _input(source, 0)
+    return None if value is None else value.as_number()
+
+
+MATH: dict[str, Callable] = {
+    "POWER": lambda a, b: np.power(np.maximum(a, 0.0), b),
+    "MINIMUM": np.minimum,
+    "MAXIMUM": np.maximum,
+    "DIVIDE": lambda a, b: np.divide(a, b, out=np.zeros(3), where=b != 0.0),
+    "SQRT": lambda a, b: np.sqrt(np.maximum(a, 0.0)),
+    "ABSOLUTE": lambda a, b: np.abs(a),
+    "GREATER_THAN": lambda a, b: (a > b).astype(float),
+    "LESS_THAN": lambda a, b: (a < b).astype(float),
+}
+
+
+def _math(source: Source) -> Value | None:
+    node, first, second = source.node, _input(source, 0), _input(source, 1)
+    if node.operation == "MULTIPLY_ADD":
+        result = combined(product(first, second), _input(source, 2), 1.0, 1.0)
+    else:
+        result = _math_of(node.operation, first, second)
+    return _clamped(result) if node.use_clamp else result
+
+
+def _math_of(operation: str, first: Value | None, second: Value | None) -> Value | None:
+    if operation in ("ADD", "SUBTRACT"):
+        return combined(first, second, 1.0, 1.0 if operation == "ADD" else -1.0)
+    if operation == "MULTIPLY":
+        return product(first, second)
+    if operation == "DIVIDE" and second is not None and second.is_constant and np.all(second.offset != 0.0):
+        return product(first, constant(1.0 / second.offset))
+    if operation in MATH and first is not None and second is not None and first.is_constant and second.is_constant:
+        return constant(MATH[operation](first.offset, second.offset))
+    return None
+
+
+def _clamped(value: Value | None) -> Value | None:
+    return constant(np.clip(value.offset, 0.0, 1.0)) if value is not None and value.is_constant else None
+
+
+def _mix(source: Source) -> Value | None:
+    """Mix and MixRGB by a constant factor."""
+    node = source.node
+    factor, first, second = 0, 1, 2
+    if node.bl_idname == "ShaderNodeMix":
+        if node.data_type == "RGBA":
+            factor, first, second = 0, 6, 7
+        elif node.data_type == "FLOAT":
+            factor, first, second = 0, 2, 3
+        else:
+            return None
+    blend = node.blend_type if getattr(node, "data_type", "RGBA") == "RGBA" else "MIX"
+    share, first, second = _input(source, factor), _input(source, first), _input(source, second)
+    if share is None or not share.is_constant:
+        return None
+    share = float(share.offset[0])
+    if getattr(node, "clamp_factor", True):
+        share = min(max(share, 0.0), 1.0)
+    if blend == "MIX":
+        return combined(first, second, 1.0 - share, share)
+    if blend in ("ADD", "SUBTRACT"):
+        return combined(first, second, 1.0, share if blend == "ADD" else -share)
+    if blend == "MULTIPLY":
+        return combined(first, product(first, second), 1.0 - share, share)
+    return None
+
+
+def _invert(source: Source) -> Value | None:
+    share, value = _input(source, 0), _input(source, 1)
+    if share is None or value is None or not share.is_constant:
+        return None
+    factor = float(share.offset[0])
+    return value.mapped((1.0 - 2.0 * factor) * np.eye(3), factor)
+
+
+def _gamma(source: Source) -> Value | None:
+    color, power = _input(source, 0), _input(source, 1)
+    if color is None or power is None or not (color.is_constant and power.is_constant):
+        return color if power is not None and power.is_constant and np.all(power.offset == 1.0) else None
+    return constant(np.power(np.maximum(color.offset, 0.0), power.offset))
+
+
+def _ramp(source: Source) -> Value | None:
+    factor = _input(source, 0)
+    if factor is None or not factor.is_constant:
+        return None
+    color = source.node.color_ramp.evaluate(float(factor.offset[0]))
+    return constant(color[3]) if source.socket.name == "Alpha" else constant(color)
+
+
+def _clamp(source: Source) -> Value | None:
+    value, low, high = (_input(source, index) for index in range(3))
+    if any(part is None or not part.is_constant for part in (value, low, high)):
+        return None
+    return replace(value, offset=np.clip(value.offset, low.offset, high.offset))
+
+
+READERS: dict[str, Callable[[Source], Value | None]] = {
+    "ShaderNodeValue": _own_value,
+    "ShaderNodeRGB": _own_value,
+    "ShaderNodeTexImage": _image,
+    "ShaderNodeSeparateColor": _separate,
+    "ShaderNodeSeparateXYZ": _separate,
+    "ShaderNodeCombineColor": _combine,
+    "ShaderNodeCombineXYZ": _combine,
+    "ShaderNodeRGBToBW": _to_number,
+    "ShaderNodeMath": _math,
+    "ShaderNodeMix": _mix,
+    "ShaderNodeMixRGB": _mix,
+    "ShaderNodeInvert": _invert,
+    "ShaderNodeGamma": _gamma,
+    "ShaderNodeValToRGB": _ramp,
+    "ShaderNodeClamp": _clamp,
+}
+
+# Color space of the image -> whether values are sRGB. Of others, and of floats in sRGB, Cycles knows more than we do.
+BYTE_SPACES = {"sRGB": True, "Non-Color": False, "Linear Rec.709": False}
+FLOAT_SPACES = {"Non-Color": False, "Linear Rec.709": False}
+# Blender hands out pixels as four floats each: half a gigabyte.
+MOST_PIXELS = 1 << 25
+# Of the entries of the matrix to Rec.709.
+SAME_SPACE = 1e-4
+
+
+@dataclass(frozen=True)
+class PlainTexture:
+    """An image texture behind a socket, and which part of its color the socket takes."""
+
+    image: str
+    uv: str  # name of the UV map, "" for the one that renders
+    extension: str
+    interpolation: str
+    srgb: bool
+    part: str  # "color", "gray", or a channel "0", "1", "2"
+
+
+def plain_texture(tree, socket, groups) -> PlainTexture | None:
+    """What feeds an input from the output `socket` of `tree`, where that is an image texture; `groups` leads to `tree`
+    from the material, as (tree, group node) pairs."""
+    found, part = source_behind(tree, socket, groups), "color"
+    if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
+        part = str(list(found.node.outputs).index(found.socket))
+        found = found.input(0)
+    if not _is_node(found, "ShaderNodeTexImage") or found.socket.name != "Color" or found.node.image is None:
+        return None
+    node = found.node
+    uv, srgb = _uv_map(found), _is_srgb(node.image)
+    if uv is None or srgb is None or not _is_plain(node):
+        return None
+    return PlainTexture(node.image.name_full, uv, node.extension, node.interpolation, srgb, part)
+
+
+def _is_node(source, kind: str) -> bool:
+    return source is not None and source.node is not None and source.node.bl_idname == kind
+
+
+def _uv_map(texture) -> str | None:
+    """Name of the UV map that an image texture is looked up at, "" for the default, None for anything else."""
+    found = texture.input("Vector")
+    if found is None:
+        return None
+    if found.node is None:
+        # Only the texture's own open input means a UV map; that of a group is a constant.
+        return "" if found.socket == texture.node.inputs["Vector"] else None
+    if getattr(found.node, "from_instancer", False):
+        return None
+    if _is_node(found, "ShaderNodeUVMap"):
+        return found.node.uv_map
+    return "" if _is_node(found, "ShaderNodeTexCoord") and found.socket.name == "UV" else None
+
+
+def _is_plain(node) -> bool:
+    mapping = node.texture_mapping
+    return (
+        node.projection == "FLAT"
+        and node.extension in EXTENSIONS
+        and node.interpolation in INTERPOLATIONS
+        and not any((*mapping.translation, *mapping.rotation))
+        and tuple(mapping.scale) == (1.0, 1.0, 1.0)
+        and (mapping.mapping_x, mapping.mapping_y, mapping.mapping_z) == ("X", "Y", "Z")
+        and mapping.vector_type == "POINT"
+        and not (mapping.use_min or mapping.use_max)
+    )
+
+
+def _is_srgb(image) -> bool | None:
+    """Whether an image of one file has sRGB values; None where it cannot be told, or is of another kind."""
+    if image.source != "FILE" or not 0 < image.size[0] * image.size[1] <= MOST_PIXELS:
+        return None
+    scene = bpy.context.scene
+    if scene.render.use_simplify and scene.cycles.texture_limit_render != "OFF":
+        return None
+    if np.abs(np.array(working_space()["to_rec709"]) - np.eye(3)).max() > SAME_SPACE:
+        return None
+    return (FLOAT_SPACES if image.is_float else BYTE_SPACES).get(image.colorspace_settings.name)
+
+
+class SavedImages:
+    """Pixels of images as .npy in a folder, row 0 below, each image once."""
+
+    def __init__(self, folder: Path):
+        self.folder, self._names = folder, {}
+
+    def file_of(self, name: str) -> str | None:
+        """File name of the pixels (H, W, 3) of the image `name`, uint8 or float32; None where it has an alpha."""
+        if name not in self._names:
+            self._names[name] = self._save(bpy.data.images[name])
+        return self._names[name]
+
+    def _save(self, image):
+        width, height = image.size
+        pixels = np.empty(width * height * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        pixels = pixels.reshape(height, width, 4)
+        if (pixels[..., 3] != 1.0).any():
+            return None
+        colors = pixels[..., :3]
+        name = f"image_{len(self._names)}.npy"
+        save_array(self.folder / name, colors if image.is_float else np.rint(255.0 * colors).astype(np.uint8))
+        return name

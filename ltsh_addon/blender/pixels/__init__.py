@@ -1,1 +1,0 @@
-"""Samples of a camera's pixels, and Cycles' reference of the same pixels."""

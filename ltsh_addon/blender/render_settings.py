@@ -1,0 +1,450 @@
+"""Cameras, pixel filters and settings of the renders that samples and references come from."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from contextlib import contextmanager
+from pathlib import Path
+
+import bpy
+import mathutils
+import numpy as np
+
+from ..scene import Border
+from ..shading.parallel import cores
+from .evaluated import SURFACE_TYPES
+from .process.blender_process import SceneError, listed
+
+DEFAULTS = {"film_exposure": 1.0, "is_portal": False, "use_bump_map_correction": True}
+
+
+def cycles_setting(owner, name: str):
+    """`owner.cycles.<name>`, or Cycles' default."""
+    return getattr(getattr(owner, "cycles", None), name, DEFAULTS[name])
+
+
+def working_space() -> dict:
+    """Name of the working space ("" where Blender does not tell, before 5.0) and its matrix to linear Rec.709."""
+    columns = [mathutils.Color(axis).from_scene_linear_to_rec709_linear() for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    name = bpy.data.colorspace.working_space if bpy.app.version >= (5, 0, 0) else ""
+    return {"name": name, "to_rec709": [[column[row] for column in columns] for row in range(3)]}
+
+
+CAMERA_TYPES = ("PERSP", "ORTHO")
+CAMERA_KINDS = {"PANO": "panoramic", "CUSTOM": "custom (Open Shading Language)"}
+
+
+def go_to_frame(scene, frame: int | None) -> None:
+    """Evaluate the animation at `frame`, or at the file's own; a camera bound to a marker becomes the scene's."""
+    if frame is None:
+        scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+    else:
+        scene.frame_set(frame)
+
+
+def choose_camera(scene, name: str | None):
+    """The camera object to render from: by `name`, or the scene's at its current frame."""
+    if name is None:
+        camera = scene.camera
+        if camera is None:
+            raise SceneError(f"scene {scene.name!r} has no active camera: set one, or name one")
+    else:
+        camera = scene.objects.get(name)
+        if camera is None or camera.type != "CAMERA":
+            cameras = listed((ob.name for ob in scene.objects if ob.type == "CAMERA"), name)
+            raise SceneError(f"camera {name!r} is not in scene {scene.name!r}; cameras there: {cameras}")
+    if camera.type != "CAMERA":
+        raise SceneError(
+            f"scene {scene.name!r}: its camera {camera.name!r} is a {camera.type} object, expected a camera"
+        )
+    if camera.data.type not in CAMERA_TYPES:
+        kind = CAMERA_KINDS.get(camera.data.type, camera.data.type)
+        raise SceneError(
+            f"camera {camera.name!r} is {kind}, expected a perspective or orthographic one; "
+            "change its type, or name another camera"
+        )
+    # A render switches to the camera of the last marker, whatever the scene says.
+    for marker in scene.timeline_markers:
+        marker.camera = None
+    scene.camera = camera
+    return camera
+
+
+def hold_still(scene, camera) -> None:
+    """Keep scene and lens at their values of this frame: a render evaluates them again, and would undo what is set."""
+    for owner in (scene, camera.data):
+        if owner.animation_data is not None:
+            owner.animation_data_clear()
+
+
+def picture_size(scene) -> tuple[int, int]:
+    """Width and height of the whole picture in pixels, without regard to a border."""
+    render = scene.render
+    share = render.resolution_percentage
+    return render.resolution_x * share // 100, render.resolution_y * share // 100
+
+
+def set_resolution(scene, width: int | None, height: int | None) -> tuple[int, int]:
+    """Set and return the size of the whole picture in pixels; a missing side keeps the file's aspect."""
+    own_width, own_height = picture_size(scene)
+    if own_width < 1 or own_height < 1:
+        raise SceneError(
+            f"scene {scene.name!r}: {scene.render.resolution_percentage} % of {scene.render.resolution_x}x"
+            f"{scene.render.resolution_y} pixels is less than one pixel; raise the percentage"
+        )
+    if width is None and height is None:
+        return own_width, own_height
+    if width is None:
+        width = max(1, round(height * own_width / own_height))
+    elif height is None:
+        height = max(1, round(width * own_height / own_width))
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    if (render.resolution_x, render.resolution_y) != (width, height):
+        raise SceneError(
+            f"resolution {width}x{height} is not possible in Blender, the nearest is "
+            f"{render.resolution_x}x{render.resolution_y}"
+        )
+    return width, height
+
+
+def render_border(scene) -> Border | None:
+    """The part of the picture that is rendered, None for all of it.
+
+    Raises SceneError for a border of less than a pixel, which Blender does not render.
+    """
+    render, (width, height) = scene.render, picture_size(scene)
+    if not render.use_border:
+        return None
+
+    def cut(share, size):
+        return int(np.float32(share) * np.float32(size))
+
+    left, right = cut(render.border_min_x, width), cut(render.border_max_x, width)
+    bottom, top = cut(render.border_min_y, height), cut(render.border_max_y, height)
+    if right <= left or top <= bottom:
+        raise SceneError(
+            f"scene {scene.name!r}: its render region is {max(right - left, 0)}x{max(top - bottom, 0)} of "
+            f"{width}x{height} pixels, expected at least one; make it larger or switch it off"
+        )
+    return Border(
+        left=left,
+        top=height - top,
+        width=right - left,
+        height=top - bottom,
+        full_width=width,
+        full_height=height,
+        cropped=render.use_crop_to_border,
+    )
+
+
+@contextmanager
+def shifted_pixels(scene, offset: np.ndarray):
+    """Meanwhile the rays of `scene` go through the points `offset` (2,) pixels from the pixels' centers."""
+    render, lens = scene.render, scene.camera.data
+    size = picture_size(scene)
+    width, height = size[0] * render.pixel_aspect_x, size[1] * render.pixel_aspect_y
+    fits_width = lens.sensor_fit == "HORIZONTAL" or (lens.sensor_fit == "AUTO" and width >= height)
+    unit = width if fits_width else height
+    before = lens.shift_x, lens.shift_y
+    try:
+        lens.shift_x += offset[0] * render.pixel_aspect_x / unit
+        lens.shift_y += offset[1] * render.pixel_aspect_y / unit
+        yield
+    finally:
+        lens.shift_x, lens.shift_y = before
+
+
+# In pixels. The interface ends at 0.01, which is too wide: reference rays then cross edges that the central sample
+# does not (measured: 1 % of the pixels of a detailed picture, 6 % relative L2). What
+# remains: 1 in 1000 rays per axis strays by up to half a pixel, by the first cell of Cycles' filter table.
+CENTER_FILTER_WIDTH = 1e-6
+QUANTILE_STEPS = 8192
+
+
+def filter_density(kind: str, width: float, distance: np.ndarray) -> tuple[np.ndarray, float]:
+    """Weight of the filter `distance` pixels from the center along one axis, not normalized, and its half extent.
+
+    `kind` and `width` (pixels) are `pixel_filter_type` and `filter_width` of the scene; filters are separable. BOX is
+    one pixel whatever the width. GAUSSIAN is exp(-8 (x / width)^2), cut at 1.5 widths. BLACKMAN_HARRIS is the window of
+    Harris 1978 ("On the use of windows for harmonic analysis with the discrete Fourier transform"), four terms,
+    two widths from end to end. Measured on an edge: Cycles 4.5.15 and 5.2.3 agree to 1e-3 of its height.
+    """
+    distance = np.asarray(distance, dtype=np.float64)
+    if kind == "BOX":
+        weight, half = np.ones_like(distance), 0.5
+    elif kind == "GAUSSIAN":
+        weight, half = np.exp(-8.0 * (distance / width) ** 2), 1.5 * width
+    elif kind == "BLACKMAN_HARRIS":
+        phase = np.pi * (distance / width + 1.0)
+        terms = (0.35875, -0.48829, 0.14128, -0.01168)
+        weight, half = sum(term * np.cos(order * phase) for order, term in enumerate(terms)), width
+    else:
+        raise ValueError(f"pixel filter is {kind!r}, expected BOX, GAUSSIAN or BLACKMAN_HARRIS")
+    return np.where(np.abs(distance) <= half, weight, 0.0), half
+
+
+def filter_quantiles(kind: str, width: float, shares: np.ndarray) -> np.ndarray:
+    """Distances from the pixel's center, in pixels, below which the filter has the `shares` of its weight."""
+    half = filter_density(kind, width, np.zeros(1))[1]
+    distance = np.linspace(-half, half, QUANTILE_STEPS + 1)
+    weight = filter_density(kind, width, distance)[0]
+    cumulative = np.concatenate([[0.0], np.cumsum(weight[1:] + weight[:-1])])
+    return np.interp(shares, cumulative / cumulative[-1], distance)
+
+
+def filter_points(kind: str, width: float, count: int) -> np.ndarray:
+    """Offsets (count, 2) from the pixel's center, right and up, in pixels, distributed as the filter; 0 for one.
+
+    The R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences"), warped along each axis.
+    """
+    if count == 1:
+        return np.zeros((1, 2))
+    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    return filter_quantiles(kind, width, (np.arange(count)[:, None] * steps + 0.5) % 1.0)
+
+
+def sub_pixel_offsets(scene, count: int) -> np.ndarray:
+    """`filter_points` of the scene's own filter. To be called outside `pinned_pixel_filter`, which replaces it."""
+    return filter_points(scene.cycles.pixel_filter_type, scene.cycles.filter_width, count)
+
+
+def filter_name(scene) -> str:
+    """The scene's filter for a report: its kind, and its width in pixels where it has one."""
+    kind = scene.cycles.pixel_filter_type
+    return kind if kind == "BOX" else f"{kind} {scene.cycles.filter_width:g} px"
+
+
+@contextmanager
+def pinned_pixel_filter(scene):
+    """Meanwhile all camera rays of a pixel go through its center; sub-samples come from shifting the camera."""
+    cycles = scene.cycles
+    before = cycles.pixel_filter_type, cycles.filter_width
+    cycles.pixel_filter_type = "GAUSSIAN"
+    # Written past the property's limits, into what stores it.
+    stored = cycles.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else cycles
+    stored["filter_width"] = CENTER_FILTER_WIDTH
+    try:
+        yield
+    finally:
+        cycles.pixel_filter_type, cycles.filter_width = before
+
+
+ZIP_ROWS = 16
+_MULTI_PART = 0x1000
+_HEADERS_BYTES = 1 << 22
+
+
+def is_whole(path: Path) -> bool:
+    """True where every chunk of the scanline EXR `path`, of ZIP compression, is there to its end."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        data = file.read(_HEADERS_BYTES)
+        try:
+            counts, position, several = _headers(data)
+            offsets = struct.unpack_from(f"<{sum(counts)}Q", data, position)
+            if min(offsets) < position:
+                return False
+            file.seek(max(offsets) + (8 if several else 4))
+            return file.tell() + 4 + struct.unpack("<I", file.read(4))[0] <= size
+        except (ValueError, IndexError, KeyError, struct.error):
+            return False
+
+
+def _headers(data: bytes) -> tuple[list[int], int, bool]:
+    """Chunks of every part, where the table of their places begins, and whether there may be several parts."""
+    several = bool(struct.unpack_from("<I", data, 4)[0] & _MULTI_PART)
+    position, counts = 8, []
+    while True:
+        attributes = {}
+        while data[position]:
+            name_end = data.index(0, position)
+            type_end = data.index(0, name_end + 1)
+            (length,) = struct.unpack_from("<I", data, type_end + 1)
+            start = type_end + 5
+            attributes[data[position:name_end]] = data[start : start + length]
+            position = start + length
+        position += 1
+        counts.append(_chunks(attributes))
+        if not several:
+            return counts, position, several
+        if not data[position]:
+            return counts, position + 1, several
+
+
+def _chunks(attributes) -> int:
+    if b"chunkCount" in attributes:
+        return struct.unpack("<I", attributes[b"chunkCount"])[0]
+    _, low, _, high = struct.unpack("<4i", attributes[b"dataWindow"])
+    return -(-(high - low + 1) // ZIP_ROWS)
+
+
+VIEW_LAYER = "ltsh"
+
+
+def choose_view_layer(scene, warnings: list[str], name: str | None = None):
+    """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
+    if name is not None and name not in scene.view_layers:
+        layers = listed((layer.name for layer in scene.view_layers), name)
+        raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
+    used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
+    if name is not None:
+        used = [scene.view_layers[name]]
+    if len(used) > 1:
+        warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is shaded")
+    for layer in scene.view_layers:
+        layer.use = layer == used[0]
+    layer = used[0]
+    layer.name = VIEW_LAYER
+    # Passes that nobody reads, and that could have the names of those that are read.
+    for extra in (layer.aovs, layer.lightgroups):
+        for item in list(extra):
+            extra.remove(item)
+    return layer
+
+
+def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
+    """Switch off all that stands between one camera ray per sample and the passes, with a warning where it shows.
+
+    What is left on purpose: the border, holdouts, material overrides and excluded or indirect-only collections, which
+    samples and reference both show as any render does.
+    """
+    render, cycles = scene.render, scene.cycles
+    for owner, name, label in (
+        (render, "use_motion_blur", "motion blur"),
+        (render, "use_multiview", "stereoscopy"),
+        (camera.data.dof, "use_dof", f"depth of field of camera {camera.name!r}"),
+    ):
+        if getattr(owner, name):
+            warnings.append(f"{label} is switched off, in the Cycles reference as well")
+            setattr(owner, name, False)
+    warnings.extend(_steps_after_rendering(scene))
+    _leave_out_world(scene, view_layer, warnings)
+    scene.camera = camera
+    hold_still(scene, camera)
+    render.engine = "CYCLES"
+    render.threads_mode, render.threads = "FIXED", cores()
+    render.use_compositing = render.use_sequencer = False
+    # Alpha 0 then means a holdout and nothing else; the passes are the same.
+    render.film_transparent = False
+    render.use_freestyle = render.use_persistent_data = False
+    render.use_file_extension = render.use_overwrite = True
+    cycles.device = "CPU"
+    # Multiplied into the result where it is read: the limits of the property and float32 have no say then.
+    cycles.film_exposure = 1.0
+    cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
+    cycles.use_animated_seed = False
+    cycles.time_limit = 0.0
+    cycles.max_bounces = 0
+    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
+    cycles.light_sampling_threshold = 0.0
+    cycles.caustics_reflective = True
+    view_layer.samples = 0
+
+
+def _steps_after_rendering(scene) -> list[str]:
+    """Warnings about what Blender would do to the rendered picture and is switched off."""
+    render, found = scene.render, []
+    if render.use_freestyle:
+        found.append("Freestyle")
+    if bpy.app.version >= (5, 0, 0):
+        tree = scene.compositing_node_group
+    else:
+        tree = scene.node_tree if scene.use_nodes else None
+    if render.use_compositing and tree is not None:
+        found.append(f"compositing by {tree.name!r}")
+    editor = scene.sequence_editor
+    if render.use_sequencer and editor is not None and len(editor.strips):
+        found.append("the video sequencer")
+    return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in found]
+
+
+def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
+    world = view_layer.world_override or scene.world
+    if world is not None and _world_shines(world):
+        warnings.append(f"world {world.name!r}: its light is not shaded; left out of the Cycles reference as well")
+    view_layer.world_override = scene.world = None
+
+
+def _world_shines(world) -> bool:
+    tree = world.node_tree
+    if bpy.app.version < (5, 0, 0) and not world.use_nodes:
+        return max(world.color) > 0.0
+    for node in tree.nodes if tree else ():
+        if node.bl_idname == "ShaderNodeBackground":
+            color, strength = node.inputs["Color"], node.inputs["Strength"]
+            dark = not color.is_linked and max(color.default_value[:3]) <= 0.0
+            if not dark and (strength.is_linked or strength.default_value > 0.0):
+                return True
+    return False
+
+
+def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
+    """Take the objects `names` and all volumes out of every collection; children keep their parents."""
+    for ob in bpy.data.objects:
+        if ob.type == "VOLUME" and ob.name_full in {other.name_full for other in scene.objects}:
+            warnings.append(f"volume {ob.name!r} is not shaded; left out of the Cycles reference as well")
+        elif ob.name_full not in names:
+            continue
+        ob.hide_render = True
+        for collection in list(ob.users_collection):
+            collection.objects.unlink(ob)
+
+
+def prepare_surfaces(warnings: list[str]) -> None:
+    """Object settings that change how a surface itself is shaded."""
+    for ob in bpy.data.objects:
+        if ob.type == "LIGHT":
+            ob.visible_camera = False
+        if ob.type not in SURFACE_TYPES:
+            continue
+        if ob.is_shadow_catcher:
+            warnings.append(f"object {ob.name!r}: shadow catcher is switched off, it is shaded like any surface")
+            ob.is_shadow_catcher = False
+        if ob.shadow_terminator_shading_offset:
+            warnings.append(f"object {ob.name!r}: the shading offset of its shadow terminator is switched off")
+            ob.shadow_terminator_shading_offset = 0.0
+
+
+def enable_passes(view_layer, names: tuple[str, ...]) -> None:
+    """Switch on the passes `use_pass_<name>`, all others off."""
+    for attribute in dir(view_layer):
+        if attribute.startswith("use_pass_"):
+            setattr(view_layer, attribute, attribute[len("use_pass_") :] in names)
+
+
+def render_exr(scene, path: Path) -> None:
+    """Render `scene` into the multi-layer float EXR `path`. Raises SceneError, and OSError where the disk is full."""
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.file_format = "OPEN_EXR_MULTILAYER"
+    if hasattr(settings, "use_exr_interleave"):
+        settings.use_exr_interleave = True
+    settings.color_depth, settings.exr_codec = "32", "ZIP"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True, scene=scene.name)
+    if not path.is_file():
+        raise SceneError(f"Blender rendered scene {scene.name!r} but wrote no {path.name}")
+    if not is_whole(path):
+        raise OSError(errno.ENOSPC, f"{path.name} was not written whole")
+
+
+def pass_names() -> dict[str, str]:
+    """Names of the passes in the EXR, which changed with 5.0."""
+    if bpy.app.version >= (5, 0, 0):
+        return {
+            "specular_light": "Glossy Direct",
+            "specular_color": "Glossy Color",
+            "diffuse_light": "Diffuse Direct",
+            "diffuse_color": "Diffuse Color",
+            "emission": "Emission",
+        }
+    return {
+        "specular_light": "GlossDir",
+        "specular_color": "GlossCol",
+        "diffuse_light": "DiffDir",
+        "diffuse_color": "DiffCol",
+        "emission": "Emit",
+    }

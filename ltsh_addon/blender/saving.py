@@ -1,0 +1,66 @@
+"""Saving copies of the open file: whole or not at all, or at once for a second Blender."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+
+import bpy
+
+from .process.blender_process import SceneError
+
+# What a compressed .blend ends with (Zstandard seekable format 0.1.1, facebook/zstd, contrib/seekable_format).
+SEEK_TABLE_END = bytes.fromhex("b1ea928f")
+
+_state = {"keeps engine": False}
+
+
+def save_working_copy(path: Path, *, keep_engine: bool = False) -> None:
+    """Save the open file, unsaved changes included, as `path` for a second Blender. Raises RuntimeError.
+
+    Files are saved with the artist's engine, also during a preview; `keep_engine` leaves the one that is in use.
+    """
+    with _without_thumbnail():
+        _state["keeps engine"] = keep_engine
+        try:
+            bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=False, check_existing=False)
+        finally:
+            _state["keeps engine"] = False
+
+
+def keeps_engine() -> bool:
+    """True while a copy is saved with the engine that is in use."""
+    return _state["keeps engine"]
+
+
+@contextlib.contextmanager
+def _without_thumbnail():
+    """Meanwhile saving draws no thumbnail: that is a render of its own, many times as long as the writing."""
+    preferences = bpy.context.preferences
+    before, unsaved = preferences.filepaths.file_preview_type, preferences.is_dirty
+    try:
+        preferences.filepaths.file_preview_type = "NONE"
+        yield
+    finally:
+        preferences.filepaths.file_preview_type, preferences.is_dirty = before, unsaved
+
+
+def save_copy(path: Path, **options) -> None:
+    """Save a compressed copy of the open file as `path`; `options` are those of `bpy.ops.wm.save_as_mainfile`. Raises
+    SceneError, which names the folder, where it cannot be saved whole."""
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=True, **options)
+    except RuntimeError as error:
+        path.with_name(f"{path.name}@").unlink(missing_ok=True)
+        reason = " ".join(str(error).split()).removeprefix("Error: ")
+        raise SceneError(f"{path.parent}: Blender cannot save there: {reason}") from error
+    check_whole(path)
+
+
+def check_whole(path: Path) -> None:
+    """Raise SceneError where the end of the compressed .blend is missing."""
+    with path.open("rb") as file:
+        file.seek(-min(len(SEEK_TABLE_END), path.stat().st_size), os.SEEK_END)
+        if file.read() != SEEK_TABLE_END:
+            raise SceneError(f"{path.parent}: Blender could not save the whole .blend there; is the disk full?")

@@ -1,1 +1,0 @@
-"""Samples of a UV map's texels, and Cycles' bake of the same texels."""

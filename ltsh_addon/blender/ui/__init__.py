@@ -1,0 +1,1 @@
+"""Panels, operators, jobs and results inside Blender."""

@@ -1,0 +1,499 @@
+"""The picture of a comparison in the image editor: composed, wiped, probed."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+
+import bpy
+import numpy as np
+
+from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
+from . import drawing, results
+
+NAME = "LTSH Comparison"
+SETTLE_SECONDS = 1.0
+PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
+_LOOKUP_SIZE = 1024
+_state = {"lookup": None, "settling": set(), "kept": False, "dragged": None}
+
+
+def changed(settings, context) -> None:
+    """Called by Blender when a setting of the view changes."""
+    try:
+        refresh(settings.id_data)
+    except RuntimeError as error:
+        _warn(error)
+
+
+def _warn(error: RuntimeError) -> None:
+    """A picture is gone; the panels say so when the results are shown anew."""
+    logging.getLogger(__name__).warning("%s", " ".join(str(error).split()))
+
+
+def refresh(scene) -> bool:
+    """Bring the image up to date; False where there are no results."""
+    result = results.result_of(scene)
+    if result is None:
+        return False
+    choice = results.choice_of(scene.ltsh, result)
+    results.images_of_pass(scene, result, choice)
+    group = result.groups[choice.group]
+    pictures = [results.pixels_of(image) for image in _chosen_images(scene, result, choice)]
+    if len(pictures) < 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
+        return False
+    mode = scene.ltsh.mode
+    pixels = compose(*pictures, mode, split_of(scene), error_scale(scene.ltsh, group, choice))
+    _store(viewer_image(scene), pixels, mode != "ERROR")
+    _settle_later(scene)
+    redraw_image_editors()
+    return True
+
+
+def _chosen_images(scene, result, choice) -> list:
+    """The two images that are compared; none where the results lack one."""
+    layers = [f"{name}.{choice.pass_name}" for name in (choice.first, choice.second)]
+    if any(layer not in result.groups[choice.group]["files"] for layer in layers):
+        return []
+    return [results.layer_image(scene, result, choice.group, layer) for layer in layers]
+
+
+def read_a_picture(scene) -> bool:
+    """Read the pixels of a picture that `refresh` needs; False where it has them all."""
+    result = results.result_of(scene)
+    images = [] if result is None else _chosen_images(scene, result, results.choice_of(scene.ltsh, result))
+    unread = next((image for image in images if not results.is_read(image)), None)
+    return unread is not None and results.pixels_of(unread).size > 0
+
+
+def split_of(scene) -> float:
+    """Where the line of the wipe is, as a share of the width: also while the mouse drags it."""
+    return scene.ltsh.split if _state["dragged"] is None else _state["dragged"]
+
+
+def drag_split(scene, position: float | None) -> None:
+    """Show the line at `position` meanwhile; None: where the settings have it.
+
+    With the settings themselves Blender would evaluate the scene anew and draw all windows for every step of the mouse.
+    """
+    _state["dragged"] = None if position is None else min(max(position, 0.0), 1.0)
+    try:
+        refresh(scene)
+    except RuntimeError as error:
+        _warn(error)
+
+
+def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:
+    """The picture (H, W', 4) of both (H, W, 4): linear colors; W' is 2 W side by side."""
+    if mode == "A":
+        return first
+    if mode == "SIDE":
+        return np.concatenate([first, second], axis=1)
+    if mode == "ERROR":
+        difference = (first[..., :3] - second[..., :3]) @ LUMINANCE_WEIGHTS.astype(np.float32)
+        colors = np.ones_like(first)
+        colors[..., :3] = _error_lookup()[_lookup_index(difference, scale)]
+        return colors
+    columns = round(split * first.shape[1])
+    return np.concatenate([first[:, :columns], second[:, columns:]], axis=1)
+
+
+def error_scale(settings, group: dict, choice) -> float:
+    """The difference at which the colors end: the artist's own, or that of the report."""
+    return settings.error_scale if settings.error_scale > 0.0 else group["scales"][choice.pass_name]
+
+
+def viewer_image(scene):
+    """The image of `scene`, made where it is not there yet."""
+    for image in results.our_images(scene):
+        if image[results.LAYER] == "":
+            return image
+    image = bpy.data.images.new(NAME, 4, 4, alpha=False, float_buffer=True)
+    image[results.LAYER], image[results.SCENE] = "", scene.name
+    image.use_fake_user = True
+    return image
+
+
+def is_viewer(image) -> bool:
+    """True for an image that this module made."""
+    return image is not None and image.get(results.LAYER) == "" and results.SCENE in image
+
+
+def _store(image, pixels: np.ndarray, as_render: bool) -> None:
+    height, width = pixels.shape[:2]
+    # Either makes new pixels, so neither may come after they are written.
+    if image.colorspace_settings.name != results.linear_space():
+        image.colorspace_settings.name = results.linear_space()
+    if tuple(image.size) != (width, height):
+        image.source, image.generated_width, image.generated_height = "GENERATED", width, height
+    image.use_view_as_render = as_render
+    image.pixels.foreach_set(np.ascontiguousarray(pixels).ravel())
+    image.update()
+
+
+def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
+    """Index into the colors; the last one is for what is not finite."""
+    finite = np.isfinite(difference)
+    position = np.clip(np.where(finite, difference, 0.0) / scale, -1.0, 1.0)
+    index = np.rint((0.5 + 0.5 * position) * (_LOOKUP_SIZE - 2)).astype(np.int32)
+    return np.where(finite, index, _LOOKUP_SIZE - 1)
+
+
+def _error_lookup() -> np.ndarray:
+    """Linear colors (N, 3) that Blender's default display shows as those of `signed_error_colors`."""
+    if _state["lookup"] is None:
+        values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
+        colors = signed_error_colors(values[None], 1.0)[0]
+        linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+        _state["lookup"] = linear.astype(np.float32)
+    return _state["lookup"]
+
+
+def _settle_later(scene) -> None:
+    """Pack the image once nothing has changed for a moment: Blender would else ask to save it before it quits."""
+    _state["settling"].add(scene.name)
+    if not bpy.app.background:
+        if bpy.app.timers.is_registered(settle):
+            bpy.app.timers.unregister(settle)
+        bpy.app.timers.register(settle, first_interval=SETTLE_SECONDS)
+
+
+def settle() -> None:
+    """Pack the images that have changed."""
+    for name in _state["settling"]:
+        scene = bpy.data.scenes.get(name)
+        if scene is not None:
+            image = viewer_image(scene)
+            if image.is_dirty:
+                image.pack()
+    _state["settling"].clear()
+
+
+def put_in_editor(context, scene) -> bool:
+    """Show the image of `scene` in an Image Editor of the window that shows nothing or a picture of ours."""
+    screen = context.window.screen if context.window is not None else None
+    for area in screen.areas if screen is not None else ():
+        if area.type == "IMAGE_EDITOR":
+            space = area.spaces.active
+            if space.image is None or results.LAYER in space.image:
+                space.image = viewer_image(scene)
+                return True
+    return False
+
+
+def redraw_image_editors() -> None:
+    """Draw all Image Editors again."""
+    for area in _areas():
+        if area.type == "IMAGE_EDITOR":
+            area.tag_redraw()
+
+
+def redraw_panels() -> None:
+    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
+    for area in _areas():
+        wanted = PANEL_REGIONS.get(area.type)
+        for region in area.regions:
+            if region.type == wanted:
+                region.tag_redraw()
+
+
+def _areas() -> list:
+    return [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
+
+
+@contextlib.contextmanager
+def kept_as_it_is():
+    """Meanwhile saving leaves the images alone: for a copy that no artist opens, in which they do not matter."""
+    _state["kept"] = True
+    try:
+        yield
+    finally:
+        _state["kept"] = False
+
+
+@bpy.app.handlers.persistent
+def _shrink(*_):
+    """Before saving: pixels that can be made again have no place in the file."""
+    for scene in bpy.data.scenes if not _state["kept"] else ():
+        for image in results.our_images(scene):
+            if is_viewer(image) and results.result_of(scene) is not None:
+                _store(image, np.zeros((4, 4, 4), dtype=np.float32), image.use_view_as_render)
+                image.pack()
+
+
+@bpy.app.handlers.persistent
+def _restore(*_):
+    """After saving and loading."""
+    if _state["kept"]:
+        return
+    for scene in bpy.data.scenes:
+        if any(is_viewer(image) for image in results.our_images(scene)):
+            refresh(scene)
+    settle()
+
+
+def _register_viewer():
+    bpy.app.handlers.save_pre.append(_shrink)
+    for handlers in (bpy.app.handlers.save_post, bpy.app.handlers.load_post):
+        handlers.append(_restore)
+
+
+def _unregister_viewer():
+    if bpy.app.timers.is_registered(settle):
+        bpy.app.timers.unregister(settle)
+    for handlers in (bpy.app.handlers.save_pre, bpy.app.handlers.save_post, bpy.app.handlers.load_post):
+        for function in (_shrink, _restore):
+            if function in handlers:
+                handlers.remove(function)
+
+
+CYCLES = "cycles"
+_active = {"on": False}
+
+
+class LTSH_OT_probe(bpy.types.Operator):
+    """Show the radiance of every picture at the pixel under the mouse. Click to leave the probe there, Esc to end"""
+
+    bl_idname = "ltsh.probe"
+    bl_label = "Pixel Probe"
+
+    @classmethod
+    def poll(cls, context):
+        space = context.space_data
+        if space is None or space.type != "IMAGE_EDITOR" or not is_viewer(space.image):
+            cls.poll_message_set("Show the image LTSH Comparison first")
+            return False
+        return True
+
+    def invoke(self, context, event):
+        self._area = context.area
+        _active["on"] = True
+        context.window.cursor_modal_set("EYEDROPPER")
+        context.window_manager.modal_handler_add(self)
+        context.area.tag_redraw()
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        region = next(region for region in self._area.regions if region.type == "WINDOW")
+        if event.type == "MOUSEMOVE":
+            x, y = region.view2d.region_to_view(event.mouse_x - region.x, event.mouse_y - region.y)
+            if context.scene.ltsh.mode == "SIDE":
+                x = 2.0 * x % 1.0
+            context.scene.ltsh.probe = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
+            self._area.tag_redraw()
+            return {"PASS_THROUGH"}
+        if event.type in {"ESC", "RIGHTMOUSE"}:
+            _active["on"] = False
+            return self._end(context, {"CANCELLED"})
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            return self._end(context, {"FINISHED"})
+        return {"PASS_THROUGH"}
+
+    def cancel(self, context):
+        """The window was closed."""
+        _active["on"] = False
+
+    def _end(self, context, outcome):
+        context.window.cursor_modal_restore()
+        self._area.tag_redraw()
+        return outcome
+
+
+def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple[str, tuple[float, ...]]]]:
+    """The pixel (column, row from below) at `point` in [0, 1]^2, and (label, RGB) of every picture there."""
+    group = result.groups[choice.group]
+    width, height = group["size"]
+    column, row = (min(int(share * size), size - 1) for share, size in zip(point, (width, height), strict=True))
+    rows = []
+    for name in group["names"]:
+        layer = f"{name}.{choice.pass_name}"
+        if layer in group["files"]:
+            pixels = results.pixels_of(results.layer_image(scene, result, choice.group, layer))
+            if pixels.size:
+                rows.append((group["labels"][name], tuple(float(value) for value in pixels[row, column, :3])))
+    return (column, row), rows
+
+
+def draw_probe(context, result, choice, corners) -> None:
+    """A cross at the probed pixel and a table of its values, while the probe is on."""
+    if not _active["on"]:
+        return
+    scene, scale = context.scene, context.preferences.system.ui_scale
+    left, bottom, right, top = corners
+    (column, row), rows = values_at(scene, result, choice, scene.ltsh.probe)
+    share = 0.5 if scene.ltsh.mode == "SIDE" else 1.0
+    x = left + share * scene.ltsh.probe[0] * (right - left)
+    y = bottom + scene.ltsh.probe[1] * (top - bottom)
+    half, arm, gap = 0.75 * scale, 9.0 * scale, 3.0 * scale
+    for a, b in ((gap, arm), (-arm, -gap)):
+        drawing.draw_rectangle(x + a, y - half, x + b, y + half, drawing.LINE)
+        drawing.draw_rectangle(x - half, y + a, x + half, y + b, drawing.LINE)
+    _draw_table(f"{column}, {row}", rows, x + 14.0 * scale, y - 14.0 * scale, scale)
+
+
+def _draw_table(title: str, rows, x: float, top: float, scale: float) -> None:
+    line, pad = 17.0 * scale, 8.0 * scale
+    label = max([drawing.text_width(name, scale) for name, _ in rows] + [drawing.text_width(title, scale)])
+    number = drawing.text_width("0000.0000", scale)
+    width = 2.0 * pad + label + 3.0 * (number + 4.0 * scale)
+    bottom = top - line * (len(rows) + 1) - pad
+    drawing.draw_rectangle(x, bottom, x + width, top, (0.0, 0.0, 0.0, 0.75))
+    y = top - line
+    drawing.draw_text(x + pad, y, title, scale, (0.75, 0.75, 0.75, 1.0))
+    for name, values in rows:
+        y -= line
+        drawing.draw_text(x + pad, y, name, scale)
+        for index, value in enumerate(values):
+            text = f"{value:.4f}"
+            right = x + pad + label + (index + 1) * (number + 4.0 * scale)
+            drawing.draw_text(right - drawing.text_width(text, scale), y, text, scale)
+
+
+_register_probe, _unregister_probe = bpy.utils.register_classes_factory((LTSH_OT_probe,))
+
+GRIP_PIXELS = 12.0
+HANDLE_PIXELS = 9.0
+_wiped = {"handle": None}
+
+
+def _shown(context):
+    """Result and choice where the space of `context` shows the comparison of its scene, else None."""
+    space, scene = context.space_data, context.scene
+    if space is None or space.type != "IMAGE_EDITOR" or not is_viewer(space.image):
+        return None
+    if not results.belongs(space.image, scene):
+        return None
+    result = results.result_of(scene)
+    return None if result is None else (result, results.choice_of(scene.ltsh, result))
+
+
+def line_position(context) -> float:
+    """Where the line is, in pixels from the left of the region."""
+    return context.region.view2d.view_to_region(split_of(context.scene), 0.0, clip=False)[0]
+
+
+class LTSH_GT_wipe(bpy.types.Gizmo):
+    """The line itself; `_draw` shows it, so that it looks the same where gizmos are switched off."""
+
+    bl_idname = "LTSH_GT_wipe"
+
+    def draw(self, context):
+        """Nothing beside what `_draw` shows."""
+
+    def test_select(self, context, location):
+        grip = GRIP_PIXELS * context.preferences.system.ui_scale
+        return 0 if abs(location[0] - line_position(context)) <= grip else -1
+
+    def invoke(self, context, event):
+        context.window.cursor_modal_set("MOVE_X")
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event, tweak):
+        drag_split(context.scene, context.region.view2d.region_to_view(event.mouse_region_x, 0.0)[0])
+        return {"RUNNING_MODAL"}
+
+    def exit(self, context, cancel):
+        context.window.cursor_modal_restore()
+        settings, position = context.scene.ltsh, split_of(context.scene)
+        if not cancel and position != settings.split:
+            settings.split = position
+            bpy.ops.ed.undo_push(message="Drag Split")
+        drag_split(context.scene, None)
+
+
+class LTSH_GGT_wipe(bpy.types.GizmoGroup):
+    """Takes the mouse at the line before any tool of the Image Editor does"""
+
+    bl_idname = "LTSH_GGT_wipe"
+    bl_label = "Split of the Comparison"
+    bl_space_type = "IMAGE_EDITOR"
+    bl_region_type = "WINDOW"
+    bl_options = {"PERSISTENT", "SHOW_MODAL_ALL"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _shown(context) is not None
+
+    def setup(self, context):
+        self.gizmos.new(LTSH_GT_wipe.bl_idname)
+
+
+def _draw() -> None:
+    """Called by Blender for every Image Editor."""
+    context = bpy.context
+    shown = _shown(context)
+    if shown is None:
+        return
+    result, choice = shown
+    scale, region, settings = context.preferences.system.ui_scale, context.region, context.scene.ltsh
+    labels = result.groups[choice.group]["labels"]
+    first, second = labels[choice.first], labels[choice.second]
+    left, bottom = region.view2d.view_to_region(0.0, 0.0, clip=False)
+    right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
+    below, gap = bottom - 26.0 * scale, 6.0 * scale
+    if settings.mode == "WIPE":
+        _draw_line(line_position(context), bottom, top, scale)
+        drawing.draw_label(left, below, first, scale)
+        drawing.draw_label(right, below, second, scale, align=1.0)
+    elif settings.mode == "SIDE":
+        drawing.draw_label(left, below, first, scale)
+        drawing.draw_label((left + right) / 2.0, below, second, scale)
+    elif settings.mode == "A":
+        drawing.draw_label(left, below, first, scale)
+    else:
+        drawing.draw_label(left, below, f"{first} \u2212 {second}", scale)
+        limit = error_scale(settings, result.groups[choice.group], choice)
+        _draw_legend(left, below - 26.0 * scale, limit, scale)
+    if result.partial:
+        drawing.draw_label(left, top + gap, result.partial, scale)
+    draw_probe(context, result, choice, (left, bottom, right, top))
+
+
+def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
+    half, handle = 0.75 * scale, HANDLE_PIXELS * scale
+    drawing.draw_rectangle(x - 2.0 * half, bottom, x + 2.0 * half, top, drawing.PAPER)
+    drawing.draw_rectangle(x - half, bottom, x + half, top, drawing.LINE)
+    middle = (bottom + top) / 2.0
+    drawing.draw_rectangle(x - handle, middle - handle, x + handle, middle + handle, drawing.PAPER)
+    for offset in (-3.0 * scale, 3.0 * scale):
+        drawing.draw_rectangle(
+            x + offset - half, middle - 0.6 * handle, x + offset + half, middle + 0.6 * handle, drawing.LINE
+        )
+
+
+def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
+    """The colors of the difference between their ends, from `left` on."""
+    width, height, gap = 160.0 * scale, 20.0 * scale, 12.0 * scale
+    start, end = f"too dark \u2212{limit:g}", f"+{limit:g} too bright"
+    drawing.draw_label(left, below, start, scale)
+    bar = left + drawing.text_width(start, scale) + gap
+    drawing.draw_gradient(bar, below, bar + width, below + height, color_bar(65, 1)[0])
+    drawing.draw_label(bar + width, below, end, scale)
+
+
+CLASSES = (LTSH_GT_wipe, LTSH_GGT_wipe)
+_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+
+
+def _register_wipe():
+    _register()
+    _wiped["handle"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
+
+
+def _unregister_wipe():
+    bpy.types.SpaceImageEditor.draw_handler_remove(_wiped["handle"], "WINDOW")
+    _unregister()
+
+
+def register() -> None:
+    """Add all of it to Blender."""
+    _register_viewer()
+    _register_probe()
+    _register_wipe()
+
+
+def unregister() -> None:
+    """Remove what `register` added."""
+    _unregister_wipe()
+    _unregister_probe()
+    _unregister_viewer()

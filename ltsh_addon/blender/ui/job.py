@@ -1,0 +1,403 @@
+"""A job in a second Blender: its arguments, its plan, the process, its stages."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import queue
+import shutil
+import subprocess
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+from bpy.app.translations import pgettext_iface as translated
+
+from ..process import blender_process
+from . import preflight
+from .settings import preferences
+
+# Costs count as if so many seconds had been measured.
+PRIOR_SECONDS = 5.0
+# Below, what a stage reports says too little about its length.
+LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
+# An end that is not reported is not shown.
+MOST = 0.99
+
+
+@dataclass(frozen=True)
+class Step:
+    """A stage of a job; of its `cost`, about seconds, only the proportion to that of the others matters."""
+
+    stage: str
+    cost: float
+
+
+class Plan:
+    """Follows a job through its `steps`; the first begins at once, some may never be reported."""
+
+    def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic):
+        self._steps, self._now = tuple(steps), now
+        self._at, self._share = 0, 0.0
+        self._measured: dict[str, float] = {}
+        self._done_cost = self._done_seconds = 0.0
+        self._started = self._stage_started = self._reported = now()
+        self._fraction = 0.0
+
+    @property
+    def number(self) -> int:
+        """Of the step that runs, from 1."""
+        return self._at + 1
+
+    @property
+    def count(self) -> int:
+        """Of all steps."""
+        return len(self._steps)
+
+    def report(self, stage: str, fraction: float) -> None:
+        """`stage` has done `fraction` of its work."""
+        later = range(self._at, self.count)
+        at = next((index for index in later if self._steps[index].stage == stage), self._at)
+        self._reported = self._now()
+        if at != self._at:
+            self._end_step()
+            self._at, self._stage_started = at, self._reported
+        self._fraction = min(max(fraction, 0.0), 1.0) if self._steps[self._at].stage == stage else 0.0
+
+    def _end_step(self) -> None:
+        step, seconds = self._steps[self._at], self._reported - self._stage_started
+        self._measured[step.stage] = seconds
+        self._done_cost += step.cost
+        self._done_seconds += seconds
+
+    def share(self) -> float:
+        """Of the whole job that is done, in [0, `MOST`]."""
+        elapsed = self._now() - self._started
+        whole = elapsed + self.seconds_left()
+        self._share = max(self._share, min(elapsed / whole, MOST) if whole > 0.0 else 0.0)
+        return self._share
+
+    def seconds_left(self) -> float:
+        """Until the job will have ended, as far as can be told."""
+        return self._rest_of_step() + sum(map(self._expected, self._steps[self._at + 1 :]))
+
+    def _expected(self, step: Step) -> float:
+        """Seconds: as long as the same stage took before, or by its cost."""
+        pace = (self._done_seconds + PRIOR_SECONDS) / (self._done_cost + PRIOR_SECONDS)
+        return self._measured.get(step.stage, step.cost * pace)
+
+    def _rest_of_step(self) -> float:
+        """Seconds; between reports the rest melts away and never becomes nothing."""
+        done = self._reported - self._stage_started
+        if self._fraction >= LEAST_FRACTION and done >= LEAST_SECONDS:
+            rest, since = done / self._fraction - done, self._reported
+        else:
+            rest, since = self._expected(self._steps[self._at]), self._stage_started
+        return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
+
+
+SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
+MESSAGE = "LTSH "
+ENDING_SECONDS = 10.0
+STARTING = "Starting"
+SURE_SECONDS = 3.0  # before, nobody knows how long it will take
+
+
+@dataclass
+class Job:
+    """A job that runs, has ended (`finished`), or was `cancelled`.
+
+    `results` are the folders of pictures so far, `error` is "" or one line that says why there are no more. Of the
+    results the window has `shown` so many; they belong to the scene with the session uid `scene`.
+    """
+
+    title: str
+    plan: Plan
+    folder: Path  # temporary, removed at the end
+    command: str  # shade, compare or bake
+    scene: int
+    shown: int = 0
+    output: Path | None = None  # where files for the user go
+    stage: str = STARTING
+    results: list[Path] = field(default_factory=list)
+    error: str = ""
+    finished: bool = False
+    cancelled: bool = False
+    started: float = field(default_factory=time.monotonic)
+
+    def start(self, runs: list[dict], *, background: bool) -> None:
+        """Start the process on command lines (see `panel_job.perform`); one in the `background` comes after this one.
+        Raises SceneError and OSError."""
+        job = self.folder / "job.json"
+        document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
+        job.write_text(json.dumps(document), encoding="utf-8")
+        self._messages: queue.SimpleQueue = queue.SimpleQueue()
+        command = blender_process.child_command(job, SCRIPT)
+        self._process = blender_process.start(command, self.folder, background=background)
+        threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
+
+    def _listen(self) -> None:
+        last_lines: deque[str] = deque(maxlen=blender_process.OUTPUT_LINES_KEPT)
+        with self._process.stdout:
+            for line in self._process.stdout:
+                message = parsed(line)
+                if message is not None:
+                    self._messages.put(message)
+                elif line.strip():
+                    last_lines.append(line.strip())
+        code = self._process.wait()
+        self._process.stdin.close()
+        if code != 0:
+            output = " | ".join(last_lines) or "none"
+            self._messages.put({"error": f"Blender ended with code {code}; its last output: {output}"})
+        self._messages.put({"end": True})
+
+    def poll(self) -> bool:
+        """Take in what the process has said since; True where that is anything."""
+        changed = False
+        while not self.finished:
+            try:
+                message = self._messages.get_nowait()
+            except queue.Empty:
+                break
+            changed = True
+            self._take(message)
+        return changed
+
+    def _take(self, message: dict) -> None:
+        if "stage" in message:
+            self.stage = message["stage"]
+            self.plan.report(self.stage, float(message["fraction"]))
+        elif "result" in message:
+            self.results.append(Path(message["result"]))
+        elif "error" in message:
+            self.error = self.error or message["error"]
+        elif "end" in message:
+            self.finished = True
+            self.remove_folder()
+
+    def wait(self, seconds: float = 0.05) -> None:
+        """Poll until the job has ended."""
+        while not self.finished:
+            if not self.poll():
+                time.sleep(seconds)
+
+    def cancel(self) -> None:
+        """Stop at once; the process ends, and its folder goes, in the background."""
+        if self.finished:
+            return
+        self.finished = self.cancelled = True
+        # No daemon: a Blender that quits now waits for it.
+        threading.Thread(target=self._end, name="ltsh-job-end").start()
+
+    def _end(self) -> None:
+        # What the process has started itself ends with it: each of them reads the other end of a pipe.
+        self._process.stdin.close()
+        try:
+            self._process.wait(ENDING_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self.remove_folder()
+
+    def end_now(self) -> None:
+        """As `cancel`, for a Blender that is about to quit: everything is gone on return."""
+        if not self.finished:
+            self.finished = self.cancelled = True
+            self._process.kill()
+            self._end()
+
+    def remove_folder(self) -> None:
+        """Remove what the job wrote for itself."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    # -- what is shown ------------------------------------------------------------------------------------------------
+
+    def seconds_left(self) -> float | None:
+        """Until the end; None where nothing can be said yet."""
+        return None if self.seconds() < SURE_SECONDS else self.plan.seconds_left()
+
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.monotonic() - self.started
+
+
+def new_folder() -> Path:
+    """A temporary folder for a job."""
+    return Path(tempfile.mkdtemp(prefix="ltsh-"))
+
+
+def parsed(line: str) -> dict | None:
+    """The message that `line` carries, or None for anything else that a process prints."""
+    if not line.startswith(MESSAGE):
+        return None
+    try:
+        message = json.loads(line[len(MESSAGE) :])
+    except ValueError:
+        return None
+    return message if isinstance(message, dict) else None
+
+
+def clock(seconds: float) -> str:
+    """`seconds` as 0:07 or 1:02:03."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _library_folders() -> list[str]:
+    """Where the process finds what this Blender got with the extension."""
+    spec = importlib.util.find_spec("OpenEXR")
+    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
+
+
+NO_CYCLES = "Not complete: without Cycles"
+REFERENCE = "reference"
+
+
+def runs(context, command: str, scene_file: Path) -> list[dict]:
+    """The command lines of a job (see `panel_job.perform`)."""
+    if command == "bake":
+        return [_run(bake_arguments(context, scene_file))]
+    if command == "shade":
+        return [_run(picture_arguments(context.scene, "shade", scene_file))]
+    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
+    first = [name for name in chosen(context.scene.ltsh, "techniques") if name != REFERENCE]
+    early = [_run(picture_arguments(context.scene, "shade", scene_file, first), NO_CYCLES)] if first else []
+    return [*early, _run(picture_arguments(context.scene, "compare", scene_file))]
+
+
+def _run(arguments: list[str], partial: str = "") -> dict:
+    return {"arguments": arguments, "output": arguments[arguments.index("-o") + 1], "partial": partial}
+
+
+def picture_arguments(scene, command: str, scene_file: Path, techniques: list[str] | None = None) -> list[str]:
+    """Arguments of `ltsh shade` or `ltsh compare`."""
+    settings = scene.ltsh
+    width, height = preflight.picture_of(scene)
+    arguments = [
+        *(command, str(scene_file), "-o", str(output_folder(scene, command))),
+        *("--techniques", ",".join(techniques or chosen(settings, "techniques"))),
+        *("--passes", ",".join(chosen(settings, "passes"))),
+        *("--resolution", f"{width}x{height}", "--aa", str(settings.anti_aliasing)),
+    ]
+    return arguments + (["--cycles-samples", str(settings.cycles_samples)] if command == "compare" else [])
+
+
+def bake_arguments(context, scene_file: Path) -> list[str]:
+    """Arguments of `ltsh bake` for the selected objects that can be baked."""
+    scene, settings = context.scene, context.scene.ltsh
+    arguments = ["bake", str(scene_file), "-o", str(output_folder(scene, "bake"))]
+    for ob in preflight.bake_objects(context)[0]:
+        arguments.append(f"--object={ob.name}")
+    arguments += [
+        *("--techniques", ",".join(chosen(settings, "techniques"))),
+        *("--passes", ",".join(chosen(settings, "bake_passes"))),
+        *("--size", settings.bake_size, "--margin", str(settings.bake_margin), "--view", settings.bake_view),
+    ]
+    if settings.bake_uv_map:
+        arguments.append(f"--uv={settings.bake_uv_map}")
+    if settings.bake_error:
+        arguments += ["--error", "--cycles-samples", str(settings.cycles_samples)]
+    return arguments
+
+
+def chosen(settings, key: str) -> list[str]:
+    """The members of a set of choices, in the order in which they are offered."""
+    items = settings.bl_rna.properties[key].enum_items.keys()
+    return [name for name in items if name in getattr(settings, key)]
+
+
+def output_folder(scene, command: str) -> Path:
+    """Where `command` writes: the folder of the settings, or that of the preferences where it is empty or where the
+    .blend that it is relative to is not saved."""
+    folder = scene.ltsh.output_folder.strip()
+    if folder and (bpy.data.filepath or not folder.startswith("//")):
+        root = Path(bpy.path.abspath(folder))
+    else:
+        root = preferences(bpy.context).output_folder / (Path(bpy.data.filepath).stem or "untitled")
+    if len(bpy.data.scenes) > 1:
+        root /= bpy.path.clean_name(scene.name)
+    return root / command
+
+
+# What stages of the command line are called there and here; others keep their names.
+TECHNIQUES = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", REFERENCE: "Reference quadrature"}
+TITLES = {
+    "open scene": "Open Scene",
+    "samples": "Sample Surfaces",
+    "Cycles A": "Cycles, First Half",
+    "Cycles B": "Cycles, Second Half",
+    "LTSH N=2": "LTSH 2",
+    "LTSH N=4": "LTSH 4",
+    "Reference quadrature": "Reference",
+    "write": "Write Files",
+    "images": "Make Pictures",
+}
+# Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
+START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
+SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
+SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
+REFERENCE_POINTS = 0.15
+
+
+def steps(context, command: str) -> list[Step]:
+    """What a job goes through, in order."""
+    starting = Step(STARTING, START_SECONDS)
+    if command == "bake":
+        return [starting, *_bake(context)]
+    names = chosen(context.scene.ltsh, "techniques")
+    if command == "shade":
+        return [starting, *_picture(context.scene, names, False)]
+    first = [name for name in names if name != REFERENCE]
+    early = _picture(context.scene, first, False) if first else []
+    return [starting, *early, *_picture(context.scene, names, True)]
+
+
+def _picture(scene, techniques: list[str], with_cycles: bool) -> list[Step]:
+    settings, (width, height) = scene.ltsh, preflight.picture_of(scene)
+    pixels, points = 1e-6 * width * height, 1e-6 * width * height * settings.anti_aliasing
+    rendered = RENDER_SECONDS * settings.anti_aliasing
+    half = Step("", rendered + SAMPLE_SECONDS * pixels * max(settings.cycles_samples // 2, settings.anti_aliasing))
+    return [
+        Step("open scene", OPEN_SECONDS),
+        Step("samples", rendered + SAMPLE_SECONDS * points),
+        *(Step(f"Cycles {name}", half.cost) for name in ("A", "B") if with_cycles),
+        *(Step(TECHNIQUES[name], _shading(name, points)) for name in techniques),
+        Step("write", FILE_SECONDS * pixels),
+        Step("images", FILE_SECONDS * pixels),
+    ]
+
+
+def _bake(context) -> list[Step]:
+    settings = context.scene.ltsh
+    texels = 1e-6 * int(settings.bake_size) ** 2
+    samples = settings.cycles_samples * len(settings.bake_passes) if settings.bake_error else 1
+    shading = sum(_shading(name, texels) for name in chosen(settings, "techniques"))
+    found = [Step("open scene", OPEN_SECONDS)]
+    for ob in preflight.bake_objects(context)[0]:
+        found.append(Step(f"bake {ob.name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
+        found.append(Step(f"shade {ob.name}", shading + FILE_SECONDS * texels))
+    return [*found, Step("images", FILE_SECONDS * texels * len(found))]
+
+
+def _shading(technique: str, points: float) -> float:
+    return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
+
+
+def stage_title(job: Job) -> str:
+    """What the job does now."""
+    return translated(TITLES.get(job.stage, job.stage))
+
+
+def progress_text(job: Job) -> str:
+    """Percent and time left of the whole job."""
+    text = f"{100.0 * job.plan.share():.0f} %"
+    left = job.seconds_left()
+    return text if left is None else f"{text}, {clock(left)} {translated('left')}"

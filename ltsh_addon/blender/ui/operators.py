@@ -1,0 +1,301 @@
+"""Operators that start, follow and stop jobs."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+from pathlib import Path
+
+import bpy
+from bpy.app.translations import pgettext_iface as translated
+
+from ..process.blender_process import SceneError
+from ..saving import save_working_copy
+from . import comparison, preflight, results
+from . import job as job_module
+from .job import Job, Plan, clock, new_folder, output_folder, progress_text, stage_title, steps
+
+
+def save_scene_copy(path: Path) -> None:
+    """Save the open file, unsaved changes included, as `path`. Raises RuntimeError."""
+    with comparison.kept_as_it_is():
+        save_working_copy(path)
+
+
+TIMER_SECONDS = 0.1
+_running: dict = {"job": None}
+
+
+def running_job() -> Job | None:
+    """The job that runs now, None where there is none."""
+    return _running["job"]
+
+
+class _JobOperator:
+    """A job, watched by a timer; Esc ends it."""
+
+    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
+    bl_options = {"UNDO"}
+    command = ""
+    _opened = False  # the next results are those of the scene, but the comparison does not show them yet
+
+    @classmethod
+    def poll(cls, context):
+        if running_job() is not None:
+            cls.poll_message_set("A job is running: wait for it, or cancel it")
+            return False
+        return context.scene is not None
+
+    def invoke(self, context, event):
+        if not self._begin(context):
+            return {"CANCELLED"}
+        self._progress = None
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
+        manager.modal_handler_add(self)
+        self._show_progress(context)
+        return {"RUNNING_MODAL"}
+
+    def execute(self, context):
+        """Without a window, from scripts: waits for the end."""
+        self._timer = None
+        if not self._begin(context):
+            return {"CANCELLED"}
+        try:
+            self._job.wait()
+            self._show_all_results(context)
+            return self._finish(context)
+        except Exception as error:
+            return self._fail(context, error)
+
+    def modal(self, context, event):
+        try:
+            return self._step(context, event)
+        except Exception as error:
+            return self._fail(context, error)
+
+    def _step(self, context, event):
+        job = self._job
+        if running_job() is not job or job.cancelled:  # the button, or another file
+            return self._finish(context)
+        if event.type == "ESC" and event.value == "PRESS":
+            job.cancel()
+            return self._finish(context)
+        if event.type == "TIMER":
+            job.poll()
+            if self._show_some_results(context):
+                return {"PASS_THROUGH"}
+            if job.finished:
+                return self._finish(context)
+            self._show_progress(context)
+        return {"PASS_THROUGH"}
+
+    def cancel(self, context):
+        """Blender ends the operator, for its window was closed: another one watches the job from now on."""
+        self._end_timer(context)
+        job = self._job
+        # Only once this window is gone; a Blender that quits calls no timers any more.
+        bpy.app.timers.register(lambda: _watch_elsewhere(job), first_interval=0.0)
+
+    def _fail(self, context, error: Exception):
+        """End the job with one line, whatever happened here; preferences say whether the console gets more."""
+        logging.getLogger(__name__).info("unexpected error", exc_info=error)
+        self._job.cancel()
+        self._job.error = f"{self._job.title} failed: {' '.join(str(error).split()) or type(error).__name__}"
+        return self._finish(context)
+
+    def _begin(self, context) -> bool:
+        reason = preflight.blocking(context, self.command)
+        if reason:
+            self.report({"ERROR"}, reason)
+            return False
+        folder = new_folder()
+        plan = Plan(steps(context, self.command))
+        job = Job(self.bl_label, plan, folder, self.command, context.scene.session_uid)
+        try:
+            copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
+            save_scene_copy(copy)
+            job.output = output_folder(context.scene, self.command)
+            runs = job_module.runs(context, self.command, copy)
+            job.start(runs, background=not bpy.app.background)
+        except (RuntimeError, OSError, SceneError) as error:
+            job.remove_folder()
+            self.report({"ERROR"}, " ".join(str(error).split()))
+            return False
+        self._job = _running["job"] = job
+        return True
+
+    def _show_progress(self, context) -> None:
+        """Draw progress again where it has changed, at most a few times per second."""
+        job = self._job
+        done = f"{job.title}: {stage_title(job)}  {progress_text(job)}"
+        text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
+        shown = text, clock(job.seconds())
+        if shown != self._progress:
+            self._progress = shown
+            context.workspace.status_text_set(text)
+            comparison.redraw_panels()
+
+    def _show_some_results(self, context) -> bool:
+        """Show a part of what is new, as much as the window may wait for: large files are read one at a time. True
+        where something was shown."""
+        scene, job = self._scene(), self._job
+        if scene is None or job.shown == len(job.results):
+            return False
+        if not self._opened:
+            results.show(scene, job.results[job.shown])
+            self._opened = True
+        elif not comparison.read_a_picture(scene):
+            comparison.refresh(scene)
+            comparison.put_in_editor(context, scene)
+            self._opened = False
+            job.shown += 1
+        return True
+
+    def _show_all_results(self, context) -> None:
+        while self._show_some_results(context):
+            pass
+
+    def _end_timer(self, context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+
+    def _finish(self, context):
+        job = self._job
+        self._end_timer(context)
+        if self._opened and not job.error:
+            self._show_all_results(context)
+        if running_job() is job:
+            _running["job"] = None
+        for workspace in bpy.data.workspaces:
+            workspace.status_text_set(None)
+        comparison.redraw_panels()
+        if job.error:
+            self.report({"ERROR"}, job.error)
+        elif job.cancelled:
+            kept = self._kept()
+            self.report({"WARNING"}, f"{job.title} was cancelled; {kept}")
+        else:
+            self._report_success()
+        return {"FINISHED"} if job.shown else {"CANCELLED"}
+
+    def _kept(self) -> str:
+        scene, job = self._scene(), self._job
+        result = results.result_of(scene) if scene is not None and job.shown else None
+        if result is None:
+            return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
+        names = next(iter(result.groups.values()))["labels"].values()
+        return f"kept: {', '.join(names)}"
+
+    def _scene(self):
+        """The scene of the job, also after it was renamed; None where it was removed."""
+        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._job.scene), None)
+
+    def _report_success(self) -> None:
+        result = results.result_in(str(self._job.results[-1])) if self._job.results else None
+        report = result.report if result is not None else {"warnings": ()}
+        for problem in report.get("problems", ()):
+            self.report({"WARNING"}, problem)
+        count = len(report["warnings"])
+        noted = f", {count} warning{'s' if count > 1 else ''}" if count else ""
+        self.report({"INFO"}, f"{self._job.title} took {clock(self._job.seconds())}{noted}")
+
+
+class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
+    """Shade what the active camera sees, with the chosen techniques"""
+
+    bl_idname = "ltsh.shade"
+    bl_label = "Shade Camera View"
+    command = "shade"
+
+
+class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
+    """Shade what the active camera sees, render it with Cycles too, and measure the difference.
+    Direct light without shadows on both sides"""
+
+    bl_idname = "ltsh.compare"
+    bl_label = "Compare with Cycles"
+    command = "compare"
+
+
+class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
+    """Bake the light on the selected objects into textures, one EXR for each"""
+
+    bl_idname = "ltsh.bake"
+    bl_label = "Bake Selected"
+    command = "bake"
+
+
+class LTSH_OT_watch(_JobOperator, bpy.types.Operator):
+    """Watch the job that runs, whose own window was closed"""
+
+    bl_idname = "ltsh.watch"
+    bl_label = "Watch Job"
+    bl_options = {"UNDO", "INTERNAL"}
+
+    @classmethod
+    def poll(cls, context):
+        return running_job() is not None
+
+    def _begin(self, context) -> bool:
+        self._job = running_job()
+        return True
+
+
+class LTSH_OT_cancel(bpy.types.Operator):
+    """Stop the job; pictures that are finished are kept"""
+
+    bl_idname = "ltsh.cancel"
+    bl_label = "Cancel"
+
+    @classmethod
+    def poll(cls, context):
+        return running_job() is not None
+
+    def execute(self, context):
+        running_job().cancel()
+        comparison.redraw_panels()
+        return {"FINISHED"}
+
+
+def _watch_elsewhere(job: Job) -> None:
+    """Let the first window that is left watch `job`."""
+    windows = bpy.context.window_manager.windows
+    if running_job() is job and windows:
+        with bpy.context.temp_override(window=windows[0]):
+            bpy.ops.ltsh.watch("INVOKE_DEFAULT")
+
+
+@bpy.app.handlers.persistent
+def _stop(*_):
+    """Another file is about to be opened: the job's scene goes."""
+    job = running_job()
+    if job is not None:
+        _running["job"] = None
+        job.cancel()
+
+
+def _end_now() -> None:
+    job = running_job()
+    if job is not None:
+        _running["job"] = None
+        job.end_now()
+
+
+CLASSES = (LTSH_OT_shade, LTSH_OT_compare, LTSH_OT_bake, LTSH_OT_watch, LTSH_OT_cancel)
+_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+
+
+def register():
+    _register()
+    bpy.app.handlers.load_pre.append(_stop)
+    atexit.register(_end_now)
+
+
+def unregister():
+    _end_now()
+    atexit.unregister(_end_now)
+    if _stop in bpy.app.handlers.load_pre:
+        bpy.app.handlers.load_pre.remove(_stop)
+    _unregister()

@@ -1,0 +1,336 @@
+"""What keeps a job from starting, said before it starts, and buttons that mend it."""
+
+from __future__ import annotations
+
+import functools
+import math
+import os
+import platform
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+from bpy.props import StringProperty
+
+from ..extract.bake import ObjectError, check_object
+from ..lights.emission import emission_behind
+from ..materials.graph import material_output
+from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
+
+
+@functools.cache
+def missing_libraries() -> str | None:
+    """One line that says what is missing and what to do, for beside grey buttons; None where all is there.
+
+    Tried once, since panels ask with every redraw: what comes later is found when the add-on is enabled again.
+    """
+    try:
+        import OpenEXR
+
+        OpenEXR.File  # noqa: B018 - a namespace left by an incomplete removal imports too
+    except (ImportError, AttributeError) as error:
+        version = ".".join(platform.python_version_tuple()[:2])
+        return (
+            f"OpenEXR cannot be imported ({' '.join(str(error).split())}): install the LTSH zip for "
+            f"{platform.system()} {platform.machine()} and Python {version}; only Live Preview works without"
+        )
+    return None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing to know; `fix` is the operator that mends it, with its label and properties."""
+
+    text: str
+    blocks: bool = True
+    fix: str = ""
+    fix_label: str = ""
+    fix_values: dict = field(default_factory=dict)
+
+
+def problems(context, command: str) -> list[Problem]:
+    """What stands in the way of "shade", "compare" or "bake" (`blocks`), and what is good to know."""
+    scene, settings = context.scene, context.scene.ltsh
+    found = _packages()
+    if not settings.techniques:
+        found.append(Problem("No technique is chosen: choose at least one"))
+    if not (settings.bake_passes if command == "bake" else settings.passes):
+        found.append(Problem("No pass is chosen: choose at least one"))
+    needs_camera = command != "bake" or settings.bake_view == "camera"
+    found += _camera(scene) if needs_camera else []
+    found += _lights(scene)
+    if command == "bake":
+        found += bake_objects(context)[1]
+    elif min(picture_of(scene)) < 4:
+        found.append(Problem("The picture is smaller than 4 pixels: raise the resolution"))
+    return found + _files(settings)
+
+
+def blocking(context, command: str) -> str:
+    """The first reason why `command` cannot run, "" where it can."""
+    return next((problem.text for problem in problems(context, command) if problem.blocks), "")
+
+
+def picture_of(scene) -> tuple[int, int]:
+    """Width and height to shade, in pixels."""
+    share = scene.ltsh.resolution_percentage / 100.0
+    width, height = picture_size(scene)
+    return max(1, round(width * share)), max(1, round(height * share))
+
+
+def bake_objects(context) -> tuple[list, list[Problem]]:
+    """Selected objects that can be baked, and what is wrong with the others."""
+    selected = [ob for ob in context.selected_objects if ob.type == "MESH"]
+    if not selected:
+        return [], [Problem("No mesh is selected: select the objects to bake")]
+    usable, found = [], []
+    for ob in selected:
+        problem = _object_problem(ob, context.scene.ltsh.bake_uv_map)
+        if problem is None:
+            usable.append(ob)
+        else:
+            found.append(problem)
+    if usable:
+        found = [Problem(p.text, False, p.fix, p.fix_label, p.fix_values) for p in found]
+    return usable, found
+
+
+def _object_problem(ob, uv_map: str) -> Problem | None:
+    if ob.hide_render:
+        text = f"Object {ob.name!r} is hidden in renders"
+        return Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": ob.name})
+    try:
+        check_object(ob)
+    except ObjectError as error:
+        return Problem(_sentence(str(error)))
+    if not ob.data.polygons and not ob.modifiers:
+        return Problem(f"Object {ob.name!r} has no faces")
+    if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
+        names = ", ".join(repr(layer.name) for layer in ob.data.uv_layers)
+        return Problem(f"Object {ob.name!r} has no UV map {uv_map!r}, found {names}")
+    if not ob.data.uv_layers and not any(modifier.type == "NODES" for modifier in ob.modifiers):
+        text = f"Object {ob.name!r} has no UV map"
+        return Problem(text, True, "ltsh.add_uv_map", "Unwrap", {"object_name": ob.name})
+    return None
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _packages() -> list[Problem]:
+    missing = missing_libraries()
+    return [Problem(missing)] if missing else []
+
+
+def _camera(scene) -> list[Problem]:
+    camera = scene.camera
+    if camera is None or camera.type != "CAMERA":
+        return [Problem("The scene has no active camera", True, "ltsh.add_camera", "Add Camera")]
+    if camera.data.type not in CAMERA_TYPES:
+        kind = CAMERA_KINDS.get(camera.data.type, camera.data.type)
+        text = f"Camera {camera.name!r} is {kind}, expected perspective or orthographic"
+        return [Problem(text, True, "ltsh.make_perspective", "Make Perspective")]
+    return []
+
+
+def _lights(scene) -> list[Problem]:
+    areas = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.data.type == "AREA"]
+    if any(not ob.hide_render for ob in areas) or any(glows(material) for material in materials_of(scene)):
+        return []
+    if areas:
+        text = f"Light {areas[0].name!r} is hidden in renders, and no other area light is there"
+        return [Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": areas[0].name})]
+    others = [ob.name for ob in scene.objects if ob.type == "LIGHT"]
+    if others:
+        text = f"No area light: {others[0]!r} is a light of another kind, which is not shaded"
+    else:
+        text = "No area light"
+    return [Problem(text, True, "ltsh.add_area_light", "Add Light")]
+
+
+def materials_of(scene) -> list:
+    """Materials of the objects of `scene` that render, each once, in the order of their names."""
+    found = {}
+    for ob in scene.objects:
+        if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
+            for slot in ob.material_slots:
+                if slot.material is not None:
+                    found[slot.material.name_full] = slot.material
+    return [found[name] for name in sorted(found)]
+
+
+def glows(material) -> bool:
+    """True where the surface of the material may emit light."""
+    output = material_output(material.node_tree) if material.node_tree is not None else None
+    return output is not None and emission_behind(material.node_tree, output.inputs["Surface"]).emits
+
+
+def _files(settings) -> list[Problem]:
+    found = []
+    if not bpy.data.filepath:
+        text = "The file is not saved: results go to the output folder of the preferences"
+        found.append(Problem(text, False, "wm.save_mainfile", "Save"))
+    elif (reason := _not_writable(settings.output_folder)) != "":
+        found.append(Problem(reason))
+    for image in bpy.data.images:
+        if image.is_dirty and image.users > image.use_fake_user and "ltsh_layer" not in image:
+            text = f"Image {image.name!r} has changes that are not saved, and do not count"
+            found.append(Problem(text, False, "ltsh.pack_image", "Pack", {"image_name": image.name}))
+    return found
+
+
+def _not_writable(folder: str) -> str:
+    path = Path(bpy.path.abspath(folder or "//"))
+    existing = next((parent for parent in (path, *path.parents) if parent.exists()), None)
+    if existing is None or not existing.is_dir() or not os.access(existing, os.W_OK):
+        return f"Output folder {folder!r} cannot be written: choose another"
+    return ""
+
+
+class LTSH_OT_add_camera(bpy.types.Operator):
+    """Add a camera that looks as the 3D viewport does, and make it the scene's active camera"""
+
+    bl_idname = "ltsh.add_camera"
+    bl_label = "Add Camera"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+        context.collection.objects.link(camera)
+        context.scene.camera = camera
+        view = _viewport(context)
+        if view is not None:
+            camera.matrix_world = view.view_matrix.inverted()
+        else:
+            camera.location, camera.rotation_euler = (0.0, -6.0, 3.0), (math.radians(65.0), 0.0, 0.0)
+        return {"FINISHED"}
+
+
+class LTSH_OT_make_perspective(bpy.types.Operator):
+    """Make the scene's active camera a perspective one"""
+
+    bl_idname = "ltsh.make_perspective"
+    bl_label = "Make Perspective"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.scene.camera is not None and context.scene.camera.type == "CAMERA"
+
+    def execute(self, context):
+        data = context.scene.camera.data
+        if data.library is not None:
+            self.report({"ERROR"}, f"Camera {data.name!r} is linked from {data.library.filepath}: make it local")
+            return {"CANCELLED"}
+        data.type = "PERSP"
+        return {"FINISHED"}
+
+
+class LTSH_OT_add_area_light(bpy.types.Operator):
+    """Add an area light above the origin that shines down"""
+
+    bl_idname = "ltsh.add_area_light"
+    bl_label = "Add Area Light"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        light = bpy.data.lights.new("Area", "AREA")
+        light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 2.0, 1.0, 200.0
+        ob = bpy.data.objects.new("Area", light)
+        context.collection.objects.link(ob)
+        ob.location = (0.0, 0.0, 4.0)
+        return {"FINISHED"}
+
+
+class LTSH_OT_show_in_render(bpy.types.Operator):
+    """Show the object in renders"""
+
+    bl_idname = "ltsh.show_in_render"
+    bl_label = "Show in Renders"
+    bl_options = {"REGISTER", "UNDO"}
+
+    object_name: StringProperty(name="Object", description="Name of the object")
+
+    def execute(self, context):
+        ob = context.scene.objects.get(self.object_name)
+        if ob is None:
+            self.report({"ERROR"}, f"Object {self.object_name!r} is not in the scene any more")
+            return {"CANCELLED"}
+        ob.hide_render = False
+        return {"FINISHED"}
+
+
+class LTSH_OT_add_uv_map(bpy.types.Operator):
+    """Unwrap the object into a new UV map (Smart UV Project)"""
+
+    bl_idname = "ltsh.add_uv_map"
+    bl_label = "Unwrap"
+    bl_options = {"REGISTER", "UNDO"}
+
+    object_name: StringProperty(name="Object", description="Name of the object")
+
+    @classmethod
+    def poll(cls, context):
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
+        ob = context.view_layer.objects.get(self.object_name)
+        if ob is None or ob.type != "MESH" or ob.hide_get():
+            self.report({"ERROR"}, f"Object {self.object_name!r} is not a visible mesh of this view layer")
+            return {"CANCELLED"}
+        selected, active = context.selected_objects, context.view_layer.objects.active
+        try:
+            for other in selected:
+                other.select_set(False)
+            ob.select_set(True)
+            context.view_layer.objects.active = ob
+            bpy.ops.object.mode_set(mode="EDIT")
+            bpy.ops.mesh.select_all(action="SELECT")
+            bpy.ops.uv.smart_project(island_margin=0.02)
+        finally:
+            if ob.mode == "EDIT":
+                bpy.ops.object.mode_set(mode="OBJECT")
+            ob.select_set(False)
+            for other in selected:
+                other.select_set(True)
+            context.view_layer.objects.active = active
+        return {"FINISHED"}
+
+
+class LTSH_OT_pack_image(bpy.types.Operator):
+    """Keep the changes of the image in the .blend"""
+
+    bl_idname = "ltsh.pack_image"
+    bl_label = "Pack Image"
+    bl_options = {"REGISTER", "UNDO"}
+
+    image_name: StringProperty(name="Image", description="Name of the image")
+
+    def execute(self, context):
+        image = bpy.data.images.get(self.image_name)
+        if image is None:
+            self.report({"ERROR"}, f"Image {self.image_name!r} is not there any more")
+            return {"CANCELLED"}
+        image.pack()
+        return {"FINISHED"}
+
+
+def _viewport(context):
+    """The view of some 3D viewport of the window, None where there is none."""
+    screen = context.screen or (context.window.screen if context.window else None)
+    for area in screen.areas if screen is not None else ():
+        if area.type == "VIEW_3D":
+            return area.spaces.active.region_3d
+    return None
+
+
+CLASSES = (
+    LTSH_OT_add_camera,
+    LTSH_OT_make_perspective,
+    LTSH_OT_add_area_light,
+    LTSH_OT_show_in_render,
+    LTSH_OT_add_uv_map,
+    LTSH_OT_pack_image,
+)
+register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -1,0 +1,193 @@
+"""The button "Preview with LTSH": shows the scene with our engine and gives back the artist's afterwards.
+
+Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before.
+"""
+
+from __future__ import annotations
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..saving import keeps_engine
+
+ENGINE = "LTSH"
+
+
+def is_previewing(scene) -> bool:
+    """True where the engine of `scene` is lent."""
+    return scene.render.engine == ENGINE and bool(scene.ltsh_view.artist_engine)
+
+
+class LTSH_OT_preview(bpy.types.Operator):
+    """Show the scene in this view with LTSH; once more: give the former engine and shading back"""
+
+    bl_idname = "ltsh.preview"
+    bl_label = "Preview with LTSH"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.scene is not None
+
+    def execute(self, context):
+        scene = context.scene
+        if is_previewing(scene):
+            stop_preview(scene)
+            return {"FINISHED"}
+        space = _view(context)
+        if scene.render.engine != ENGINE:
+            if space is not None:
+                _lent_views[space.as_pointer()] = (scene.session_uid, space.shading.type)
+            scene.ltsh_view.artist_engine = scene.render.engine
+            scene.render.engine = ENGINE
+        if space is not None:
+            space.shading.type = "RENDERED"
+        return {"FINISHED"}
+
+
+# Address of a 3D view that was switched to a preview -> its scene, and the shading to give back. Only kept here: undo
+# does not reach views, and files are saved without previews.
+_lent_views: dict[int, tuple[int, str]] = {}
+
+
+def _view(context):
+    """The 3D view of `context`, or the window's first one."""
+    space = context.space_data
+    if space is None or space.type != "VIEW_3D":
+        screen = context.screen
+        areas = screen.areas if screen is not None else ()
+        space = next((area.spaces.active for area in areas if area.type == "VIEW_3D"), None)
+    return space
+
+
+def _shading_before(scene) -> list:
+    """Give the views that show a preview of `scene` the shading that they had before, and return them.
+
+    Views whose shading was changed by hand since stay as they are.
+    """
+    found = []
+    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
+        owner, former = _lent_views.get(space.as_pointer(), (None, ""))
+        if owner == scene.session_uid and space.type == "VIEW_3D" and space.shading.type == "RENDERED":
+            space.shading.type = former
+            found.append(space)
+    return found
+
+
+def _give_back_views(scene) -> None:
+    """End what the preview of `scene` did to views."""
+    _shading_before(scene)
+    _forget_views(scene)
+
+
+def _forget_views(scene) -> None:
+    for address in [address for address, (owner, _) in _lent_views.items() if owner == scene.session_uid]:
+        del _lent_views[address]
+
+
+def stop_preview(scene) -> None:
+    """Give `scene` the artist's engine back, and its views their shading."""
+    _give_back_views(scene)
+    wanted = scene.ltsh_view.artist_engine
+    scene.ltsh_view.artist_engine = ""
+    try:
+        scene.render.engine = wanted
+    except TypeError:
+        # The engine that was there is not registered any more.
+        scene.render.engine = "CYCLES"
+
+
+_saved: list[str] = []
+_saved_views: list = []
+
+
+@persistent
+def _before_saving(*_) -> None:
+    # A copy for a render of our own keeps the engine: the render has begun.
+    if keeps_engine():
+        return
+    _saved.clear()
+    _saved_views.clear()
+    for scene in bpy.data.scenes:
+        if is_previewing(scene):
+            _saved.append(scene.name)
+            _saved_views.extend(_shading_before(scene))
+            scene.render.engine = scene.ltsh_view.artist_engine
+
+
+@persistent
+def _after_saving(*_) -> None:
+    for name in _saved:
+        if name in bpy.data.scenes:
+            bpy.data.scenes[name].render.engine = ENGINE
+    for space in _saved_views:
+        space.shading.type = "RENDERED"
+    _saved.clear()
+    _saved_views.clear()
+
+
+@persistent
+def _after_undo(*_) -> None:
+    """Undo takes the engine of a preview back, but does not reach the view."""
+    for scene in bpy.data.scenes:
+        if not is_previewing(scene):
+            _give_back_views(scene)
+
+
+@persistent
+def _after_loading(*_) -> None:
+    """Files that were saved during a preview have the artist's engine, and no preview."""
+    _lent_views.clear()
+    for scene in bpy.data.scenes:
+        if scene.render.engine != ENGINE:
+            scene.ltsh_view.artist_engine = ""
+    _subscribe()
+
+
+def _engine_changed() -> None:
+    """Whoever chooses another engine by hand has ended the preview; Blender calls this when all that is done."""
+    for scene in bpy.data.scenes:
+        if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
+            scene.ltsh_view.artist_engine = ""
+            _forget_views(scene)
+
+
+_subscriber = object()
+
+
+def _subscribe() -> None:
+    """Blender forgets who wants to hear of changes when it opens a file."""
+    bpy.msgbus.clear_by_owner(_subscriber)
+    bpy.msgbus.subscribe_rna(
+        key=(bpy.types.RenderSettings, "engine"), owner=_subscriber, args=(), notify=_engine_changed
+    )
+
+
+HANDLERS = (
+    ("save_pre", _before_saving),
+    ("save_post", _after_saving),
+    ("save_post_fail", _after_saving),
+    ("undo_post", _after_undo),
+    ("load_post", _after_loading),
+)
+
+
+def register() -> None:
+    """Add the operator and the handlers."""
+    bpy.utils.register_class(LTSH_OT_preview)
+    for name, function in HANDLERS:
+        getattr(bpy.app.handlers, name).append(function)
+    _subscribe()
+
+
+def unregister() -> None:
+    """Give all scenes and views back what they had; remove operator and handlers."""
+    bpy.msgbus.clear_by_owner(_subscriber)
+    for scene in bpy.data.scenes:
+        if is_previewing(scene):
+            stop_preview(scene)
+    for name, function in HANDLERS:
+        functions = getattr(bpy.app.handlers, name)
+        if function in functions:
+            functions.remove(function)
+    bpy.utils.unregister_class(LTSH_OT_preview)

@@ -1,0 +1,219 @@
+"""Results as images of Blender: each picture that a job left is a float image, loaded from its own EXR."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...imaging.report import index_stamp, read_index
+
+LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
+PREFIX = "LTSH "
+ERROR = "error_"
+CYCLES = "cycles"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What is in a folder of pictures; `index` is that of `display_layers`."""
+
+    folder: Path
+    index: dict
+
+    @property
+    def command(self) -> str:
+        """The command that made them: shade, compare or bake."""
+        return self.index["command"]
+
+    @property
+    def partial(self) -> str:
+        """What is missing, "" where nothing is."""
+        return self.index["partial"]
+
+    @property
+    def report(self) -> dict:
+        """The report of the command."""
+        return self.index["report"]
+
+    @property
+    def groups(self) -> dict:
+        """Pictures of each baked texture by file name, or of the camera's picture by ""."""
+        return self.index["groups"]
+
+    def group(self, name: str) -> tuple[str, dict]:
+        """The group `name`, or the first where it is not there."""
+        return (name, self.groups[name]) if name in self.groups else next(iter(self.groups.items()))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The pictures to look at, brought to what the result has: `first` and `second` may be the same."""
+
+    group: str
+    first: str
+    second: str
+    pass_name: str
+
+
+_read: dict[str, tuple[tuple, Result]] = {}
+_pixels: dict[str, tuple[tuple, np.ndarray]] = {}
+PIXELS_KEPT = 8
+
+
+def result_of(scene) -> Result | None:
+    """The results of `scene`, None where there are none or their folder is gone. Files are read once."""
+    return result_in(scene.ltsh.result_folder) if scene.ltsh.result_folder else None
+
+
+def result_in(folder: str) -> Result | None:
+    """The results in a folder as Blender names it, None where there are none."""
+    path = Path(bpy.path.abspath(folder))
+    try:
+        stamp = index_stamp(path)
+        known = _read.get(str(path))
+        if known is None or known[0] != stamp:
+            known = stamp, Result(path, read_index(path))
+            _read[str(path)] = known
+        return known[1]
+    except (OSError, ValueError):
+        return None
+
+
+def choice_of(settings, result: Result) -> Choice:
+    """What `settings` (Scene.ltsh) choose, or what comes nearest."""
+    name, group = result.group(settings.group)
+    names, passes = group["names"], group["passes"]
+    first = settings.first if settings.first in names else names[0]
+    second = settings.second if settings.second in names else next((n for n in names[::-1] if n != first), first)
+    return Choice(name, first, second, settings.pass_name if settings.pass_name in passes else passes[-1])
+
+
+def show(scene, folder: Path) -> None:
+    """Make the pictures in `folder` the results of `scene`, with images for the chosen pass."""
+    scene.ltsh.result_folder = _blender_path(folder)
+    _pixels.clear()
+    result = result_of(scene)
+    if result is None:
+        return
+    settings = scene.ltsh
+    settings.groups.clear()
+    for name in result.groups:
+        settings.groups.add().name = name
+    choice = choice_of(settings, result)
+    # What the artist chose stays wherever the new results have it, or will have it when they are complete.
+    for key in ("group", "first", "second", "pass_name") if not result.partial else ():
+        if getattr(settings, key) != getattr(choice, key) and _offers(settings, key, getattr(choice, key)):
+            settings[key] = _stored(settings, key, getattr(choice, key))
+    wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
+    for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
+        bpy.data.images.remove(image)
+    images_of_pass(scene, result, choice)
+    for image in our_images(scene):
+        if image[LAYER]:
+            image.reload()
+
+
+def images_of_pass(scene, result: Result, choice: Choice) -> None:
+    """Make sure that all pictures of the chosen pass are images."""
+    files = result.group(choice.group)[1]["files"]
+    for layer in files:
+        if layer.rpartition(".")[2] == choice.pass_name:
+            layer_image(scene, result, choice.group, layer)
+
+
+def layer_image(scene, result: Result, group: str, layer: str):
+    """The image of a layer, loaded if it is not there yet."""
+    path = result.folder / result.groups[group]["files"][layer]
+    full = _full(group, layer)
+    image = next((image for image in our_images(scene) if image[LAYER] == full), None)
+    if image is None:
+        image = bpy.data.images.load(str(path), check_existing=False)
+        image.name = PREFIX + full
+        image[LAYER], image[SCENE] = full, scene.name
+        image.use_fake_user = True
+    is_error = layer.startswith(ERROR)
+    _set(image, "filepath", _blender_path(path))
+    _set(image.colorspace_settings, "name", "Non-Color" if is_error else linear_space())
+    _set(image, "use_view_as_render", not is_error)
+    return image
+
+
+def _set(owner, name: str, value) -> None:
+    """Set a property that is another one: Blender reads the whole file again, also for the same path."""
+    if getattr(owner, name) != value:
+        setattr(owner, name, value)
+
+
+def our_images(scene) -> list:
+    """Images that show results of `scene`."""
+    return [image for image in bpy.data.images if belongs(image, scene)]
+
+
+def belongs(image, scene) -> bool:
+    """True for an image of `scene`; one whose scene was renamed or removed belongs to all."""
+    name = image.get(SCENE)
+    return LAYER in image and name is not None and (name == scene.name or name not in bpy.data.scenes)
+
+
+def pixels_of(image) -> np.ndarray:
+    """Pixels (H, W, 4) float32 of an image, row 0 below; kept for the last few. Empty where they cannot be read."""
+    path = bpy.path.abspath(image.filepath)
+    try:
+        stamp = Path(path).stat().st_mtime_ns, tuple(image.size)
+    except OSError:
+        return np.empty((0, 0, 4), np.float32)
+    known = _pixels.get(path)
+    if known is None or known[0] != stamp:
+        width, height = image.size
+        flat = np.empty(4 * width * height, dtype=np.float32)
+        if flat.size:
+            image.pixels.foreach_get(flat)
+        known = (Path(path).stat().st_mtime_ns, (width, height)), flat.reshape(height, width, 4)
+        while len(_pixels) >= PIXELS_KEPT:
+            _pixels.pop(next(iter(_pixels)))
+        _pixels[path] = known
+    return known[1]
+
+
+def is_read(image) -> bool:
+    """Are the pixels of an image known, without a look into its file?"""
+    path = bpy.path.abspath(image.filepath)
+    try:
+        return path in _pixels and _pixels[path][0][0] == Path(path).stat().st_mtime_ns
+    except OSError:
+        return False
+
+
+def linear_space() -> str:
+    """Name of the scene-linear color space of the open file, in which pixels are stored as they are."""
+    spaces = bpy.types.ColorManagedInputColorspaceSettings.bl_rna.properties["name"].enum_items.keys()
+    wanted = bpy.data.colorspace.working_space if bpy.app.version >= (5, 0, 0) else "Linear Rec.709"
+    return next((name for name in (wanted, "Linear Rec.709", "Linear") if name in spaces), "Non-Color")
+
+
+def _full(group: str, layer: str) -> str:
+    return f"{group} {layer}".strip()
+
+
+def _blender_path(path: Path) -> str:
+    """Relative to the .blend where that is possible: both may move together."""
+    if not bpy.data.filepath:
+        return str(path)
+    try:
+        return bpy.path.relpath(str(path))
+    except ValueError:  # another drive of Windows
+        return str(path)
+
+
+def _offers(settings, key: str, value: str) -> bool:
+    items = getattr(settings.bl_rna.properties[key], "enum_items", None)
+    return items is None or value in items
+
+
+def _stored(settings, key: str, value: str):
+    """As `settings[key]` has it, which sets without calling what updates."""
+    items = getattr(settings.bl_rna.properties[key], "enum_items", None)
+    return value if items is None else items[value].value

@@ -1,0 +1,370 @@
+"""Settings of the scene, preferences of the user, presets."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+from bl_operators.presets import AddPresetBase
+from bl_ui.utils import PresetPanel
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    EnumProperty,
+    FloatProperty,
+    FloatVectorProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ...shading.parallel import CORES_VARIABLE
+from .comparison import changed
+
+# "bl_ext.user_default.ltsh" in Blender, where add-ons are known by it; "ltsh_addon" when imported from elsewhere.
+ADDON = __package__.rsplit(".", 3)[0]
+LOGGER = __package__.rsplit(".", 2)[0]
+MEMORY_VARIABLE = "LTSH_MEMORY_MIB"
+RESULTS = "results"
+LOG_LEVELS = (
+    ("ERROR", "Errors", "Only what failed"),
+    ("WARNING", "Warnings", "Also what went another way than asked"),
+    ("INFO", "Information", "Also what is done and how long it takes"),
+    ("DEBUG", "Details", "Everything, to find the cause of a fault"),
+)
+_DEFAULT_LOG_LEVEL = "WARNING"
+_NO_LIMIT = 0
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """What is set; 0 means no limit of the add-on's own. `output_folder` is absolute and need not exist."""
+
+    cores: int
+    memory_mib: int
+    output_folder: Path
+    log_level: str
+
+
+def preferences(context) -> Preferences:
+    """The preferences of the running Blender, or the defaults where the add-on is loaded without being enabled."""
+    addon = context.preferences.addons.get(ADDON)
+    stored = addon.preferences if addon is not None else None
+    if stored is None:
+        return Preferences(_NO_LIMIT, _NO_LIMIT, default_output_folder(), _DEFAULT_LOG_LEVEL)
+    chosen = stored.output_folder.strip()
+    folder = Path(bpy.path.abspath(chosen)).absolute() if chosen else default_output_folder()
+    return Preferences(stored.cores, stored.memory_mib, folder, stored.log_level)
+
+
+def default_output_folder() -> Path:
+    """The folder for files of this extension, which stays when it is updated."""
+    if ADDON.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(ADDON, path=RESULTS))
+    return Path(bpy.utils.user_resource("DATAFILES", path="ltsh")) / RESULTS
+
+
+class LTSH_AddonPreferences(bpy.types.AddonPreferences):
+    bl_idname = ADDON
+
+    cores: bpy.props.IntProperty(
+        name="Processor Cores",
+        description="How many cores shading, baking and the Cycles reference may use; 0 takes all of them",
+        min=0, max=1024, soft_max=64, default=_NO_LIMIT, update=lambda self, context: apply(context),
+    )  # fmt: skip
+    memory_mib: bpy.props.IntProperty(
+        name="Memory Limit",
+        description="A job that needs more than this many MiB is refused before it starts; "
+        "0 allows what the machine has free",
+        min=0, soft_max=2**20, step=1024, default=_NO_LIMIT, update=lambda self, context: apply(context),
+    )  # fmt: skip
+    output_folder: bpy.props.StringProperty(
+        name="Output Folder",
+        description="Where pictures, reports and baked textures are written; // is the folder of the .blend. "
+        "Empty takes a folder of the extension's own, which goes when the extension is uninstalled",
+        subtype="DIR_PATH", default="",
+    )  # fmt: skip
+    log_level: bpy.props.EnumProperty(
+        name="Log",
+        description="What the add-on writes to the console that Blender was started from",
+        items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=lambda self, context: apply(context),
+    )  # fmt: skip
+
+    def draw(self, context):
+        from .preflight import missing_libraries
+
+        layout = self.layout
+        layout.use_property_split, layout.use_property_decorate = True, False
+        missing = missing_libraries()
+        if missing:
+            layout.label(text=missing, icon="ERROR", translate=False)
+        limits = layout.column(align=True)
+        limits.prop(self, "cores", text="Processor Cores (0: All)")
+        limits.prop(self, "memory_mib", text="Memory Limit, MiB (0: All Free)")
+        layout.prop(self, "output_folder", placeholder=str(default_output_folder()))
+        layout.prop(self, "log_level")
+
+
+_variables_before: dict[str, str | None] = {}
+_log_handlers: list[logging.Handler] = []
+
+
+def apply(context) -> None:
+    """Put limits and log level into effect, here and for processes started from now on."""
+    chosen = preferences(context)
+    for name, value in ((CORES_VARIABLE, chosen.cores), (MEMORY_VARIABLE, chosen.memory_mib)):
+        before = _variables_before.setdefault(name, os.environ.get(name))
+        _set_variable(name, str(value) if value != _NO_LIMIT else before)
+    logger = logging.getLogger(LOGGER)
+    logger.setLevel(chosen.log_level)
+    if not _log_handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("LTSH %(levelname)s: %(message)s"))
+        logger.addHandler(handler)
+        _log_handlers.append(handler)
+
+
+def _set_variable(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value
+
+
+def _register_preferences() -> None:
+    """Add the preferences and put them into effect."""
+    bpy.utils.register_class(LTSH_AddonPreferences)
+    apply(bpy.context)
+
+
+def _unregister_preferences() -> None:
+    """Take the preferences and their effects back."""
+    logger = logging.getLogger(LOGGER)
+    while _log_handlers:
+        logger.removeHandler(_log_handlers.pop())
+    logger.setLevel(logging.NOTSET)
+    while _variables_before:
+        _set_variable(*_variables_before.popitem())
+    bpy.utils.unregister_class(LTSH_AddonPreferences)
+
+
+TECHNIQUES = (
+    ("ltc", "LTC", "Linearly transformed cosines, as EEVEE has them: fastest, least accurate", 1),
+    ("ltsh2", "LTSH 2", "Linearly transformed spherical harmonics of degree 2: nearly as fast as LTC", 2),
+    ("ltsh4", "LTSH 4", "Linearly transformed spherical harmonics of degree 4: the most accurate closed form", 4),
+    ("reference", "Reference", "Quadrature of the true lobe: exact and slow, on some of the pixels of large images", 8),
+)
+PASSES = (
+    ("specular", "Specular", "Glossy reflection, surface color included", 1),
+    ("diffuse", "Diffuse", "Diffuse reflection, surface color included", 2),
+)
+BAKE_PASSES = (
+    *PASSES,
+    ("diffuse_light", "Lightmap", "Diffuse reflection without the color of the surface", 4),
+    ("combined", "Combined", "Specular and diffuse together", 8),
+)
+PICTURES = (*TECHNIQUES, ("cycles", "Cycles", "The Cycles reference of the same points", 16))
+VIEWS = (
+    ("camera", "Active Camera", "The specular part as the scene's camera sees it"),
+    ("above", "Above Surface", "The specular part as seen along the normal of each point, independent of any camera"),
+)
+SIZES = tuple((str(size), f"{size} px", f"{size} x {size} texels") for size in (256, 512, 1024, 2048, 4096, 8192))
+MODES = (
+    ("A", "Single", "The first picture alone", "IMAGE_PLANE", 0),
+    ("WIPE", "Wipe", "The first picture left of a line that can be dragged, the second right", "UV_SYNC_SELECT", 1),
+    ("SIDE", "Side by Side", "Both pictures next to each other", "MOD_MIRROR", 2),
+    ("ERROR", "Difference", "First minus second: red is too bright, blue too dark, white is equal", "IMAGE_ALPHA", 3),
+)
+
+
+class LTSH_PG_scene(bpy.types.PropertyGroup):
+    """What to shade, bake and look at in a scene."""
+
+    techniques: EnumProperty(
+        name="Techniques",
+        description="How the glossy lobe is integrated over the lights. Shift-click to choose several",
+        items=TECHNIQUES,
+        options={"ENUM_FLAG"},
+        default={"ltc", "ltsh4"},
+    )
+    passes: EnumProperty(
+        name="Passes",
+        description="Parts of the reflected light. Shift-click to choose several",
+        items=PASSES,
+        options={"ENUM_FLAG"},
+        default={"specular", "diffuse"},
+    )
+    resolution_percentage: IntProperty(
+        name="Resolution",
+        description="Percentage of the scene's render resolution",
+        subtype="PERCENTAGE",
+        min=1,
+        max=400,
+        soft_max=100,
+        default=100,
+    )
+    anti_aliasing: IntProperty(
+        name="Anti-Aliasing",
+        description="Points per pixel, drawn from the scene's pixel filter; 1 takes the centers of pixels",
+        min=1,
+        max=256,
+        soft_max=64,
+        default=1,
+    )
+    cycles_samples: IntProperty(
+        name="Cycles Samples",
+        description="Samples per pixel of the Cycles reference; its noise falls with their square root",
+        min=2,
+        max=1 << 20,
+        soft_max=8192,
+        default=256,
+    )
+    output_folder: StringProperty(
+        name="Output",
+        description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
+        "folder of the .blend. Empty takes the one of the preferences, as does a file that is not saved yet",
+        subtype="DIR_PATH",
+        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
+        default="//ltsh/",
+    )
+    bake_size: EnumProperty(name="Size", description="Texels on each side of the texture", items=SIZES, default="1024")
+    bake_margin: IntProperty(
+        name="Margin",
+        description="How far colors go on beyond the borders of UV islands, in texels",
+        subtype="PIXEL",
+        min=0,
+        max=256,
+        soft_max=64,
+        default=16,
+    )
+    bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
+    bake_uv_map: StringProperty(
+        name="UV Map",
+        description="Name of the UV map to bake into; empty for the one that is active for rendering",
+    )
+    bake_passes: EnumProperty(
+        name="Bake Passes",
+        description="Parts of the reflected light. Shift-click to choose several",
+        items=BAKE_PASSES,
+        options={"ENUM_FLAG"},
+        default={"specular", "diffuse"},
+    )
+    bake_error: BoolProperty(
+        name="Compare with Cycles",
+        description="Bake the same texels with Cycles too and measure the signed error",
+        default=False,
+    )
+    result_folder: StringProperty(
+        name="Results",
+        description="Folder of the pictures that are shown",
+        subtype="DIR_PATH",
+        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )
+    # -- what the Image Editor shows of it ----------------------------------------------------------------------------
+    mode: EnumProperty(
+        name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
+    )
+    groups: CollectionProperty(type=bpy.types.PropertyGroup)
+    group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
+    first: EnumProperty(
+        name="A", description="The first picture, left of the line", items=PICTURES, default="ltsh4", update=changed
+    )
+    second: EnumProperty(
+        name="B", description="The second picture, right of the line", items=PICTURES, default="cycles", update=changed
+    )
+    pass_name: EnumProperty(
+        name="Pass", description="Which part of the light is shown", items=BAKE_PASSES, default="combined",
+        update=changed,
+    )  # fmt: skip
+    split: FloatProperty(
+        name="Split",
+        description="Where the line between the two pictures is; it can also be dragged in the image",
+        subtype="FACTOR",
+        min=0.0,
+        max=1.0,
+        default=0.5,
+        update=changed,
+    )
+    error_scale: FloatProperty(
+        name="Scale",
+        description="Difference in radiance at which the colors end; 0 takes the one of the report",
+        min=0.0,
+        soft_max=10.0,
+        precision=4,
+        default=0.0,
+        update=changed,
+    )
+    probe: FloatVectorProperty(
+        name="Probe",
+        description="Where the pixel probe was last, from the lower left corner",
+        size=2,
+        default=(0.5, 0.5),
+        options={"HIDDEN"},
+    )
+
+
+def _register_properties():
+    bpy.utils.register_class(LTSH_PG_scene)
+    bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
+
+
+def _unregister_properties():
+    del bpy.types.Scene.ltsh
+    bpy.utils.unregister_class(LTSH_PG_scene)
+
+
+SUBFOLDER = "ltsh"
+KEPT = ("techniques", "passes", "resolution_percentage", "anti_aliasing", "cycles_samples",
+        "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
+
+
+class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):
+    """Add or remove a preset of these settings"""
+
+    bl_idname = "ltsh.add_preset"
+    bl_label = "Add LTSH Preset"
+    preset_menu = "LTSH_PT_presets"
+    preset_subdir = SUBFOLDER
+    preset_defines = ["settings = bpy.context.scene.ltsh"]
+    preset_values = [f"settings.{name}" for name in KEPT]
+
+
+class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
+    """Settings by name"""
+
+    bl_label = "LTSH Presets"
+    preset_subdir = SUBFOLDER
+    preset_operator = "script.execute_preset"
+    preset_add_operator = "ltsh.add_preset"
+
+
+_register, _unregister = bpy.utils.register_classes_factory((LTSH_OT_add_preset, LTSH_PT_presets))
+# Blender looks for a folder "presets" in it.
+FOLDER = str(Path(__file__).parent)
+
+
+def _register_presets():
+    _register()
+    bpy.utils.register_preset_path(FOLDER)
+
+
+def _unregister_presets():
+    bpy.utils.unregister_preset_path(FOLDER)
+    _unregister()
+
+
+def register() -> None:
+    """Add all of it to Blender."""
+    _register_preferences()
+    _register_properties()
+    _register_presets()
+
+
+def unregister() -> None:
+    """Remove what `register` added."""
+    _unregister_presets()
+    _unregister_properties()
+    _unregister_preferences()

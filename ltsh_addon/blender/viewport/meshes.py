@@ -1,0 +1,255 @@
+"""Evaluated meshes as batches: corners, normals, tangents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import bpy
+import gpu
+import numpy as np
+
+from ...cycles.horizons import unit
+from ..evaluated import read_values
+
+# Before, Cycles did not take corner normals where only faces are sharp.
+_CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
+# Between the normals of a face and of its triangles, where they count as one.
+_SAME = 1e-5
+
+
+def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (C, 3) at the corners, which stand at the vertices `vertex` (C,), and the mask (F,) of the faces whose
+    triangles are flat: there Cycles interpolates nothing.
+
+    Faces count as flat as far as Cycles says so, which is not always how Blender's solid view shows them: with normals
+    at all corners none are, and edges that are all sharp make none.
+    """
+    faces = len(mesh.polygons)
+    sharp = _marks(mesh, "sharp_face", faces)
+    by_vertex = not mesh.has_custom_normals and not sharp.all() and _edges_do_not_count(mesh, sharp)
+    if by_vertex:
+        normal = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32).take(vertex, axis=0)
+    else:
+        normal = read_values(mesh.corner_normals, "vector", (len(vertex), 3), np.float32)
+    flat = sharp if by_vertex or mesh.normals_domain == "FACE" else np.zeros(faces, bool)
+    return normal, flat
+
+
+def _edges_do_not_count(mesh, sharp_faces: np.ndarray) -> bool:
+    """True where Cycles takes normals of vertices, with sharp faces apart."""
+    edges = _marks(mesh, "sharp_edge", len(mesh.edges))
+    return bool(edges.all() if edges.any() else not _CORNERS_OF_SHARP_FACES or not sharp_faces.any())
+
+
+def _marks(mesh, name: str, count: int) -> np.ndarray:
+    attribute = mesh.attributes.get(name)
+    return np.zeros(count, bool) if attribute is None else read_values(attribute.data, "value", (count,), bool)
+
+
+def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray, normal: np.ndarray):
+    """Triangles (K,) that need corners of their own, and their normals (K, 3): those of faces `flat` (F,) that are not
+    plane. `triangles` (T, 3) are corners with places and normals (C, 3)."""
+    candidates = np.arange(len(triangles))
+    if not flat.all():
+        face = read_values(mesh.loop_triangle_polygons, "value", (len(triangles),), np.int32)
+        candidates = np.nonzero(flat[face])[0]
+    corners = triangles.take(candidates, axis=0)
+    # `take` is several times as fast as an index.
+    first, second, third = (place.take(corners[:, number], axis=0) for number in range(3))
+    own = unit(np.cross(second - first, third - first))
+    differs = np.zeros(len(candidates), bool)
+    # All corners of a face have its normal where all faces are flat.
+    for number in range(1 if flat.all() else 3):
+        difference = np.abs(normal.take(corners[:, number], axis=0) - own)
+        for axis in range(3):
+            differs |= difference[:, axis] > _SAME
+    differs &= own.any(axis=1)
+    return candidates[differs], own[differs]
+
+
+def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
+    """Tangents (C, 4) for corners with places (C, 3), unit normals (C, 3) and UV coordinates (C, 2), in the frame of
+    the places; the last number is the sign of the bitangent. (1, 0, 0, -1) where no triangle (T, 3) has an area in UV.
+
+    Triangles that share a place, a normal, UV coordinates and their orientation in UV share a tangent there: the mean
+    of theirs, each projected onto the plane of the normal and weighted by its angle.
+    """
+    corner, area = triangles.ravel(), _uv_area(uv, triangles)
+    of_triangle = unit(_towards_u(place, uv, triangles) * np.sign(area)[:, None])
+    upward = normal[corner].astype(np.float64)
+    flat = unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(place, triangles, upward)[:, None]
+    used = (area != 0.0).repeat(3)
+    group = _groups(place, normal, uv, corner, area)
+    flat[~used] = 0.0
+    total = np.stack([np.bincount(group, flat[:, axis]) for axis in range(3)], axis=-1)
+    found = np.tile(np.array([1.0, 0.0, 0.0, -1.0], np.float32), (len(place), 1))
+    found[corner[used], :3] = unit(total)[group[used]]
+    found[corner[used], 3] = np.sign(area).repeat(3)[used]
+    return found
+
+
+def _uv_area(uv, triangles):
+    """Twice the areas (T,) in UV, negative where a triangle is mirrored there."""
+    first, second = _edges(uv, triangles)
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def _towards_u(place, uv, triangles):
+    """The directions (T, 3) in which u grows, for positive areas."""
+    (first, second), (uv_first, uv_second) = _edges(place, triangles), _edges(uv, triangles)
+    return first * uv_second[:, 1:] - second * uv_first[:, 1:]
+
+
+def _edges(values, triangles):
+    start = values[triangles[:, 0]].astype(np.float64)
+    return values[triangles[:, 1]] - start, values[triangles[:, 2]] - start
+
+
+def _angles(place, triangles, upward):
+    """Angles (3 T,) at the corners of the triangles, seen along the normals `upward` (3 T, 3)."""
+    points = place[triangles].astype(np.float64)
+    ahead, back = (unit(_projected((np.roll(points, way, axis=1) - points).reshape(-1, 3), upward)) for way in (-1, 1))
+    return np.arccos(np.clip((ahead * back).sum(axis=1), -1.0, 1.0))
+
+
+def _groups(place, normal, uv, corner, area):
+    """Numbers (3 T,) that are equal for corners of triangles which share a tangent."""
+    # Negative zeros count as zero.
+    rows = np.concatenate([place, normal, uv], axis=1, dtype=np.float32)[corner] + np.float32(0.0)
+    rows = np.concatenate([rows, np.sign(area).astype(np.float32).repeat(3)[:, None]], axis=1)
+    as_one = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel()
+    return np.unique(as_one, return_inverse=True)[1].ravel()
+
+
+def _projected(vectors, normals):
+    return vectors - (vectors * normals).sum(axis=1, keepdims=True) * normals
+
+
+@dataclass
+class MeshBatches:
+    """One evaluated mesh; `slots` are the material slots that have faces."""
+
+    slots: tuple[int, ...]
+    triangles: int
+    indices: dict[int, gpu.types.GPUIndexBuf]
+    corners: gpu.types.GPUVertBuf | None
+    corner_count: int
+    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
+    middle: np.ndarray  # (3,) of the bounding box
+    is_smooth: bool  # do normals differ from those of the faces?
+    _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
+    _tangents: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
+    _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
+
+    def batch(self, slot: int, uv_map: str) -> gpu.types.GPUBatch:
+        """What draws the faces of `slot` with a UV map; maps that the mesh lacks are zero, as in Cycles."""
+        key = slot, uv_map
+        if key not in self._batches:
+            batch = gpu.types.GPUBatch(type="TRIS", buf=self.corners, elem=self.indices[slot])
+            batch.vertbuf_add(self._uv_buffer(uv_map))
+            if uv_map in self._tangents:
+                batch.vertbuf_add(self._tangents[uv_map])
+            self._batches[key] = batch
+        return self._batches[key]
+
+    def add_tangents(self, ob, uv_map: str) -> None:
+        """Make sure that normal maps on `uv_map` have tangents; `ob` is an evaluated object with this mesh."""
+        if uv_map in self._tangents or uv_map not in self.uv:
+            return
+        found = _arrays(ob)
+        tangents = corner_tangents(found.place, found.normal, found.uv[uv_map], found.triangles)
+        self._tangents[uv_map] = _vertex_buffer({"tangent": tangents})
+        self._batches.clear()
+
+    def _uv_buffer(self, uv_map: str) -> gpu.types.GPUVertBuf:
+        if uv_map not in self._uv_buffers:
+            values = self.uv.get(uv_map)
+            if values is None:
+                values = np.zeros((self.corner_count, 2), np.float32)
+            self._uv_buffers[uv_map] = _vertex_buffer({"uv": values})
+        return self._uv_buffers[uv_map]
+
+
+def _vertex_buffer(attributes: dict[str, np.ndarray]) -> gpu.types.GPUVertBuf:
+    layout = gpu.types.GPUVertFormat()
+    for name, values in attributes.items():
+        layout.attr_add(id=name, comp_type="F32", len=values.shape[1], fetch_mode="FLOAT")
+    buffer = gpu.types.GPUVertBuf(layout, len(next(iter(attributes.values()))))
+    for name, values in attributes.items():
+        buffer.attr_fill(name, values)
+    return buffer
+
+
+@dataclass
+class _Arrays:
+    """Corners and triangles of an evaluated mesh; flat faces that are not plane have corners of their own."""
+
+    triangles: np.ndarray  # (T, 3) of corners
+    slots: np.ndarray  # (T,)
+    place: np.ndarray  # (C, 3)
+    normal: np.ndarray  # (C, 3)
+    uv: dict[str, np.ndarray]
+    middle: np.ndarray  # (3,)
+    is_smooth: bool
+
+
+def mesh_batches(ob) -> MeshBatches | None:
+    """Those of the evaluated object `ob`; None where it has no faces."""
+    found = _arrays(ob)
+    if found is None:
+        return None
+    triangles, slots = found.triangles, found.slots
+    used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
+    indices = {
+        slot: gpu.types.GPUIndexBuf(
+            type="TRIS", seq=triangles if len(used) == 1 else np.ascontiguousarray(triangles[slots == slot])
+        )
+        for slot in used
+    }
+    buffer = _vertex_buffer({"position": found.place, "normal": found.normal})
+    return MeshBatches(used, len(triangles), indices, buffer, len(found.place), found.uv, found.middle, found.is_smooth)
+
+
+def _arrays(ob) -> _Arrays | None:
+    mesh = ob.to_mesh()
+    if mesh is None:
+        return None
+    try:
+        mesh.calc_loop_triangles()
+        count = len(mesh.loop_triangles)
+        if count == 0:
+            return None
+        triangles = read_values(mesh.loop_triangles, "loops", (count, 3), np.int32)
+        slots = _slots(mesh, count, max(len(ob.material_slots), 1))
+        # Attributes are copied as they lie in memory, `mesh.loops` and `mesh.vertices` one by one.
+        vertex = read_values(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
+        place = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
+        middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
+        place, uv = place.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
+        normal, flat = interpolated_normals(mesh, vertex)
+        if flat.any():
+            chosen, own = own_normals(mesh, flat, triangles, place, normal)
+            corners = triangles[chosen].ravel()
+            triangles[chosen] = len(vertex) + np.arange(len(corners)).reshape(-1, 3)
+            normal = np.concatenate([normal, own.repeat(3, axis=0)])
+            place = np.concatenate([place, place.take(corners, axis=0)])
+            uv = {name: np.concatenate([values, values.take(corners, axis=0)]) for name, values in uv.items()}
+    finally:
+        ob.to_mesh_clear()
+    return _Arrays(triangles, slots, place, normal, uv, middle, not flat.all())
+
+
+def _slots(mesh, count: int, slots: int) -> np.ndarray:
+    """The material slot (count,) of every triangle."""
+    if slots == 1:
+        return np.zeros(count, np.int32)
+    return np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
+
+
+def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:
+    maps = {}
+    for layer in mesh.uv_layers:
+        maps[layer.name] = read_values(layer.uv, "vector", (corners, 2), np.float32)
+        if layer.active_render:
+            maps[""] = maps[layer.name]
+    return maps

@@ -1,0 +1,334 @@
+"""The scene as the viewport keeps it, updated by what changed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...scene import AreaLight
+from ..evaluated import (
+    SURFACE_TYPES,
+    EmitterTraits,
+    data_pointer,
+    is_seen_by_cameras,
+    is_surface,
+    mesh_key,
+    owner_of,
+    visibility,
+)
+from ..lights.area import area_light, note_unsupported, reason_to_leave_out
+from ..lights.emission import Emission, emission_behind
+from ..lights.linking import Receivers
+from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
+from ..lights.textures import ShownTextures
+from ..materials.graph import material_output, source_of
+from ..materials.looks import Look, look_of, world_radiance
+from ..materials.values import product, value_at
+from .meshes import MeshBatches, mesh_batches
+from .textures import look_values, uniform_buffer
+
+# Where nothing says on which side of closed emissive meshes the eye is, it is outside.
+FAR_AWAY = np.full(3, 1e6)
+# Patches and faces included. A frame takes as long as all of them do.
+MOST_LIGHTS = 2048
+
+
+def view_lights(depsgraph, in_view: Callable, textures: ShownTextures) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
+    """The lights among the instances that `in_view` says yes to, and what is not shown as Cycles has it.
+
+    `textures` are those of the last time.
+    """
+    notes: list[str] = []
+    receivers = Receivers([ob.original for ob in depsgraph.objects])
+    lights, emits = [], False
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if not instance.show_self or not in_view(instance):
+            continue
+        emits = emits or (ob.type in SURFACE_TYPES and _has_emission(ob))
+        if ob.type != "LIGHT":
+            continue
+        matrix = np.array(instance.matrix_world, dtype=np.float64)
+        problem = reason_to_leave_out(ob, matrix)
+        if problem:
+            notes.append(f"{ob.original.name}: {problem}")
+            continue
+        plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
+        shown = [light for light in _with_nodes(plain, ob.data, textures, notes) if np.any(light.radiance != 0.0)]
+        if shown:
+            lights.extend(shown)
+            note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
+    if emits:
+        lights.extend(_mesh_lights(depsgraph, receivers, notes))
+    return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
+
+
+def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS) -> list[AreaLight]:
+    """The `most` lights with the largest power, in their order; the others are named in `notes`."""
+    if len(lights) <= most:
+        return lights
+    power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
+    kept = np.sort(np.argsort(-power, kind="stable")[:most])
+    left = 1.0 - power[kept].sum() / power.sum()
+    notes.append(
+        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * left:.1f} % of the power "
+        "is missing"
+    )
+    return [lights[index] for index in kept]
+
+
+def _has_emission(ob) -> bool:
+    return any(slot.material is not None and np.any(_emission(slot.material)) for slot in ob.material_slots)
+
+
+def _emission(material) -> np.ndarray:
+    return np.zeros(3) if material is None else look_of(material.original).emission
+
+
+def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
+    override = depsgraph.view_layer_eval.material_override
+    found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
+    camera = depsgraph.scene.camera
+    eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
+    return constant_mesh_lights(found, _emission, eye, notes.append)
+
+
+def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str]) -> list[AreaLight]:
+    """`light` with what constants and images in its node tree make of it."""
+    tree = data.node_tree if bpy.app.version >= (5, 0, 0) or data.use_nodes else None
+    if tree is None:
+        return [light]
+    output = material_output(tree)
+    emission = emission_behind(tree, output.inputs["Surface"]) if output is not None else Emission()
+    if emission.plain:
+        return [light]
+    source = source_of(tree, output.inputs["Surface"]) if output is not None else None
+    if source is None or source.node is None:
+        return []
+    if source.node.bl_idname == "ShaderNodeEmission":
+        inputs = (source.node.inputs[name] for name in ("Color", "Strength"))
+        factor = product(*(value_at(source.tree, socket, source.groups) for socket in inputs))
+        if factor is not None and factor.is_constant:
+            return [replace(light, radiance=light.radiance * factor.offset)]
+        patches = None if factor is None else textures.split(light, factor, notes)
+        if patches is not None:
+            return patches
+    notes.append(f"{light.name}: its nodes are not resolved, it shines as without them")
+    return [light]
+
+
+# In place of a receiver's number: nothing is seen there, nor behind it.
+HOLDOUT = -1
+
+
+@dataclass
+class ShownLook:
+    """A look with its uniform buffer; `textures` by slot come when it is first drawn."""
+
+    look: Look
+    uniforms: object
+    textures: dict | None = None
+    further: tuple[ShownLook, ...] = ()  # the other lobes
+
+    @property
+    def lobes(self) -> tuple[ShownLook, ...]:
+        """This lobe and the further ones."""
+        return (self, *self.further)
+
+
+@dataclass(frozen=True)
+class ShownInstance:
+    """One placement of a mesh."""
+
+    mesh: MeshBatches
+    model: Matrix
+    looks: tuple[ShownLook, ...]  # one for each slot of the mesh
+    receiver: int  # or HOLDOUT
+    side: float  # -1 where the transform mirrors
+    center: np.ndarray  # (4,) of the bounding box in the world
+    is_only_user: bool  # of the mesh
+
+
+@dataclass
+class Changes:
+    """What an update of the depsgraph touches."""
+
+    everything: bool = False
+    geometry: set[int] = field(default_factory=set)  # session uids of original objects and their data
+    materials: set[str] = field(default_factory=set)  # full names
+    images: bool = False
+    instances: bool = False
+    lights: bool = False
+    world: bool = False
+
+    @property
+    def surfaces(self) -> bool:
+        """Is anything of the G-buffer different?"""
+        return self.everything or self.instances or self.images or bool(self.geometry or self.materials)
+
+
+def changes_of(depsgraph, first: bool) -> Changes:
+    """What `depsgraph.updates` says; all of it on the `first` call, where the list is empty."""
+    changes = Changes(everything=first)
+    for update in depsgraph.updates:
+        block = update.id.original
+        if isinstance(block, bpy.types.Object):
+            _note_object(changes, block, update)
+        elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
+            # Materials and worlds are named beside their node trees.
+            changes.lights = True
+        elif isinstance(block, bpy.types.Material):
+            changes.materials.add(block.name_full)
+        elif isinstance(block, bpy.types.Image):
+            changes.images = True
+        elif isinstance(block, bpy.types.World):
+            changes.world = True
+        elif isinstance(block, bpy.types.Collection | bpy.types.Scene):
+            changes.instances = changes.lights = changes.world = True
+        elif update.is_updated_geometry:
+            changes.geometry.add(block.session_uid)
+    return changes
+
+
+def _note_object(changes: Changes, block, update) -> None:
+    if block.type == "LIGHT":
+        changes.lights = True
+        return
+    # Objects may be mesh lights, or instance lights.
+    changes.lights |= update.is_updated_transform or update.is_updated_geometry
+    changes.instances = True
+    if update.is_updated_geometry:
+        changes.geometry.add(block.session_uid)
+
+
+class SceneMirror:
+    """Meshes, looks, instances and lights of one view of a scene."""
+
+    def __init__(self):
+        self.instances: list[ShownInstance] = []
+        self.lights: tuple[AreaLight, ...] = ()
+        self.background = np.zeros(3)
+        self.surfaces_version = 0
+        self._meshes: dict[tuple, MeshBatches | None] = {}
+        self._looks: dict[str, ShownLook] = {}
+        self._light_notes: tuple[str, ...] = ()
+        self._light_textures = ShownTextures()
+        self._world_note: tuple[str, ...] = ()
+        self._synced = False
+
+    @property
+    def notes(self) -> list[str]:
+        """What is not shown as Cycles has it, each once."""
+        found = [note for shown in self._looks.values() for note in shown.look.notes]
+        return list(dict.fromkeys([*found, *self._light_notes, *self._world_note]))
+
+    @property
+    def triangles(self) -> int:
+        return sum(instance.mesh.triangles for instance in self.instances)
+
+    @property
+    def most_lobes(self) -> int:
+        """How many lobes the material with the most has."""
+        return max((len(shown.lobes) for shown in self._looks.values()), default=0)
+
+    def sync(self, depsgraph, space=None) -> None:
+        """Take over what has changed; `space` is the 3D view, whose local view counts."""
+        changes = changes_of(depsgraph, not self._synced)
+        self._drop_changed(changes)
+        in_view = visibility(depsgraph, space)
+        if changes.surfaces:
+            self._read_instances(depsgraph, changes, in_view)
+            self.surfaces_version += 1
+        if changes.lights or changes.everything or changes.materials or changes.images:
+            self.lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures)
+        if changes.world or changes.everything:
+            self._read_world(depsgraph.scene)
+        self._synced = True
+
+    def _drop_changed(self, changes: Changes) -> None:
+        if changes.everything:
+            self._meshes.clear()
+            self._looks.clear()
+        for name in changes.materials:
+            self._looks.pop(name, None)
+        if changes.images:
+            self._light_textures.clear()
+            for shown in (lobe for look in self._looks.values() for lobe in look.lobes):
+                shown.textures = None
+
+    def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
+        override = depsgraph.view_layer_eval.material_override
+        receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
+        found, meshes, looks = [], {}, {}
+        users = Counter()  # of evaluated data, also those that are not in view
+        for instance in depsgraph.object_instances:
+            ob = instance.object
+            if not is_surface(instance):
+                continue
+            data = data_pointer(ob)
+            users[data] += 1
+            if not is_seen_by_cameras(instance) or not in_view(instance):
+                continue
+            key = mesh_key(instance)
+            if key not in meshes:
+                known = key in self._meshes and not changes.geometry.intersection(key[:3])
+                meshes[key] = self._meshes[key] if known else mesh_batches(ob)
+            mesh = meshes[key]
+            if mesh is None:
+                continue
+            materials = _materials(ob, mesh, override)
+            for material in materials:
+                name = _name(material)
+                if name not in looks:
+                    looks[name] = self._looks.get(name) or _shown_look(material)
+            shown = tuple(looks[_name(material)] for material in materials)
+            for lobe in (lobe.look for look in shown for lobe in look.lobes):
+                if lobe.normal is not None:
+                    mesh.add_tangents(ob, lobe.uv_map)
+            receiver = _receiver(instance, receivers, depsgraph.view_layer)
+            model = instance.matrix_world.copy()
+            side = -1.0 if model.determinant() < 0.0 else 1.0
+            center = np.array(model) @ [*mesh.middle, 1.0]
+            found.append((data, (mesh, model, shown, receiver, side, center)))
+        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
+        self._meshes, self._looks = meshes, looks
+
+    def _read_world(self, scene) -> None:
+        self.background, whole = world_radiance(scene.world)
+        world = scene.world
+        self._world_note = () if whole else (f"{world.name}: its nodes are not resolved, its viewport color is shown",)
+
+
+def _shown_look(material) -> ShownLook:
+    look = look_of(None if material is None else material.original)
+    further = tuple(ShownLook(lobe, uniform_buffer(look_values(lobe))) for lobe in look.further)
+    return ShownLook(look, uniform_buffer(look_values(look)), further=further)
+
+
+def _materials(ob, mesh: MeshBatches, override) -> list:
+    """The material of every slot of `mesh`, None where there is none."""
+    slots = [slot.material for slot in ob.material_slots] or [None]
+    return [override or slots[slot] for slot in mesh.slots]
+
+
+def _name(material) -> str:
+    return material.name_full if material else ""
+
+
+def _receiver(instance, receivers: Receivers, view_layer) -> int:
+    owner = owner_of(instance).original
+    if owner.holdout_get(view_layer=view_layer):
+        return HOLDOUT
+    numbers = receivers.numbers
+    own = numbers.get(instance.object.original.name_full, 0)
+    return numbers.get(owner.name_full, own) if instance.is_instance else own
+
+
+def _originals(depsgraph) -> list:
+    return [ob.original for ob in depsgraph.objects]

@@ -1,0 +1,270 @@
+"""A picture of the mirrored scene: surfaces, light, then what the view shows of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+
+from ..materials.values import Value
+from .lighting import HorizonPass, LightingPass
+from .mirror import SceneMirror
+from .surfaces import SurfacePass, View, has_bent_lobes
+from .textures import GBufferTextures, UploadedLights, upload_lights
+
+MODES = ("single", "split", "difference")
+_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
+_VERTEX = """
+void main()
+{
+  gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+# Red is brighter, blue darker, white equal, as in `imaging.false_color`.
+_FRAGMENT = """
+vec4 over_background(vec4 lit)
+{
+  float alpha = mix(lit.a, 1.0, background.a);
+  return vec4(lit.rgb * scales.x + background.rgb * (1.0 - lit.a), alpha);
+}
+
+void main()
+{
+  ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
+  vec4 first = texelFetch(first_picture, texel, 0);
+  vec4 second = texelFetch(second_picture, texel, 0);
+  second.a = min(first.a, second.a);
+  color = over_background(first);
+  if (place.z == 1) {
+    float beyond = float(texel.x) + 0.5 - scales.z;
+    color = beyond > 0.0 ? over_background(second) : color;
+    color = abs(beyond) <= scales.w ? vec4(vec3(0.8), 1.0) : color;
+  }
+  else if (place.z == 2) {
+    float difference = dot(first.rgb - second.rgb, vec3(1.0 / 3.0)) * scales.x / scales.y;
+    float strength = clamp(abs(difference), 0.0, 1.0);
+    vec3 side = difference > 0.0 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 0.0, 1.0);
+    color = vec4((second.a > 0.0 ? mix(vec3(1.0), side, strength) : vec3(0.2)) * white, 1.0);
+  }
+}
+"""
+
+
+class PicturePass:
+    """Draws one or two pictures into what is bound; needs an active GPU context."""
+
+    def __init__(self):
+        info = gpu.types.GPUShaderCreateInfo()
+        info.vertex_in(0, "VEC2", "corner")
+        info.fragment_out(0, "VEC4", "color")
+        info.push_constant("IVEC4", "place")
+        info.push_constant("VEC4", "scales")
+        info.push_constant("VEC4", "background")
+        info.push_constant("FLOAT", "white")
+        info.sampler(0, "FLOAT_2D", "first_picture")
+        info.sampler(1, "FLOAT_2D", "second_picture")
+        info.vertex_source(_VERTEX)
+        info.fragment_source(_FRAGMENT)
+        self._shader = gpu.shader.create_from_info(info)
+        self._batch = batch_for_shader(self._shader, "TRIS", {"corner": _TRIANGLE})
+
+    def draw(
+        self,
+        first: gpu.types.GPUTexture,
+        second: gpu.types.GPUTexture | None,
+        rect: tuple[int, int, int, int],
+        *,
+        mode: str = "single",
+        exposure: float = 1.0,
+        background=(0.0, 0.0, 0.0),
+        transparent: bool = False,
+        split: float = 0.5,
+        difference_scale: float = 1.0,
+        line_width: float = 1.0,
+        white: float = 1.0,
+    ) -> None:
+        """Fill `rect` (x, y, width, height) of what is bound, scene-linear, from pictures RGBA with alpha 1 where they
+        show a surface. `mode` is one of MODES; `split` is the place of the line between 0 and 1, `white` the
+        brightness of no difference."""
+        x, y, width, height = rect
+        gpu.state.viewport_set(x, y, width, height)
+        gpu.state.blend_set("NONE")
+        gpu.state.depth_test_set("NONE")
+        gpu.state.depth_mask_set(False)
+        shader = self._shader
+        shader.bind()
+        shader.uniform_sampler("first_picture", first)
+        shader.uniform_sampler("second_picture", first if second is None else second)
+        shader.uniform_int("place", (x, y, MODES.index(mode), 0))
+        shader.uniform_float("scales", (exposure, difference_scale, split * width, 0.5 * line_width))
+        behind = (0.0, 0.0, 0.0) if transparent else [exposure * float(value) for value in background]
+        shader.uniform_float("background", (*behind, 0.0 if transparent else 1.0))
+        shader.uniform_float("white", white)
+        self._batch.draw(shader)
+
+
+# The lighting pass is fast for so many indices of refraction, and exact for all.
+MOST_IORS = 6
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """What of the lighting is shown, and how."""
+
+    technique: str
+    passes: str  # combined, specular or diffuse
+    mode: str  # of `picture_pass.MODES`
+    second_technique: str
+    split: float
+    difference_scale: float
+    exposure: float
+    transparent: bool
+    line_width: float = 1.0
+    second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
+    white: float = 1.0  # what the false colors' white is before the scene's own exposure
+
+
+class ViewRenderer:
+    """The GPU's side of one view; needs an active GPU context."""
+
+    def __init__(self):
+        self._surfaces = SurfacePass()
+        self._picture = PicturePass()
+        self._lighting: dict[str, LightingPass] = {}
+        self._targets: list = []
+        self._horizons: HorizonPass | None = None
+        self._lobe_horizons: HorizonPass | None = None
+        self._gbuffer: GBufferTextures | None = None
+        self._lit_gbuffer: GBufferTextures | None = None
+        self._lights: UploadedLights | None = None
+        self._drawn = self._uploaded = None
+
+    def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
+        """Draw the scene into `frame_buffer`, which has `size` pixels."""
+        surfaces_changed = self._draw_surfaces(mirror, view, size)
+        lights_changed = self._upload_lights(mirror)
+        if surfaces_changed or lights_changed or self._lit_gbuffer is None:
+            self._choose_horizons(mirror, view)
+        techniques = [shown.technique]
+        if shown.mode != "single" and shown.second_picture is None:
+            techniques.append(shown.second_technique)
+        first, *others = self._lit(techniques, mirror, view, size, shown)
+        second = others[0] if others else shown.second_picture
+        # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
+        with frame_buffer.bind():
+            self._picture.draw(
+                first,
+                second,
+                (0, 0, *size),
+                mode=shown.mode,
+                exposure=shown.exposure,
+                background=mirror.background if shown.passes == "combined" else np.zeros(3),
+                transparent=shown.transparent,
+                split=shown.split,
+                difference_scale=shown.difference_scale,
+                line_width=shown.line_width,
+                white=shown.white,
+            )
+
+    def _draw_surfaces(self, mirror, view: View, size) -> bool:
+        """Draw the G-buffer if anything has changed, and tell that."""
+        drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), size)
+        if drawn == self._drawn:
+            return False
+        self._drawn = None
+        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+        self._drawn = drawn
+        return True
+
+    def _upload_lights(self, mirror) -> bool:
+        """Upload the lights if they have changed, and tell that."""
+        if self._uploaded is mirror.lights:
+            return False
+        self._lights = upload_lights(mirror.lights)
+        self._uploaded = mirror.lights
+        return True
+
+    def _choose_horizons(self, mirror, view: View) -> None:
+        """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
+        self._lit_gbuffer = None
+        if self._horizons is None and self._gbuffer.geometric_normal is not None:
+            self._horizons = HorizonPass()
+        self._lit_gbuffer = self._with_horizons(self._gbuffer, self._horizons, mirror, view)
+
+    def _with_horizons(self, gbuffer, horizons, mirror, view: View) -> GBufferTextures:
+        if gbuffer.geometric_normal is None:
+            return gbuffer
+        horizon = horizons.draw(gbuffer, self._lights, (*view.eye, 0.0 if view.is_parallel else 1.0))
+        smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
+        return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
+
+    def _lit(self, techniques: list[str], mirror, view: View, size, shown: ShownPicture) -> list:
+        """The textures that `techniques` are drawn into; the surfaces of a further lobe are drawn once for all."""
+        lightings = [self._lighting_of(technique, mirror) for technique in techniques]
+        targets = [self._target(number, size) for number in range(len(techniques))]
+        place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
+        for number in range(max(mirror.most_lobes, 1)):
+            gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
+            for lighting, (_, buffer) in zip(lightings, targets, strict=True):
+                lighting.draw(gbuffer, buffer, shown.passes, **place, add=number > 0)
+        if shown.passes == "combined" and shown.second_picture is None:
+            for _, buffer in targets:
+                self._surfaces.add_emission(mirror.instances, view, size, buffer)
+        return [texture for texture, _ in targets]
+
+    def _lighting_of(self, technique: str, mirror) -> LightingPass:
+        if technique not in self._lighting:
+            self._lighting[technique] = LightingPass(technique)
+        lighting = self._lighting[technique]
+        lighting.set_iors(common_iors(mirror))
+        lighting.set_lights(self._lights)
+        return lighting
+
+    def _further_lobe(self, number: int, mirror, view: View) -> GBufferTextures:
+        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
+        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
+            self._lobe_horizons = HorizonPass()
+        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
+
+    def _target(self, number: int, size):
+        """Texture and frame buffer that the technique `number` is drawn into."""
+        while len(self._targets) <= number:
+            self._targets.append(None)
+        if self._targets[number] is None or self._targets[number][2] != size:
+            texture = gpu.types.GPUTexture(size, format="RGBA32F")
+            self._targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
+        return self._targets[number][:2]
+
+    def read(self, number: int = 0) -> np.ndarray:
+        """The last picture (H, W, 4) of the first technique or the second, row 0 at the bottom."""
+        texture = self._targets[number][0]
+        buffer = texture.read()
+        buffer.dimensions = texture.width * texture.height * 4
+        return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+
+    def free(self) -> None:
+        """Let go of everything."""
+        for lighting in self._lighting.values():
+            lighting.free()
+        self._lighting.clear()
+        self._targets.clear()
+        self._surfaces.free()
+        for horizons in (self._horizons, self._lobe_horizons):
+            if horizons is not None:
+                horizons.free()
+        self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = self._lobe_horizons = None
+        self._drawn = self._uploaded = None
+
+
+def common_iors(mirror: SceneMirror) -> tuple[float, ...]:
+    """The constant indices of refraction of most instances, as the lighting pass takes them."""
+    counts: dict[float, int] = {}
+    for instance in mirror.instances:
+        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
+            value: Value = lobe.value("ior")
+            ior = round(200.0 * float(value.offset[0])) / 200.0
+            if value.is_constant and ior > 1.0:
+                counts[ior] = counts.get(ior, 0) + 1
+    return tuple(sorted(counts, key=counts.get, reverse=True)[:MOST_IORS]) or (1.5,)

@@ -1,0 +1,357 @@
+"""What the shaders read: samples, lights, tables and looks as textures and buffers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+
+import gpu
+import numpy as np
+
+from ...cycles import closures
+from ...cycles.lobes import LOBE_KINDS
+from ...scene import AreaLight, SurfaceSamples
+from ...shading import light_cone, moments32
+from ...shading.light_polygons import ROUND_CORNERS, ROUND_LIMITS
+from ...shading.lookup_table import LookupTable
+from ..materials.looks import COAT, IMAGE_SLOTS, Look
+from ..materials.values import EXTENSIONS, Value
+
+# Field of `GBufferTextures` by its name in shaders.
+SAMPLERS = {
+    "positions": "position",
+    "normals": "normal",
+    "bases": "base",
+    "f0s": "f0",
+    "f90s": "f90",
+    "dielectric_weights": "dielectric",
+    "geometric_normals": "geometric_normal",
+    "diffuse_normals": "diffuse_normal",
+    "smooth_normals": "smooth_normal",
+}
+
+
+@dataclass(frozen=True)
+class GBufferTextures:
+    """Textures of one size; see the module's docstring."""
+
+    position: gpu.types.GPUTexture
+    normal: gpu.types.GPUTexture
+    base: gpu.types.GPUTexture
+    f0: gpu.types.GPUTexture
+    f90: gpu.types.GPUTexture
+    dielectric: gpu.types.GPUTexture
+    geometric_normal: gpu.types.GPUTexture | None = None
+    diffuse_normal: gpu.types.GPUTexture | None = None
+    smooth_normal: gpu.types.GPUTexture | None = None
+
+    def __post_init__(self):
+        if self.diffuse_normal is None and self.smooth_normal is not None:
+            raise ValueError("G-buffer: smooth_normal without diffuse_normal, expected both")
+        sizes = {
+            field.name: (texture.width, texture.height)
+            for field in fields(self)
+            if (texture := getattr(self, field.name)) is not None
+        }
+        if len(set(sizes.values())) != 1:
+            raise ValueError(f"G-buffer: textures have the sizes {sizes}, expected one size for all")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.position.width, self.position.height
+
+
+def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:
+    """RGBA32F texture of values (H, W, 4), or an array texture of values (N, H, W, 4)."""
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    height, width = values.shape[-3:-1]
+    buffer = gpu.types.Buffer("FLOAT", values.size, values.reshape(-1))
+    layers = values.shape[0] if values.ndim == 4 else 0
+    return gpu.types.GPUTexture((width, height), layers=layers, format="RGBA32F", data=buffer)
+
+
+def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:
+    """Textures of `samples` (P), `width` wide, at `pixel` (P,), counted from the lower left; left out: in order."""
+    pixel = np.arange(len(samples)) if pixel is None else np.asarray(pixel)
+    height = -(-(int(pixel.max(initial=0)) + 1) // width)
+
+    def texture(vectors, scalars):
+        values = np.zeros((height * width, 4), np.float32)
+        values[pixel, :3] = vectors
+        values[pixel, 3] = scalars
+        return float_texture(values.reshape(height, width, 4))
+
+    dip = samples.specular_dip
+    bumped = (samples.smooth_normal != samples.diffuse_normal).any()
+    turned = bumped or (samples.diffuse_normal != samples.normal).any()
+    return GBufferTextures(
+        position=texture(samples.position, 1.0 + samples.receiver),
+        normal=texture(samples.normal, samples.roughness),
+        base=texture(samples.diffuse_albedo, samples.ior),
+        f0=texture(samples.specular_f0, dip[:, 0]),
+        f90=texture(samples.specular_f90, dip[:, 1]),
+        dielectric=texture(samples.dielectric, dip[:, 2]),
+        geometric_normal=texture(samples.geometric_normal, 0.0)
+        if (samples.geometric_normal != samples.normal).any()
+        else None,
+        diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
+        smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
+    )
+
+
+HEADER = 6
+WIDTH = 256
+DIFFUSE, SPECULAR, ROUND = 1, 2, 4
+_QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+
+
+def _circle(count):
+    """Corners (count, 2) of a regular polygon with the area of the unit circle, as in `AreaLight.polygon`."""
+    step = 2.0 * np.pi / count
+    angle = step * np.arange(count)
+    return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+# A polygon of the area of a circle has its second moments to 2e-3 with 8 corners, to 1.4e-4 with 16. Lobes that do not
+# see more than these, of lights that no horizon cuts, are as exact as with those of `light_polygons`: within 3e-5.
+_FEW_CORNERS, _FEW_LIMITS = (8, 16), (0.3, 1.5)
+_CIRCLES = (*_FEW_CORNERS, *ROUND_CORNERS)
+_NODES = tuple(sorted({effort.layers for effort in light_cone.EFFORTS}))
+_SHARED = [
+    _QUAD,
+    *(_circle(count) for count in _CIRCLES),
+    *(np.stack(light_cone.gauss_legendre(count), axis=1) for count in _NODES),
+]
+_FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
+QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
+# Texel of the first node by the number of nodes.
+NODES_FIRST = dict(zip(_NODES, _FIRST[1 + len(_CIRCLES) :], strict=True))
+FIRST_LIGHT = sum(len(part) for part in _SHARED)
+# Texel of the first corner, number of corners, and up to which reach in units of the lobe's width they are taken.
+ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, (*_FEW_LIMITS, *ROUND_LIMITS, np.inf), strict=True))
+
+
+def constants() -> dict[str, int]:
+    """What GLSL that reads the texture needs to know, by name."""
+    return {
+        "LIGHT_HEADER": HEADER,
+        "FIRST_LIGHT": FIRST_LIGHT,
+        "LIGHT_WIDTH": WIDTH,
+        "DIFFUSE_FLAG": DIFFUSE,
+        "SPECULAR_FLAG": SPECULAR,
+        "ROUND_FLAG": ROUND,
+    }
+
+
+def circle_first(count: int) -> int:
+    """Texel of the first of `count` corners of a circle."""
+    return _CIRCLE_FIRST[_CIRCLES.index(count)]
+
+
+def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
+    """Texels (H, `WIDTH`, 4) of `lights` in float32; lights without area have no part of it: see `visible_lights`."""
+    lights = list(lights)
+    headers, lists = [], []
+    place = FIRST_LIGHT + HEADER * len(lights)
+    for light in lights:
+        first, count, half_v, corners = _outline(light, place)
+        receivers = np.zeros((0, 1)) if light.receivers is None else np.array(light.receivers, float)[:, None]
+        headers.append(_header(light, first, count, half_v, place + len(corners)))
+        for part in (corners, receivers):
+            lists.append(np.pad(part, ((0, 0), (0, 4 - part.shape[1]))))
+            place += len(part)
+    shared = [np.pad(part, ((0, 0), (0, 2))) for part in _SHARED]
+    texels = np.concatenate([*shared, *headers, *lists])
+    rows = -(-len(texels) // WIDTH)
+    return np.pad(texels, ((0, rows * WIDTH - len(texels)), (0, 0))).reshape(rows, WIDTH, 4).astype(np.float32)
+
+
+def visible_lights(lights: Iterable[AreaLight]) -> list[AreaLight]:
+    """Those lights that have an area."""
+    return [light for light in lights if light.area_vector.any()]
+
+
+def _outline(light, place):
+    """First texel and number of corners, half_v so that corners run counterclockwise as seen from the lit side, and
+    the light's own corners (V, 2)."""
+    half_v = light.half_v
+    if light.shape == "POLYGON":
+        axes = np.stack([light.half_u, half_v], axis=1)
+        corners = np.linalg.lstsq(axes, (light.polygon() - light.center).T, rcond=None)[0].T
+        return place, len(corners), half_v, corners
+    if np.dot(light.area_vector, light.direction) < 0.0:
+        half_v = -half_v
+    own = np.zeros((0, 2))
+    return (0, 0, half_v, own) if light.is_round else (QUAD_FIRST, 4, half_v, own)
+
+
+def _header(light, first, count, half_v, first_receiver):
+    flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
+    receivers = -1 if light.receivers is None else len(light.receivers)
+    tangent, share = light_cone.cone(light.spread) if light.is_focused else (0.0, np.inf)
+    reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
+    return np.array([
+        [*light.center, first],
+        [*light.half_u, count],
+        [*half_v, flags],
+        [*light.direction, first_receiver],
+        [*light.radiance, receivers],
+        [tangent, 1.0 / share, reach, _bound(light)],
+    ])  # fmt: skip
+
+
+def _bound(light):
+    if light.shape != "POLYGON":
+        return 1.01
+    axes = np.stack([light.half_u, light.half_v], axis=1)
+    return 1.01 * np.abs(np.linalg.lstsq(axes, (light.corners - light.center).T, rcond=None)[0]).max()
+
+
+# Indices of refraction per unit in the texture of the dielectrics' weights; those of the shipped tables are among them.
+IOR_STEPS = 200
+
+
+def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
+    """Texels (N, R, T, 4) in float32, with one more curve for every index of refraction of `iors`."""
+    ridges = moments32.along_directions(table)
+    rows, columns, parameters = table.warp.shape
+    vectors = (*range(len(ridges.weights)), *(("dielectric", float(ior)) for ior in iors))
+    channels = ridges.channels(vectors)
+    parts = [channels[:parameters], *np.split(channels[parameters:], len(vectors))]
+    padded = np.concatenate([np.pad(part, ((0, -len(part) % 4), (0, 0))) for part in parts])
+    return padded.reshape(-1, 4, rows, columns).transpose(0, 2, 3, 1)
+
+
+def dielectric_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
+    """Texels (S, 2, 4), column x for the index of refraction 1 + y / `IOR_STEPS`, y the row: weights of the table's
+    first four curves and, in the second texel, of the fifth; its w is 1 + n where the index is number n of `iors`.
+    """
+    count = table.fresnel_weights.shape[1]
+    if count > 7:
+        raise ValueError(f"table {table.name} has {count} Fresnel curves, the graphics card's path takes up to 7")
+    grid = 1.0 + np.arange(round((float(table.fresnel_ior[-1]) - 1.0) * IOR_STEPS) + 1) / IOR_STEPS
+    texels = np.zeros((len(grid), 8), np.float32)
+    texels[:, :count] = table.dielectric_weights(grid).T
+    for number, ior in enumerate(iors):
+        nearest = round((ior - 1.0) * IOR_STEPS)
+        if 0 <= nearest < len(grid) and abs(grid[nearest] - ior) < 1e-6:
+            texels[nearest, 7] = 1.0 + number
+    return texels.reshape(len(grid), 2, 4)
+
+
+MOST_LOOPS = 40000
+
+
+@dataclass(frozen=True)
+class UploadedLights:
+    """Lights that have an area, and their texture."""
+
+    lights: tuple[AreaLight, ...]
+    texture: gpu.types.GPUTexture
+
+
+def upload_lights(lights: Iterable[AreaLight]) -> UploadedLights:
+    """`lights` on the card; needs an active GPU context."""
+    visible = tuple(visible_lights(lights))
+    return UploadedLights(visible, float_texture(light_texels(visible)))
+
+
+def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
+    """The lights (first, end) of each draw call, of which each goes round as many `loops`: llvmpipe breaks off those
+    of a pixel that go round more than 65535 times, and other cards do not like long ones. The first call is there
+    without lights, too."""
+    number = np.cumsum([0, *loops[:-1]]) // MOST_LOOPS if len(loops) else np.zeros(0)
+    starts = [0, *(np.nonzero(np.diff(number))[0] + 1).tolist(), len(loops)]
+    return list(zip(starts[:-1], starts[1:], strict=True))
+
+
+# In units of vec4: where slots start, the size of one, where the terms of conductors and where the coat starts, all.
+FIRST_SLOT, SLOT_SIZE = 3, 6
+FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
+LAYERS = FIRST_TERM + 5
+LOOK_SIZE = LAYERS + 3
+VIEW_FACTORS = {"fresnel": 1, "facing": 2}
+KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
+DEFINES = {
+    **{name.upper(): str(int(number)) for name, number in KINDS.items()},
+    **{"FIRST_SLOT": str(FIRST_SLOT), "SLOT_SIZE": str(SLOT_SIZE), "FIRST_TERM": str(FIRST_TERM)},
+    "LAYERS": str(LAYERS),
+}
+
+
+def uniform_buffer(values: np.ndarray) -> gpu.types.GPUUniformBuf:
+    """A uniform buffer of values (N, 4)."""
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", values.size, values.ravel()))
+
+
+def look_values(look: Look) -> np.ndarray:
+    """The uniform buffer (LOOK_SIZE, 4) of a look."""
+    data = np.zeros((LOOK_SIZE, 4))
+    flags = (look.normal is not None) + 2 * look.corrected
+    data[0] = KINDS[look.kind], look.scattered, flags, look.normal_strength
+    data[1] = *look.emission, look.value("transmission").offset[0]
+    data[2] = *look.value("tint").offset, look.value("specular_level").offset[0]
+    for position, name in enumerate(IMAGE_SLOTS):
+        value = look.normal if name == "normal" else look.value(name)
+        if value is not None:
+            start = FIRST_SLOT + SLOT_SIZE * position
+            data[start : start + SLOT_SIZE] = _slot_values(value)
+    data[LAYERS, 0] = look.weight
+    if look.view_factor is not None:
+        factor = look.view_factor
+        data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
+    if look.coat is not None:
+        data[LAYERS, 1:] = look.coat.weight, look.coat.roughness, look.coat.ior
+        data[LAYERS + 1] = *look.coat.tint, look.coat.follows_normal
+    if look.kind.startswith("conductor"):
+        exact = look.kind == "conductor"
+        index, extinction = look.value("color").offset[None], np.maximum(look.value("tint").offset, 0.0)[None]
+        data[FIRST_TERM : FIRST_TERM + 4, :3] = np.stack(closures.conductor_fit(index, extinction, exact))[:, 0]
+        data[FIRST_TERM + 4, :3] = closures.conductor_average(index, extinction, exact)[0]
+    return data
+
+
+def _slot_values(value: Value) -> np.ndarray:
+    rows = np.zeros((SLOT_SIZE, 4))
+    rows[3, :3] = value.offset
+    if value.image is not None:
+        use = value.image
+        rows[:3], rows[3, 3] = value.matrix, 1.0
+        rows[4:6, :3] = use.mapping
+        rows[4, 3] = use.closest
+        rows[5, 3] = EXTENSIONS.index(use.extension) + 4 * is_encoded(use.image)
+    return rows
+
+
+def is_encoded(image) -> bool:
+    """True for images that Cycles interpolates before it makes them linear."""
+    return not image.is_float and image.colorspace_settings.name == "sRGB"
+
+
+def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
+    """R32F texture of values (H, W), row 0 first."""
+    values = np.ascontiguousarray(values, dtype=np.float32)
+    buffer = gpu.types.Buffer("FLOAT", values.size, values.ravel())
+    return gpu.types.GPUTexture(values.shape[::-1], format="R32F", data=buffer)
+
+
+def albedo_table() -> np.ndarray:
+    """(33, 32): directional albedo of GGX by roughness and cosine, then its average by roughness."""
+    nodes = np.linspace(0.0, 1.0, closures.ALBEDO_NODES)
+    roughness, cosine = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
+    directional, _ = closures.albedos(roughness, cosine)
+    _, average = closures.albedos(nodes, np.ones_like(nodes))
+    return np.vstack([directional.reshape(len(nodes), -1), average])
+
+
+def blend_table() -> np.ndarray:
+    """(256, 16): where between f0 and 1 the albedo of a dielectric lies, rows by roughness and cosine."""
+    count = closures.GLASS_NODES
+    nodes = np.linspace(0.0, 1.0, count)
+    roughness, cosine, coordinate = (axis.ravel() for axis in np.meshgrid(nodes, nodes, nodes, indexing="ij"))
+    f0 = np.minimum(coordinate**4, closures.MAX_F0)
+    ior = (1.0 + np.sqrt(f0)) / (1.0 - np.sqrt(f0))
+    share = closures.dielectric_albedo(np.zeros((len(ior), 1)), ior, roughness, cosine)[:, 0]
+    return share.reshape(count * count, count)

@@ -1,0 +1,164 @@
+"""The command line, the same for `python -m ltsh_addon` and `blender --command ltsh`.
+
+Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the arguments are; 130 interrupted by Ctrl-C;
+143 ended by SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import logging
+import re
+import shlex
+import sys
+
+from .. import interruption
+from ..pipeline.tasks import NameClash
+from ..scene import VERSION, Cancelled
+from ..shading import TableError
+from .arguments import Misuse
+from .commands import add_bake, add_compare, add_demo, add_merge, add_run, add_shade, add_tables
+from .job_file import Mistakes
+from .output import print_json
+from .progress import ProgressBar, RunLog
+
+EXAMPLES = """examples:
+  %(prog)s demo -o out/demo
+  %(prog)s compare room.blend -o out/room --resolution 960x540 --cycles-samples 1024
+  %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
+  %(prog)s bake room.blend -o out/room --object Floor --size 2048 --error
+  %(prog)s compare room.blend -o out/room --frames 1-240 --shard 1/4 --resume
+  %(prog)s merge out/room
+  %(prog)s run night.toml
+
+exit codes: 0 done; 1 a file, scene or folder is wrong; 2 the arguments are; 130 Ctrl-C; 143 SIGTERM
+"""
+
+
+def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None, bar=None) -> int:
+    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code.
+
+    `bar` shows progress in place of a ProgressBar on stderr.
+    """
+    try:
+        with interruption.raised(program):
+            return _main(arguments, program, open_file, bar)
+    except KeyboardInterrupt as error:
+        lines = [f"{program}: {interruption.message(error)}"]
+        return _fail("--json" in arguments, bar or ProgressBar(sys.stderr), lines, interruption.exit_code(error))
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong with arguments in one line."""
+
+    def error(self, message):
+        raise Misuse(f"{self.prog}: {message}; see {self.prog} --help")
+
+
+def _main(arguments, program, open_file, bar) -> int:
+    try:
+        options = _parsed(program, arguments)
+    except SystemExit as stop:  # argparse has printed help
+        return int(stop.code or 0)
+    except Misuse as error:
+        return _fail("--json" in arguments, bar or ProgressBar(sys.stderr), [str(error)], 2)
+    try:
+        log = RunLog(options.log)
+    except OSError as error:
+        return _fail(getattr(options, "json", False), bar or ProgressBar(sys.stderr), [f"{program}: {error}"], 1)
+    with log:
+        log.line(f"{program} {shlex.join(arguments)}")
+        bar = bar or ProgressBar(sys.stderr, quiet=options.quiet, log=log)
+        code = _run(options, program, bar, open_file)
+        log.line(f"exit code {code}")
+    return code
+
+
+def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
+    try:
+        return options.run(options, bar, open_file)
+    except (Exception, KeyboardInterrupt) as error:
+        lines, code = _explained(error)
+        return _fail(getattr(options, "json", False), bar, [f"{program}: {line}" for line in lines], code)
+
+
+def _explained(error) -> tuple[list[str], int]:
+    """What is to be said about an error, and the exit code."""
+    from ..blender.process import blender_process
+
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, Mistakes):
+        return error.lines, 1 if error.of_the_world else 2
+    if isinstance(error, Misuse | NameClash):
+        return [text], 2
+    if isinstance(error, KeyboardInterrupt):
+        return [interruption.message(error)], interruption.exit_code(error)
+    if not isinstance(
+        error, TableError | OSError | ValueError | ImportError | Cancelled | MemoryError | blender_process.SceneError
+    ):
+        logging.getLogger(__name__).error("unexpected error", exc_info=error)
+        text = f"unexpected error: {type(error).__name__}: {text}"
+    return [text], 1
+
+
+def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
+    """Say what is wrong on stderr, and on stdout where a document is expected there; the exit code."""
+    for line in lines:
+        bar.note(line)
+    if as_json:
+        print_json({"errors": lines})
+    return code
+
+
+def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
+    """What the arguments mean. Raises Misuse, with what may have been meant."""
+    parser, commands = _parser(program)
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
+        hint = _similar(arguments[0], commands) or f"expected one of {', '.join(commands)}"
+        raise Misuse(f"{program}: command {arguments[0]!r} is unknown ({hint}); see {program} --help")
+    options, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        raise Misuse(_unknown_argument(options, unknown, commands))
+    return options
+
+
+def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
+    """What is wrong with arguments that the command does not have."""
+    program = commands[options.command].prog
+    name = next((word.partition("=")[0] for word in unknown if word.startswith("-")), None)
+    if name is None:
+        hint = " (name all files one after another)" if getattr(options, "scenes", None) else ""
+        return f"{program}: {unknown[0]!r} is not expected here{hint}; see {program} --help"
+    known = {command: re.findall(r"--[\w-]+", parser.format_help()) for command, parser in commands.items()}
+    owners = [command for command, names in known.items() if name in names]
+    hint = f"an option of {', '.join(owners)}" if owners else _similar(name, known[options.command])
+    return f"{program}: option {name} is unknown here{f' ({hint})' if hint else ''}; see {program} --help"
+
+
+def _similar(name: str, known) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"did you mean {near[0]}?" if near else ""
+
+
+def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
+    """The parser, and those of the commands by name."""
+    parser = _Parser(
+        prog=program,
+        description="Shade scenes under area lights with linearly transformed lobes and compare with Cycles.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for name, add, meaning in (
+        ("demo", add_demo, "build the example scene and run compare on it"),
+        ("compare", add_compare, "techniques beside Cycles: EXR, sheet, report"),
+        ("shade", add_shade, "shade per pixel of the camera"),
+        ("bake", add_bake, "bake lighting and errors into the texels of UV maps"),
+        ("run", add_run, "do the jobs of a file"),
+        ("merge", add_merge, "assemble the report of what shards have done"),
+        ("tables", add_tables, "fit, validate or export the lookup tables"),
+    ):
+        add(commands.add_parser(name, help=meaning))
+    return parser, commands.choices

@@ -1,0 +1,199 @@
+"""What the command line says meanwhile: a bar, lines of a log."""
+
+from __future__ import annotations
+
+import json
+import time
+from datetime import datetime
+from pathlib import Path
+
+
+class RunLog:
+    """Lines for the file `path`; without one they go nowhere. A context, which closes it. Raises OSError."""
+
+    def __init__(self, path: Path | None):
+        try:
+            # Unbuffered, so that a line is one write, however long: several shards may write to one log.
+            self._file = None if path is None else open(path, "ab", buffering=0)
+        except OSError as error:
+            raise OSError(f"log {path}: cannot be written ({error.strerror}); choose another with --log") from error
+
+    def __enter__(self) -> RunLog:
+        return self
+
+    def __exit__(self, *exception) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def line(self, text: str) -> None:
+        """Append a line, with the time."""
+        if self._file is not None:
+            stamp = datetime.now().astimezone().isoformat(timespec="seconds")
+            # Names of files may hold bytes that are no UTF-8.
+            self._file.write(f"{stamp} {' '.join(text.split())}\n".encode(errors="backslashreplace"))
+
+
+BAR_WIDTH = 28
+LOG_INTERVAL = 10.0  # seconds
+
+
+class ProgressBar:
+    """Callable as progress(stage, fraction); `finish` ends the line.
+
+    Of a job with several tasks, announced by `begin_task`, it shows where the job stands, and the stage beside it.
+    """
+
+    def __init__(self, stream, *, quiet: bool = False, log: RunLog | None = None):
+        self._stream = stream
+        self.log = log or RunLog(None)
+        self._task, self._tasks = 0, 1
+        self._quiet = quiet or stream is None  # print would take None for stdout
+        self._terminal = bool(getattr(stream, "isatty", lambda: False)())
+        self._stage = None
+        self._stage_start = 0.0
+        self._fraction = 0.0
+        self._last_shown = 0.0
+        self._line_open = False
+
+    def __call__(self, stage: str, fraction: float) -> bool:
+        """Show where `stage` stands, fraction in [0, 1]; returns True: a bar never stops the work."""
+        if self._quiet:
+            return True
+        now = time.monotonic()
+        if self._tasks > 1:
+            if self._terminal and now - self._last_shown > 0.1:
+                self._last_shown = now
+                self._draw(f"{self._task} of {self._tasks} {stage}", (self._task - 1) / self._tasks, now)
+            return True
+        if stage != self._stage:
+            if self._line_open and self._fraction < 1.0:  # many stages end without a last word
+                self._draw(self._stage, 1.0, now)
+            self.finish()
+            self._stage, self._stage_start, self._last_shown = stage, now, -1e9
+        self._fraction = fraction
+        ended = fraction >= 1.0
+        if self._terminal:
+            if ended or now - self._last_shown > 0.1:
+                self._last_shown = now
+                self._draw(stage, fraction, now)
+        elif ended or now - self._last_shown > LOG_INTERVAL:
+            self._last_shown = now
+            print(f"{stage}: {100.0 * fraction:.0f} % {self._remaining(fraction, now)}".rstrip(), file=self._stream)
+        return True
+
+    def begin_job(self, label: str) -> None:
+        """Another job begins: a line, unless quiet."""
+        self.finish()
+        self._tasks, self._stage = 1, None
+        self.log.line(label)
+        if not self._quiet:
+            say(label, self._stream)
+
+    def begin_task(self, number: int, tasks: int) -> None:
+        """Task `number`, from 1, of so many begins."""
+        if number == 1:
+            self.finish()
+            self._stage_start = time.monotonic()
+        self._task, self._tasks = number, tasks
+
+    def end_task(self, name: str, seconds: float, failed: bool = False) -> None:
+        """The task has ended; where the stream is no terminal, that is a line."""
+        name = f"{name} failed" if failed else name
+        self.log.line(f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s")
+        if self._quiet or self._tasks == 1:
+            return
+        now, share = time.monotonic(), self._task / self._tasks
+        if self._terminal:
+            self._draw(f"{self._task} of {self._tasks} {name}", share, now)
+        else:
+            left = "" if self._task == self._tasks else self._remaining(share, now)
+            text = f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s {left}".rstrip()
+            say(text, self._stream)
+            self._stream.flush()
+        if self._task == self._tasks:
+            self.finish()
+            self._tasks = 1
+
+    def remark(self, text: str) -> None:
+        """Print a line, unless quiet, and log it."""
+        self.finish()
+        self.log.line(text)
+        if not self._quiet:
+            say(text, self._stream)
+
+    def note(self, text: str) -> None:
+        """Print a line that is no progress, also when quiet, and log it."""
+        self.finish()
+        say(text, self._stream)
+        self.log.line(text)
+
+    def _draw(self, stage, fraction, now):
+        filled = round(min(max(fraction, 0.0), 1.0) * BAR_WIDTH)
+        bar = "#" * filled + "-" * (BAR_WIDTH - filled)
+        text = f"{stage:<24.24} [{bar}] {100.0 * fraction:3.0f} % {self._remaining(fraction, now)}"
+        self._stream.write(f"\r{text:<79}")
+        self._stream.flush()
+        self._line_open = True
+
+    def _remaining(self, fraction, now) -> str:
+        elapsed = now - self._stage_start
+        if fraction >= 1.0:
+            return f"({elapsed:.1f} s)"
+        if elapsed < 1.0 or fraction < 0.02:
+            return ""
+        return f"({duration(elapsed / fraction - elapsed)} left)"
+
+    def finish(self) -> None:
+        """End the current line, so that what follows starts on its own."""
+        if self._line_open:
+            self._stream.write("\n")
+            self._stream.flush()
+            self._line_open = False
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people read them: 40 s, 12 min, 3.3 h."""
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"
+
+
+def say(text: str, stream) -> None:
+    """Print to `stream`, which is None when it was closed; letters that its encoding lacks are spelled out."""
+    if stream is not None:
+        encoding = stream.encoding or "ascii"
+        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
+
+
+MESSAGE = "LTSH "
+REPORT_SECONDS = 0.1
+
+
+class LineProgress(ProgressBar):
+    """Progress as messages on a stream, a few per second.
+
+    `notes` are what the commands had to say besides.
+    """
+
+    def __init__(self, stream):
+        super().__init__(None)
+        self._messages, self._last = stream, 0.0
+        self.notes: list[str] = []
+
+    def __call__(self, stage: str, fraction: float) -> bool:
+        now = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._last = stage, 0.0
+        if fraction >= 1.0 or now - self._last >= REPORT_SECONDS:
+            self._last = now
+            self.send({"stage": stage, "fraction": fraction})
+        return True
+
+    def note(self, text: str) -> None:
+        """Keep the line."""
+        self.notes.append(text)
+
+    def send(self, document: dict) -> None:
+        """One message; all of it or, where the reader is gone, nothing."""
+        self._messages.write(MESSAGE + json.dumps(document) + "\n")
+        self._messages.flush()

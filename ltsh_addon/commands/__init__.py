@@ -1,1 +1,0 @@
-"""The command line's commands: their arguments, and what is printed."""

@@ -1,1 +1,0 @@
-"""Techniques beside Cycles: the whole way from a .blend to images, errors and a report."""

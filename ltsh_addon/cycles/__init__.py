@@ -1,0 +1,1 @@
+"""How Cycles shades, in numpy: closures, normals, horizons, G-buffers, UV rasters. Nothing here knows Blender."""

@@ -1,0 +1,94 @@
+"""From the channels that a 1-sample Cycles render wrote to `SurfaceSamples` and `Film`. Needs no bpy.
+
+Cycles evaluates every texture, bump map and node group itself; the values arrive through the AOVs of `aovs`, one hit
+per pixel and file, so nothing is averaged across an edge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..scene import FARTHEST, Film, SurfaceSamples
+from .horizons import unit
+from .lobes import HIT_AOVS, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
+
+# Arrays of one block stay in the cache.
+HITS_PER_BLOCK = 65536
+
+
+def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tuple[SurfaceSamples, np.ndarray, int]:
+    """Samples (P) of one render, the pixel (P,) of each (row by row from the top left), and how many were unusable.
+
+    The samples of a hit, one for each of its lobes, follow one another. `diffuse_color` is the name of the pass with
+    the diffuse albedo. Unusable are hits whose ray met several surfaces (transparency adds the AOVs of both) and hits
+    with values that are not finite or too far away.
+    """
+    hit = read_aov(channels, "hit").ravel()
+    pixel = np.flatnonzero(hit != 0.0)
+
+    def picked(plane):
+        return plane.reshape(hit.size, *plane.shape[2:])[pixel].astype(np.float64)
+
+    values = {name: picked(read_aov(channels, name)) for name in HIT_AOVS}
+    values["albedo"] = picked(read_layer(channels, diffuse_color, "RGB"))
+    lobes = [
+        {name: picked(read_aov(channels, lobe_aov(name, slot))) for name in names}
+        for slot, names in enumerate(lobe_names(channels))
+    ]
+    usable = np.abs(values["hit"] - 1.0) < 1e-6
+    for value in (*values.values(), *(value for lobe in lobes for value in lobe.values())):
+        usable &= np.isfinite(value) if value.ndim == 1 else np.isfinite(value).all(axis=-1)
+    usable &= np.linalg.norm(values["incoming"], axis=-1) > 0.5
+    usable &= np.abs(values["position"]).max(axis=-1) <= FARTHEST
+    pieces, index, usable = [], [], np.flatnonzero(usable)
+    for start in range(0, max(len(usable), 1), HITS_PER_BLOCK):
+        block = usable[start : start + HITS_PER_BLOCK]
+        hits = _hits_of({name: value[block] for name, value in values.items()})
+        samples, of_block = samples_of_lobes(
+            hits, [{name: value[block] for name, value in lobe.items()} for lobe in lobes]
+        )
+        pieces.append(samples)
+        index.append(block[of_block])
+    return joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
+
+
+def joined(pieces: list[SurfaceSamples]) -> SurfaceSamples:
+    """The samples of all `pieces`, one after another."""
+    names = pieces[0].__dataclass_fields__
+    return SurfaceSamples(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
+
+
+def _hits_of(values: dict[str, np.ndarray]) -> Hits:
+    return Hits(
+        position=values["position"],
+        view=unit(values["incoming"]),
+        smooth_normal=unit(values["smooth_normal"]),
+        true_normal=unit(values["true_normal"]),
+        corrected=values["correct_normal"] > 0.5,
+        receiver=np.rint(values["receiver"]).astype(np.int32),
+        diffuse_albedo=values["albedo"],
+    )
+
+
+def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
+    """Take the hits on holdouts out of the `channels` of a render with an opaque background.
+
+    Cycles evaluates the shaders of holdouts, AOVs included, and then shows a hole; nothing else has alpha 0.
+    """
+    read_aov(channels, "hit")[read_layer(channels, "Combined", "A") == 0.0] = 0.0
+
+
+def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
+    """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV."""
+    depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")
+    return int(np.count_nonzero((depth < 1e9) & (read_aov(channels, "hit") == 0.0)))
+
+
+def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:
+    """All samples of `renders` (samples, pixel), one per sub-sample, and the film they lie on."""
+    pixel = np.concatenate([pixel for _, pixel in renders])
+    # A render has one hit per pixel, whose samples follow one another.
+    of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]
+    of_hit = np.concatenate(of_hit)
+    first = None if of_hit.all() else of_hit
+    return joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)

@@ -1,0 +1,462 @@
+"""Lobes of a surface as AOVs carry them, and the samples that they make."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+
+from ..scene import SurfaceSamples
+from . import closures
+from .closures import sheen_albedo
+from .horizons import bump_alpha2, unit, valid_specular_normal
+
+AOV_PREFIX = "ltsh_"
+MAX_LOBES = 8
+# Name of the quantity -> type of the AOV.
+HIT_AOVS = {
+    "hit": "VALUE",  # 1 where a surface was hit
+    "receiver": "VALUE",  # `AreaLight.receivers`
+    "correct_normal": "VALUE",  # 1 where Cycles bends specular normals (use_bump_map_correction)
+    "position": "COLOR",
+    "incoming": "COLOR",  # towards the camera
+    "smooth_normal": "COLOR",
+    "true_normal": "COLOR",
+}
+# Name of the quantity -> type of the AOV, and the value that changes nothing: an AOV that no material needs is left out
+# (None: never left out).
+LOBE_AOVS = {
+    "kind": ("VALUE", 0.0),  # one of LOBE_KINDS
+    "weight": ("VALUE", 1.0),  # product of the factors of mixes
+    "normal": ("COLOR", (0.0, 0.0, 0.0)),  # the Normal socket; zero: the smooth normal
+    "color": ("COLOR", None),  # of conductors the refractive index
+    "roughness": ("VALUE", None),
+    "metallic": ("VALUE", 0.0),
+    "ior": ("VALUE", 1.5),
+    "specular_level": ("VALUE", 0.5),
+    "tint": ("COLOR", (1.0, 1.0, 1.0)),  # of conductors the extinction coefficient
+    "multiple_scattering": ("VALUE", 0.0),  # 1 for Multiscatter GGX
+    "transmission": ("VALUE", 0.0),
+    "backfacing": ("VALUE", 0.0),
+    "sheen_weight": ("VALUE", 0.0),
+    "sheen_tint": ("COLOR", (1.0, 1.0, 1.0)),
+    "sheen_roughness": ("VALUE", 0.5),
+    "coat_weight": ("VALUE", 0.0),
+    "coat_roughness": ("VALUE", 0.03),
+    "coat_ior": ("VALUE", 1.5),
+    "coat_tint": ("COLOR", (1.0, 1.0, 1.0)),
+    "coat_normal": ("COLOR", (0.0, 0.0, 0.0)),
+}
+LOBE_KINDS = {
+    "none": 0.0,
+    "principled": 1.0,
+    "glossy": 2.0,
+    "diffuse": 3.0,
+    "translucent": 4.0,
+    "metal": 5.0,
+    "conductor": 6.0,
+    "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
+    "glass": 8.0,
+    "sheen": 9.0,
+}
+
+
+def lobe_aov(name: str, slot: int) -> str:
+    """The AOV of the quantity `name` of LOBE_AOVS in a slot."""
+    return f"{name}_{slot}"
+
+
+def aov_kind(name: str) -> str:
+    """Type of an AOV: of HIT_AOVS, or as `lobe_aov` names it."""
+    return HIT_AOVS[name] if name in HIT_AOVS else LOBE_AOVS[name.rpartition("_")[0]][0]
+
+
+def read_layer(channels: dict[str, np.ndarray], name: str, components: str) -> np.ndarray:
+    """Pass `name` as (H, W) float32, or (H, W, 3) for three components, from EXR `channels` of one view layer.
+
+    Blender writes `<view layer>.<pass>.<component>`; the view layer's name is of no interest.
+    """
+    planes = []
+    for component in components:
+        suffix = f".{name}.{component}"
+        found = [key for key in channels if key.endswith(suffix) or key == suffix[1:]]
+        if len(found) != 1:
+            raise ValueError(
+                f"render result: {len(found)} channels named {suffix[1:]!r}, expected one; found {sorted(channels)}"
+            )
+        planes.append(channels[found[0]])
+    return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
+
+
+def read_aov(channels: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """The AOV `name` (see `aov_kind`): (H, W) or (H, W, 3) float32."""
+    return read_layer(channels, AOV_PREFIX + name, "RGB" if aov_kind(name) == "COLOR" else "X")
+
+
+def lobe_names(channels: dict[str, np.ndarray]) -> list[list[str]]:
+    """For each slot in EXR `channels` the names of LOBE_AOVS that were written."""
+    written = {key.rpartition(".")[0].rpartition(AOV_PREFIX)[2] for key in channels if AOV_PREFIX in key}
+    slots = [[name for name in LOBE_AOVS if lobe_aov(name, slot) in written] for slot in range(MAX_LOBES)]
+    return [names for names in slots if names]
+
+
+# Below this weight Cycles drops a closure.
+SMALLEST_WEIGHT = 1e-5
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What each of P hits has once."""
+
+    position: np.ndarray  # (P, 3)
+    view: np.ndarray  # (P, 3)
+    smooth_normal: np.ndarray  # (P, 3)
+    true_normal: np.ndarray  # (P, 3)
+    corrected: np.ndarray  # (P,) bool: specular normals are bent
+    receiver: np.ndarray  # (P,) integers
+    diffuse_albedo: np.ndarray | None  # (P, 3) of all lobes together; None: as estimated from each lobe's own
+
+    def take(self, index) -> Hits:
+        """The hits at `index`."""
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
+
+
+class LobeSlot:
+    """The hits (Q,) that have a lobe in one slot, and its quantities there."""
+
+    def __init__(self, hits: Hits, lobe, index, weight):
+        self.lobe, self.index, self.weight = lobe, index, weight
+        self.hits = hits.take(index)
+        self.kind = np.rint(lobe["kind"][index]).astype(int)
+        self.normal = self._normal("normal")
+        self.specular_normal = self._bent(self.normal)
+        self.roughness = np.clip(self.value("roughness", 1.0), 0.0, 1.0)
+
+    def value(self, name: str, default=None) -> np.ndarray:
+        """The quantity `name`, or what changes nothing, or `default` where there is no such value."""
+        if name in self.lobe:
+            return self.lobe[name][self.index]
+        kind, neutral = LOBE_AOVS[name]
+        neutral = default if neutral is None else neutral
+        return np.broadcast_to(np.float64(neutral), (len(self.index), 3) if kind == "COLOR" else (len(self.index),))
+
+    def has(self, name: str) -> bool:
+        """True where some sample has more than a vanishing `name`."""
+        return name in self.lobe and bool((self.value(name) > SMALLEST_WEIGHT).any())
+
+    def of(self, kind: str) -> np.ndarray:
+        """Mask (Q, 1) of a kind of lobe."""
+        return (self.kind == LOBE_KINDS[kind])[:, None]
+
+    def _normal(self, name):
+        normal = unit(self.value(name))
+        return np.where(np.any(normal != 0.0, axis=-1, keepdims=True), normal, self.hits.smooth_normal)
+
+    def _bent(self, normal):
+        bent = valid_specular_normal(normal, self.hits.true_normal, self.hits.view)
+        return np.where(self.hits.corrected[:, None], bent, normal)
+
+    def coat_normal(self) -> np.ndarray:
+        """Shading normal (Q, 3) of the coat."""
+        return self._bent(self._normal("coat_normal"))
+
+    def sheen_normal(self) -> np.ndarray:
+        """Shading normal (Q, 3) of the sheen: that of the base, and under a coat partly that of the coat."""
+        coat = np.clip(self.value("coat_weight"), 0.0, 1.0)[:, None]
+        return unit((1.0 - coat) * self.normal + coat * self.coat_normal())
+
+    def cosine(self, normal) -> np.ndarray:
+        """Cosine (Q,) of the view."""
+        return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
+
+    @cached_property
+    def color(self) -> np.ndarray:
+        """(Q, 3), never negative."""
+        return np.maximum(self.value("color", 0.0), 0.0)
+
+    @cached_property
+    def metallic(self) -> np.ndarray:
+        """Share (Q,) of the metal."""
+        clipped = np.clip(self.value("metallic"), 0.0, 1.0)
+        return np.where(self.of("metal")[:, 0], 1.0, np.where(self.of("principled")[:, 0], clipped, 0.0))
+
+    @cached_property
+    def transmission(self) -> np.ndarray:
+        """Share (Q,) of the transmission in what is no metal."""
+        return np.where(self.of("principled")[:, 0], np.clip(self.value("transmission"), 0.0, 1.0), 0.0)
+
+    @cached_property
+    def albedos(self) -> tuple[np.ndarray, np.ndarray]:
+        """Directional and average albedo (Q,) of the lobe without Fresnel."""
+        return closures.albedos(self.roughness, self.cosine(self.specular_normal))
+
+    def scattered(self, mean: np.ndarray) -> np.ndarray:
+        """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 where there is none."""
+        if not self.has("multiple_scattering"):
+            return np.ones_like(mean)
+        factor = closures.multiple_scattering(mean, *self.albedos)
+        return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
+
+
+SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
+
+
+@dataclass
+class _Part:
+    """Samples of one kind at the hits `index` (Q,); what is left out is zero or that of the hit."""
+
+    index: np.ndarray
+    normal: np.ndarray  # (Q, 3) of the specular lobe
+    diffuse_normal: np.ndarray
+    roughness: np.ndarray
+    ior: np.ndarray
+    specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, dip, dielectric
+    diffuse: np.ndarray = field(default=None)  # (Q, 3) estimate of the diffuse albedo
+    behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is that of the other side
+
+    def __post_init__(self):
+        count = len(self.index)
+        self.specular = np.zeros((4, count, 3)) if self.specular is None else self.specular
+        self.diffuse = np.zeros((count, 3)) if self.diffuse is None else self.diffuse
+        self.behind = np.zeros(count, dtype=bool) if self.behind is None else self.behind
+
+
+def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[SurfaceSamples, np.ndarray]:
+    """Samples and the hit (S,) of each, those of a hit one after another: the lobes with a weight, at least one.
+
+    `lobes` has for each slot the quantities of LOBE_AOVS that were written, (P,) or (P, 3).
+    """
+    slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
+    parts_of_slots = [_parts_of(slot) for slot in slots]
+    parts = [part for own in parts_of_slots for part in own]
+    for slot, own in zip(slots, parts_of_slots, strict=True):
+        if slot.has("sheen_weight"):
+            _put_under_sheen(hits, slot, own, parts)
+    bare = np.ones(len(hits.position), dtype=bool)
+    for part in parts:
+        bare[part.index] = False
+    return _joined(hits, [*parts, _bare_part(hits, np.nonzero(bare)[0])])
+
+
+def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples of all parts and the hit of each, in the order of the hits."""
+    index = np.concatenate([part.index for part in parts])
+    order = np.argsort(index, kind="stable")
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])[order]
+        for name in ("normal", "diffuse_normal", "roughness", "ior", "diffuse", "behind")
+    }
+    specular = np.concatenate([part.specular for part in parts], axis=1)[:, order]
+    index, behind = index[order], joined["behind"]
+    at_hit = hits.take(index)
+    smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
+    samples = SurfaceSamples(
+        position=at_hit.position,
+        view=at_hit.view,
+        normal=joined["normal"],
+        diffuse_normal=joined["diffuse_normal"],
+        roughness=joined["roughness"],
+        **dict(zip(SPECULAR_FIELDS, specular, strict=True)),
+        ior=joined["ior"],
+        diffuse_albedo=joined["diffuse"]
+        if hits.diffuse_albedo is None
+        else _split(hits.diffuse_albedo, joined["diffuse"], index),
+        geometric_normal=at_hit.true_normal,
+        smooth_normal=smooth_normal,
+        receiver=at_hit.receiver,
+        bump_alpha2=np.where(at_hit.corrected, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
+    )
+    return samples, index
+
+
+def _split(albedo: np.ndarray, estimate: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """The diffuse albedo (S, 3) of each sample: that of its hit (P, 3) in proportion to the `estimate` (S, 3).
+
+    The sum over a hit's samples stays what Cycles says; where no sample expects any, the first gets it.
+    """
+    count = len(albedo)
+    sums = np.stack([np.bincount(index, weights=column, minlength=count) for column in estimate.T], axis=-1)[index]
+    first = np.concatenate([[True], index[1:] != index[:-1]])[:, None] if len(index) else np.ones((0, 1), dtype=bool)
+    share = np.divide(estimate, sums, out=np.where(first, 1.0, np.zeros_like(estimate)), where=sums > 0.0)
+    return share * albedo[index]
+
+
+def _bare_part(hits, index) -> _Part:
+    """Hits on surfaces without a lobe."""
+    normal = hits.smooth_normal[index]
+    ones = np.ones(len(index))
+    return _Part(index, normal, normal, ones, ones)
+
+
+def _slot_of(hits: Hits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
+    """The hits that have a lobe in one slot, or None."""
+    weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
+    index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
+    return LobeSlot(hits, lobe, index, weight[index]) if len(index) else None
+
+
+def _parts_of(slot: LobeSlot) -> list[_Part]:
+    """The parts of one slot, its base first."""
+    coat, under = _coat_part(slot)
+    transmitted = _transmission_part(slot, under)
+    return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
+
+
+def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
+    """Take away from the slot's `own` parts what its sheen reflects, and let it reflect that as diffuse light."""
+    base = own[0]
+    shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
+    shine = np.where(slot.of("principled"), shine, 0.0)
+    most = shine.max(axis=1, keepdims=True)
+    if hits.diffuse_albedo is None:
+        albedo = sheen_albedo(slot.cosine(slot.sheen_normal()), slot.value("sheen_roughness"))[:, None]
+    else:
+        albedo = _albedo_of_sheen(hits, slot, shine, base, parts)
+    left = np.ones((len(hits.position), 1))
+    left[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
+    for part in own:
+        part.specular *= left[part.index]
+        part.diffuse *= left[part.index]
+    base.diffuse += slot.weight[:, None] * shine * albedo
+
+
+def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
+    """The albedo R (Q, 1) of the sheen; it follows from the diffuse albedo of the hit, which is linear in R.
+
+    Without the sheen it would be what all `parts` expect together, with it the slot's own diffuse part D becomes
+    w s R + (1 - max(s) R) D, s (`shine`) the weight times the tint of the sheen, w the weight of the slot.
+    """
+    expected = np.zeros_like(hits.diffuse_albedo)
+    for part in parts:
+        expected[part.index] += part.diffuse
+    change = slot.weight[:, None] * shine - shine.max(axis=1, keepdims=True) * base.diffuse
+    missing = (hits.diffuse_albedo - expected)[base.index]
+    square = (change * change).sum(axis=1)
+    albedo = np.divide((missing * change).sum(axis=1), square, out=np.zeros(len(square)), where=square > 1e-9)
+    return np.clip(albedo, 0.0, 1.0)[:, None]
+
+
+def _coat_part(slot: LobeSlot):
+    """The coat (None without), and the share (Q, 3) of the lobe's weight that is left under it."""
+    under = np.repeat(slot.weight[:, None], 3, axis=1)
+    if not slot.has("coat_weight"):
+        return None, under
+    weight = np.maximum(slot.value("coat_weight"), 0.0)
+    ior = np.maximum(slot.value("coat_ior"), 1.0)
+    roughness = np.clip(slot.value("coat_roughness"), 0.0, 1.0)
+    normal = slot.coat_normal()
+    cosine = slot.cosine(normal)
+    albedo, average = closures.albedos(roughness, cosine)
+    mean = np.repeat(closures.dielectric_average(ior)[:, None], 3, axis=1)
+    boost = closures.multiple_scattering(mean, albedo, average)
+    f0 = np.repeat(closures.f0_of_ior(ior)[:, None], 3, axis=1)
+    reflected = boost * albedo[:, None] * closures.dielectric_albedo(f0, ior, roughness, cosine)
+    left = np.clip(1.0 - weight[:, None] * np.where(ior[:, None] > 1.0, reflected, 0.0), 0.0, 1.0)
+    # The light crosses the coat along the refracted ray.
+    depth = 1.0 / np.sqrt(1.0 - (1.0 - cosine**2) / ior**2).clip(1e-6)
+    tint = np.maximum(slot.value("coat_tint"), 0.0) ** depth[:, None]
+    left = left * (1.0 + weight[:, None] * (tint - 1.0))
+    coated = np.nonzero((weight > SMALLEST_WEIGHT) & (slot.kind == LOBE_KINDS["principled"]))[0]
+    specular = np.zeros((4, len(coated), 3))
+    specular[3] = (boost * (weight * slot.weight)[:, None])[coated]
+    part = _Part(slot.index[coated], normal[coated], normal[coated], roughness[coated], ior[coated], specular)
+    under[coated] *= left[coated]
+    return part, under
+
+
+def _transmission_part(slot: LobeSlot, under: np.ndarray):
+    """What the transmission of a Principled BSDF reflects, None without."""
+    if not slot.has("transmission"):
+        return None
+    weight = slot.transmission * (1.0 - slot.metallic)
+    at = np.nonzero(weight > SMALLEST_WEIGHT)[0]
+    specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0), np.sqrt(np.minimum(slot.color, 1.0)))
+    specular = (specular * (weight[:, None] * under))[:, at]
+    return _Part(slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular)
+
+
+def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
+    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is; `tint` is
+    that of the reflectance at normal incidence, `through` that of the light that passes."""
+    ior = np.maximum(slot.value("ior"), 1e-5)
+    f0 = np.clip(closures.f0_of_ior(ior)[:, None] * tint, 0.0, 1.0)
+    ior = np.where(slot.value("backfacing") > 0.5, 1.0 / ior, ior)
+    view = slot.roughness, slot.cosine(slot.specular_normal)
+    factor = np.ones_like(through)
+    if slot.has("multiple_scattering"):
+        scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
+        factor = np.where(scattered, closures.glass_scattering(through, ior, *view), 1.0)
+    *terms, ior = closures.dielectric_terms(f0, ior, view[1])
+    return np.stack(terms) * factor, ior
+
+
+def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
+    """Everything but coat and transmission."""
+    specular = _metal_terms(slot)
+    diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
+    if slot.of("sheen").any():
+        albedo = sheen_albedo(slot.cosine(slot.normal), slot.roughness)[:, None]
+        diffuse = np.where(slot.of("sheen"), slot.color * albedo, diffuse)
+    ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
+    for kind in ("conductor", "conductor_4_5"):
+        if slot.of(kind).any():
+            specular += np.where(slot.of(kind), _conductor_terms(slot, kind == "conductor"), 0.0)
+    if slot.of("glass").any():
+        terms, own_ior = _glass_terms(slot, np.ones_like(slot.color), slot.color)
+        specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
+        ior = np.where(slot.of("glass")[:, 0], own_ior, ior)
+    if slot.of("principled").any():
+        terms, own_ior, left = _dielectric_terms(slot)
+        below = np.where(slot.of("principled"), ((1.0 - slot.metallic) * (1.0 - slot.transmission))[:, None], 0.0)
+        specular += terms * below
+        diffuse = diffuse + slot.color * below * left
+        ior = np.where(slot.of("principled")[:, 0], own_ior, ior)
+    behind = slot.of("translucent")
+    return _Part(
+        slot.index,
+        slot.specular_normal,
+        # Cycles bends the normal of translucent lobes too.
+        np.where(behind, -slot.specular_normal, slot.normal),
+        slot.roughness,
+        ior,
+        specular * under,
+        diffuse * under,
+        behind[:, 0],
+    )
+
+
+def _metal_terms(slot: LobeSlot) -> np.ndarray:
+    """Specular terms (4, Q, 3) of F82 metals and of Glossy BSDF, which reflects its color at all angles."""
+    terms = np.zeros((4, len(slot.index), 3))
+    if slot.metallic.any():
+        f0, tint = np.minimum(slot.color, 1.0), np.clip(slot.value("tint"), 0.0, 1.0)
+        dip = closures.f82_dip(f0, tint)
+        factor = slot.metallic[:, None] * slot.scattered(closures.metal_average(f0, dip))
+        terms[:3] += factor * np.stack([f0, np.ones_like(f0), dip])
+    if slot.of("glossy").any():
+        terms[:2] += np.where(slot.of("glossy"), slot.color * slot.scattered(slot.color), 0.0)
+    return terms
+
+
+def _conductor_terms(slot: LobeSlot, exact: bool) -> np.ndarray:
+    """Specular terms (4, Q, 3) of conductors, whose complex index is `color` + i `tint`."""
+    extinction = np.maximum(slot.value("tint"), 0.0)
+    terms = np.stack(closures.conductor_fit(slot.color, extinction, exact))
+    return terms * slot.scattered(closures.conductor_average(slot.color, extinction, exact))
+
+
+def _dielectric_terms(slot: LobeSlot):
+    """Specular terms (4, Q, 3) of the dielectric part of Principled BSDF, its index (Q,), and the share (Q, 1) of the
+    light that is left for the diffuse part."""
+    ior, f0 = closures.specular_level_applied(np.maximum(slot.value("ior"), 1e-5), slot.value("specular_level"))
+    f0 = np.clip(f0[:, None] * np.maximum(slot.value("tint"), 0.0), 0.0, 1.0)
+    factor = slot.scattered(closures.dielectric_blend_average(f0, ior))
+    cosine = slot.cosine(slot.specular_normal)
+    albedo = closures.dielectric_albedo(f0, ior, slot.roughness, cosine)
+    scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
+    albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
+    left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
+    *terms, ior = closures.dielectric_terms(f0, ior, cosine)
+    return np.stack(terms) * factor, ior, left

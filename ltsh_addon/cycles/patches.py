@@ -1,0 +1,260 @@
+"""Flat lights whose radiance varies, as patches of constant radiance. Needs no bpy.
+
+An image of the light is cut in halves, again and again where the error is largest, until the mean of |radiance - that
+of its patch| is below `ERROR` of the mean radiance. The larger patches on the way there stay: each surface point takes
+those that its lobe cannot tell from the smaller ones (`shading.light_detail`).
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..scene import AreaLight
+
+ERROR = 0.02
+# Cells along each side at most, and so 64 x 64 patches.
+GRID = 64
+# So many cuts one after another lead from a patch to its parts.
+CUTS = 4
+# Corners of the polygon that stands for an ellipse cut into patches: 2e-3 of its radius from it, with its area.
+ROUND_CORNERS = 64
+# Largest rectangle at the edge of a round light with a spread, whose half axes are 1.
+FOCUSED_EDGE = 0.125
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle `cell` (left, right, bottom, top in [-1, 1]), its mean radiance (3,) and the parts of it."""
+
+    cell: tuple[float, float, float, float]
+    radiance: np.ndarray
+    parts: tuple[Patch, ...] = ()
+
+    def smallest(self) -> Iterator[Patch]:
+        """The patches in it that were not cut."""
+        if not self.parts:
+            yield self
+        for part in self.parts:
+            yield from part.smallest()
+
+
+@dataclass(frozen=True)
+class Patches:
+    """The patch that is the whole image, None of a dark one, and the relative L1 error of the smallest patches."""
+
+    whole: Patch | None
+    error: float
+
+    @property
+    def smallest(self) -> list[Patch]:
+        """The patches that were not cut."""
+        return [] if self.whole is None else list(self.whole.smallest())
+
+
+def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * GRID) -> Patches:
+    """At most `most` smallest patches of an `image` (H, W, 3), row 0 on top, of which only the pixels `covered` (H, W)
+    count; dark ones are left out."""
+    pixels = _Pixels(image, covered)
+    height, width = covered.shape
+    total = np.abs(image[covered]).sum()
+    number = itertools.count()
+    whole = (0, height, 0, width)
+    error = pixels.error(whole)
+    # A heap of (-error, tie breaker, cell); what cannot be cut any more is laid aside.
+    open_cells, done, halves_of = [(-error, next(number), whole)], 0, {}
+    while open_cells and error > ERROR * total and len(open_cells) + done < most:
+        own, _, cell = heapq.heappop(open_cells)
+        halves = pixels.best_halves(cell)
+        if halves is None:
+            done += 1
+            continue
+        error += own
+        halves_of[cell] = halves
+        for half in halves:
+            part = pixels.error(half)
+            error += part
+            heapq.heappush(open_cells, (-part, next(number), half))
+    share = max(error, 0.0) / total if total > 0.0 else 0.0
+    return Patches(_patch(whole, halves_of, pixels), float(share))
+
+
+def _patch(cell, halves_of: dict, pixels: _Pixels) -> Patch | None:
+    parts, radiance = [cell] if cell in halves_of else [], pixels.mean(cell)
+    for _ in range(CUTS):
+        parts = [half for part in parts for half in halves_of.get(part, (part,))]
+    found = tuple(patch for patch in (_patch(part, halves_of, pixels) for part in parts) if patch is not None)
+    if not found and not np.any(radiance != 0.0):
+        return None
+    height, width = pixels.covered.shape
+    sides = (cell[2] / width, cell[3] / width, 1.0 - cell[1] / height, 1.0 - cell[0] / height)
+    return Patch(tuple(2.0 * side - 1.0 for side in sides), radiance, found)
+
+
+class _Pixels:
+    """Sums over the covered pixels of cells (top, bottom, left, right)."""
+
+    def __init__(self, image: np.ndarray, covered: np.ndarray):
+        self.image, self.covered, self.full = image, covered, bool(covered.all())
+        inside = np.where(covered[..., None], image, 0.0)
+        values = np.concatenate([inside, np.square(inside), covered[..., None]], axis=-1)
+        self._sums = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0), (0, 0)))
+        self._least = tuple(-(-count // GRID) for count in covered.shape)
+
+    def _sum(self, cell) -> np.ndarray:
+        """Sums (7,) of the colors, of their squares, and of 1."""
+        top, bottom, left, right = cell
+        return self._sums[bottom, right] - self._sums[top, right] - self._sums[bottom, left] + self._sums[top, left]
+
+    def mean(self, cell) -> np.ndarray:
+        """Mean color (3,), 0 where nothing is covered."""
+        rows, columns = slice(cell[0], cell[1]), slice(cell[2], cell[3])
+        inside = self.image[rows, columns][self.covered[rows, columns]]
+        return inside.mean(axis=0) if len(inside) else np.zeros(3)
+
+    def error(self, cell) -> float:
+        """Sum of the absolute differences from the mean."""
+        rows, columns = slice(cell[0], cell[1]), slice(cell[2], cell[3])
+        values = self.image[rows, columns]
+        values = values.reshape(-1, 3) if self.full else values[self.covered[rows, columns]]
+        return float(np.abs(values - values.mean(axis=0)).sum()) if len(values) else 0.0
+
+    def _squares(self, cell) -> float:
+        """Sum of the squares of the differences from the mean."""
+        sums = self._sum(cell)
+        return float((sums[3:6] - np.square(sums[:3]) / max(sums[6], 1.0)).sum())
+
+    def best_halves(self, cell):
+        """The two halves of `cell` by the cut that leaves the smaller squares of differences; None: too small to cut.
+
+        Squares never grow by a cut, unlike the absolute differences that say when to stop.
+        """
+        top, bottom, left, right = cell
+        choices = []
+        if bottom - top >= 2 * self._least[0]:
+            middle = (top + bottom) // 2
+            choices.append(((top, middle, left, right), (middle, bottom, left, right)))
+        if right - left >= 2 * self._least[1]:
+            middle = (left + right) // 2
+            choices.append(((top, bottom, left, middle), (top, bottom, middle, right)))
+        return min(choices, key=lambda halves: sum(self._squares(half) for half in halves), default=None)
+
+
+def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
+    """`light` as one with its mean radiance, and with a light for every patch in the tree of its `detail`; [] if dark.
+
+    Cells are along its half_u and half_v; those wholly inside become rectangles, others polygons.
+    """
+    if patches.whole is None:
+        return []
+    outline = _outline(light)
+    detail = [part for patch in patches.whole.parts for part in _lights_of(light, outline, patch)]
+    return [replace(light, radiance=patches.whole.radiance, detail=tuple(detail))]
+
+
+def _lights_of(light: AreaLight, outline: np.ndarray, patch: Patch) -> list[AreaLight]:
+    """One light for `patch` with those of its parts as detail, or these alone where the patch has no simple shape."""
+    whole = _light_of_cell(replace(light, radiance=patch.radiance), outline, patch.cell)
+    if not patch.parts:
+        return whole
+    detail = tuple(part for inner in patch.parts for part in _lights_of(light, outline, inner))
+    return [replace(whole[0], detail=detail)] if len(whole) == 1 else list(detail)
+
+
+def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLight]:
+    """The part of `light` in `cell`; `outline` (V, 2) is that of the light where it is no rectangle."""
+    size = (cell[1] - cell[0]) * (cell[3] - cell[2])
+    inside = outline if light.shape in ("SQUARE", "RECTANGLE") else clip_to_cell(outline, cell)
+    share = polygon_area(inside) / size
+    if light.shape in ("SQUARE", "RECTANGLE") or share >= 1.0 - 1e-6:
+        return [_rectangle(light, cell)]
+    if share <= 1e-9:
+        return []
+    if not light.is_focused:
+        whole = _rectangle(light, cell)
+        return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
+    # Polygons have no spread: small rectangles with the same power stand for the edge.
+    if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
+        return [part for half in _halves(cell) for part in _light_of_cell(light, outline, half)]
+    bounds = np.stack([inside.min(axis=0), inside.max(axis=0)], axis=-1).ravel()
+    full = (bounds[1] - bounds[0]) * (bounds[3] - bounds[2])
+    return [_rectangle(replace(light, radiance=light.radiance * share * size / full), bounds)]
+
+
+def _halves(cell) -> list[tuple]:
+    left, right, bottom, top = cell
+    if right - left >= top - bottom:
+        middle = 0.5 * (left + right)
+        return [(left, middle, bottom, top), (middle, right, bottom, top)]
+    middle = 0.5 * (bottom + top)
+    return [(left, right, bottom, middle), (left, right, middle, top)]
+
+
+def _rectangle(light: AreaLight, cell) -> AreaLight:
+    left, right, bottom, top = cell
+    return replace(
+        light,
+        shape="RECTANGLE",
+        corners=None,
+        center=light.center + 0.5 * (left + right) * light.half_u + 0.5 * (bottom + top) * light.half_v,
+        half_u=0.5 * (right - left) * light.half_u,
+        half_v=0.5 * (top - bottom) * light.half_v,
+    )
+
+
+def _outline(light: AreaLight) -> np.ndarray:
+    """Corners (V, 2) of `light` along half_u and half_v."""
+    if light.shape == "POLYGON":
+        offset = light.corners - light.center
+        axes = np.stack([light.half_u, light.half_v], axis=-1)
+        outline = np.linalg.lstsq(axes, offset.T, rcond=None)[0].T
+        return outline if signed_area(outline) > 0.0 else outline[::-1]
+    step = 2.0 * np.pi / ROUND_CORNERS
+    # No corner where the ellipse touches its rectangle: the polygon stays inside.
+    angle = step * (np.arange(ROUND_CORNERS) + 0.5)
+    return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _in_space(light: AreaLight, outline: np.ndarray) -> np.ndarray:
+    corners = light.center + outline[:, :1] * light.half_u + outline[:, 1:] * light.half_v
+    mirrored = np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0
+    return corners[::-1] if mirrored else corners
+
+
+def clip_to_cell(outline: np.ndarray, cell) -> np.ndarray:
+    """The part (W, 2) of a polygon (V, 2) in the rectangle left, right, bottom, top (Sutherland and Hodgman 1974).
+
+    Of a concave polygon that falls apart the parts hang together by edges that run there and back.
+    """
+    left, right, bottom, top = cell
+    for axis, sign, bound in ((0, 1.0, left), (0, -1.0, right), (1, 1.0, bottom), (1, -1.0, top)):
+        if len(outline) == 0:
+            break
+        height = sign * (outline[:, axis] - bound)
+        clipped = []
+        for index in range(len(outline)):
+            after = (index + 1) % len(outline)
+            if height[index] >= 0.0:
+                clipped.append(outline[index])
+            if (height[index] >= 0.0) != (height[after] >= 0.0):
+                share = height[index] / (height[index] - height[after])
+                clipped.append(outline[index] + share * (outline[after] - outline[index]))
+        outline = np.array(clipped).reshape(-1, 2)
+    return outline
+
+
+def signed_area(outline: np.ndarray) -> float:
+    """Area of a polygon (V, 2), positive if it is counterclockwise."""
+    if len(outline) < 3:
+        return 0.0
+    x, y = outline.T
+    return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
+
+
+def polygon_area(outline: np.ndarray) -> float:
+    """Area of a polygon (V, 2)."""
+    return abs(signed_area(outline))

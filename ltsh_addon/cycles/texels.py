@@ -1,0 +1,180 @@
+"""From a mesh, its materials and the texels that its triangles cover to surface samples. Needs no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from ..scene import AreaLight, SurfaceSamples
+from .gbuffer import HITS_PER_BLOCK, joined
+from .horizons import end_at_horizons_of_cycles, unit
+from .images import GRAY, ImageTexture
+from .lobes import LOBE_AOVS, Hits, samples_of_lobes
+from .uv import Texels
+
+# Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
+SMALLEST_BAKED_COSINE = 0.2
+
+
+@dataclass(frozen=True)
+class TexelMesh:
+    """Triangles of one evaluated object in world space."""
+
+    corners: np.ndarray  # (T, 3, 3) m
+    normals: np.ndarray  # (T, 3, 3) unit, as shaded, custom normals included
+    uv: np.ndarray  # (T, 3, 2)
+    material: np.ndarray  # (T,) number of the material
+    vertices: np.ndarray  # (T, 3) numbers in the mesh
+
+    def save(self, path) -> None:
+        """Write an .npz."""
+        np.savez(path, **{item.name: getattr(self, item.name) for item in fields(self)})
+
+    @classmethod
+    def load(cls, path) -> TexelMesh:
+        """Read what `save` wrote."""
+        with np.load(Path(path)) as data:
+            return cls(**{item.name: data[item.name] for item in fields(cls)})
+
+
+@dataclass(frozen=True)
+class BakeView:
+    """From where a surface is seen: `kind` "above" (along its normal), "point" (from a position) or "direction" (from
+    afar, unit vector towards the viewer). `bent` as Cycles' bake has it, see SMALLEST_BAKED_COSINE."""
+
+    kind: str
+    vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    bent: bool = False
+
+    def towards(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Unit vectors (P, 3) from positions (P, 3) with normals (P, 3) towards the viewer."""
+        if self.kind == "above":
+            return normal
+        vector = np.array(self.vector, dtype=np.float64)
+        view = unit(vector - position) if self.kind == "point" else np.broadcast_to(vector, position.shape)
+        if not self.bent:
+            return view
+        cosine = np.sum(view * normal, axis=-1, keepdims=True)
+        bent = unit(view - normal * (cosine - SMALLEST_BAKED_COSINE))
+        # Surfaces that face away are seen the more along their normal, the more they do.
+        behind = np.clip(-cosine, 0.0, 1.0)
+        return np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(bent * (1.0 - behind) + normal * behind))
+
+
+@dataclass(frozen=True)
+class BakeMaterial:
+    """What one material writes: `aovs.LOBE_AOVS` for each of its lobes. A value is a number, a color, or where it
+    varies its map or one of the `textures`, and which part of their color."""
+
+    corrected: bool
+    lobes: tuple[dict, ...]
+    textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # with the UV map (T, 3, 2)
+
+    @classmethod
+    def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
+        """From what JSON makes of it, the folder of `images`, and the files of UV maps by name."""
+        textures = []
+        for texture in record["textures"]:
+            pixels = np.load(images / texture["file"], mmap_mode="r")
+            read_as = {name: texture[name] for name in ("extension", "interpolation", "srgb")}
+            textures.append((ImageTexture(pixels, **read_as), np.load(uv_maps[texture["uv"]])))
+        return cls(record["corrected"], tuple(record["lobes"]), tuple(textures))
+
+    def colors(self, number: int, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Colors (Q, 3) of texture `number` at points of triangles (Q,) with barycentric weights (Q, 3)."""
+        texture, uv = self.textures[number]
+        return texture.colors(_interpolated(uv, triangle, weights))
+
+
+def texel_samples(
+    mesh: TexelMesh,
+    materials: list[BakeMaterial],
+    texels: Texels,
+    read_map,
+    view: BakeView,
+    lights: tuple[AreaLight, ...],
+    receiver: int = 0,
+) -> tuple[SurfaceSamples, np.ndarray]:
+    """Samples (S) of texels (Q) and the texel (S,), 0 to Q - 1, of each; those of a texel follow one another.
+
+    read_map(number) returns the baked map of that number at the texels, (Q, 3).
+    """
+    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
+    facets = unit(np.cross(sides[:, 0], sides[:, 1]))
+    corrected = np.array([material.corrected for material in materials], dtype=bool)
+    maps = {number: read_map(number) for number in _maps_read(materials)}
+    pieces, index = [], []
+    for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
+        block = slice(start, start + HITS_PER_BLOCK)
+        triangle, weights = texels.triangle[block], texels.barycentric[block]
+        position = _interpolated(mesh.corners, triangle, weights)
+        smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
+        true_normal = facets[triangle]
+        flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
+        number = mesh.material[triangle]
+        hits = Hits(
+            position=position,
+            view=view.towards(position, smooth_normal),
+            smooth_normal=smooth_normal,
+            true_normal=np.where(flipped, -true_normal, true_normal),
+            corrected=corrected[number],
+            receiver=np.full(len(position), receiver),
+            diffuse_albedo=None,
+        )
+        of_block = {name: values[block] for name, values in maps.items()}
+        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
+        pieces.append(end_at_horizons_of_cycles(samples, lights))
+        index.append(texel + start)
+    return joined(pieces), np.concatenate(index)
+
+
+def _maps_read(materials) -> set[int]:
+    """Numbers of the maps that some material reads."""
+    values = (value for material in materials for lobe in material.lobes for value in lobe.values())
+    return {value["map"] for value in values if isinstance(value, dict) and "map" in value}
+
+
+def _interpolated(values, triangle, weights):
+    """Values (T, 3, C) at the points with barycentric weights (Q, 3) of triangles (Q,)."""
+    return sum(values[triangle, corner] * weights[:, corner, None] for corner in range(3))
+
+
+def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndarray]]:
+    """For each slot its quantities at texels of materials `number` (Q,), of which `maps` has the baked ones (Q, 3)."""
+    texels = [np.flatnonzero(number == which) for which in range(len(materials))]
+    colors = {}
+
+    def varying(which, value, kind):
+        at = texels[which]
+        if "map" in value:
+            found = maps[value["map"]][at]
+            return found if kind == "COLOR" else found[:, value["channel"]]
+        key = which, value["texture"]
+        if key not in colors:
+            colors[key] = materials[which].colors(value["texture"], triangle[at], weights[at])
+        part = value["part"]
+        if part == "gray":
+            return colors[key] @ GRAY
+        return colors[key] if part == "color" else colors[key][:, int(part)]
+
+    slots = []
+    for slot in range(max((len(material.lobes) for material in materials), default=0)):
+        names = {name for material in materials if len(material.lobes) > slot for name in material.lobes[slot]}
+        values = {}
+        for name in names | {"kind"}:
+            kind, neutral = LOBE_AOVS[name]
+            shape = (len(number), 3) if kind == "COLOR" else (len(number),)
+            values[name] = np.zeros(shape) + (0.0 if neutral is None else neutral)
+            for which, material in enumerate(materials):
+                if len(material.lobes) <= slot or name not in material.lobes[slot]:
+                    continue
+                value = material.lobes[slot][name]
+                if isinstance(value, dict):
+                    value = varying(which, value, kind)
+                elif kind == "COLOR":
+                    value = np.asarray(value)[:3]
+                values[name][texels[which]] = value
+        slots.append(values)
+    return slots

@@ -1,0 +1,395 @@
+"""UV maps: which texel lies on which face, and what lies beyond a seam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Blender's bake moves its sampling points by this much, in texels, so that centers exactly on an edge belong to one
+# side. The same here, for the same texels.
+NUDGE = (0.001, 0.002)
+_NO_ROW = 1 << 40
+# How far a triangle may stick out of its tile, in tiles: rounding, and no texel.
+TILE_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Texels:
+    """Q texels of a block of rows and where they lie on the triangles."""
+
+    index: np.ndarray  # (Q,) increasing: (y - first row) * W + x
+    triangle: np.ndarray  # (Q,)
+    barycentric: np.ndarray  # (Q, 3) weights of the triangle's corners, none negative
+    covers: int  # how often texels were covered, all together
+    overlaps: int  # how many of them were covered more than once
+
+
+@dataclass(frozen=True)
+class UvTriangles:
+    """Triangles of a UV map in texels of one tile; `texels` finds those of a block of rows."""
+
+    corners: np.ndarray  # (T, 3, 2) float64, in texels
+    width: int
+    height: int
+
+    @classmethod
+    def in_tile(cls, uv: np.ndarray, width: int, height: int, tile: tuple[int, int] = (0, 0)) -> UvTriangles:
+        """Triangles uv (T, 3, 2) on a texture of width x height texels that fills the unit square at `tile`."""
+        # In single precision like Blender, so that rounding moves no texel from one side of an edge to the other.
+        size = np.array([width, height], dtype=np.float32)
+        corners = (np.asarray(uv, dtype=np.float32) - np.asarray(tile, dtype=np.float32)) * size
+        return cls(corners.astype(np.float64), width, height)
+
+    def texels(self, first_row: int, row_count: int, conservative: bool = False) -> Texels:
+        """The texels of some rows whose centers are covered; where triangles overlap the last one wins, as in Blender.
+
+        With `conservative` also those that are touched anywhere by a triangle and whose center is not covered: their
+        sample is the point of the triangle nearest to the center.
+        """
+        owner = np.full(row_count * self.width, -1, dtype=np.int64)
+        shifted = self.corners.astype(np.float32) - (np.float32(0.5) + np.array(NUDGE, np.float32))
+        spans = _center_spans(shifted, first_row, row_count, (self.width, self.height))
+        triangle, index = _expand(*spans, self.width, first_row)
+        owner[index] = triangle
+        covered = owner >= 0
+        covers, overlaps = len(index), 0
+        if covers > np.count_nonzero(covered):
+            overlaps = int(np.count_nonzero(np.bincount(index) > 1))
+        if conservative:
+            spans = _touching_spans(self.corners, first_row, row_count, self.width)
+            triangle, index = _expand(*spans, self.width, first_row)
+            free = ~covered[index]
+            owner[index[free]] = triangle[free]
+        found = np.flatnonzero(owner >= 0)
+        triangle = owner[found]
+        center = np.stack([found % self.width + 0.5, found // self.width + first_row + 0.5], axis=-1)
+        return Texels(found, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
+
+
+def _center_spans(corners, first_row, row_count, size):
+    """(triangle, row, first x, last x) of the runs of integer points in triangles (T, 3, 2), float32, of a texture of
+    `size` (width, height).
+
+    As Blender's rasterizer does it, down to the rounding: a side is followed from its upper end row by row, in single
+    precision, and a point on the left side is outside.
+    """
+    width, height = size
+    sides = [_side_rows(corners[:, k], corners[:, (k + 1) % 3], first_row, row_count, height) for k in range(3)]
+    first = np.min([side.first for side in sides], axis=0)
+    last = np.max([side.last for side in sides], axis=0)
+    triangle, step = repeated(last - first + 1)
+    row = first[triangle] + step
+    offset = np.cumsum(np.maximum(last - first + 1, 0)) - np.maximum(last - first + 1, 0)
+    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    for side in sides:
+        of, number = repeated(side.last - side.first + 1)
+        position = offset[of] + (side.first - first)[of] + number
+        x = side.x[side.start[of] + number]
+        left[position], right[position] = np.minimum(left[position], x), np.maximum(right[position], x)
+    crossed = np.flatnonzero(np.isfinite(left))
+    left, right = left[crossed], right[crossed]
+    return triangle[crossed], row[crossed], np.floor(left) + 1.0, np.minimum(np.floor(right), width - 1.0)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """Where one side of every triangle meets the rows of the block."""
+
+    first: np.ndarray  # (T,) first row, _NO_ROW where there is none
+    last: np.ndarray  # (T,) last row, -_NO_ROW where there is none
+    start: np.ndarray  # (T,) place of the first row's x in `x`
+    x: np.ndarray
+
+
+def _side_rows(start, end, first_row, row_count, height):
+    upward = (start[:, 1] < end[:, 1])[:, None]
+    low, high = np.where(upward, start, end), np.where(upward, end, start)
+    top = np.minimum(np.floor(high[:, 1]), height - 1.0)
+    first = np.maximum(np.ceil(low[:, 1]), first_row)
+    last = np.minimum(top, first_row + row_count - 1.0)
+    with np.errstate(invalid="ignore"):
+        seen = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (first <= last))
+    # The longest way down first, so that those still under way are always the first ones.
+    seen = seen[np.argsort(first[seen] - top[seen], kind="stable")]
+    low, high, top = low[seen], high[seen], top[seen].astype(np.float32)
+    rise = high[:, 1] - low[:, 1]
+    flat = rise <= np.finfo(np.float32).eps
+    slope = np.divide(low[:, 0] - high[:, 0], rise, out=np.zeros_like(rise), where=~flat)
+    x = np.where(flat, np.minimum(low[:, 0], high[:, 0]), slope * (low[:, 1] - top) + low[:, 0])
+    rows = np.zeros(len(start) + 1, np.int64)
+    rows[seen + 1] = last[seen] - first[seen] + 1.0
+    place = np.cumsum(rows)
+    values = np.empty(place[-1], np.float32)
+    steps, skipped = top - first[seen], top - last[seen]
+    target = place[seen + 1] - 1 + skipped.astype(np.int64)
+    active = len(seen)
+    for step in range(int(steps[0]) + 1 if active else 0):
+        active = np.searchsorted(-steps[:active], -step, side="right")
+        within = np.flatnonzero(skipped[:active] <= step)
+        values[target[within] - step] = x[within]
+        x[:active] += slope[:active]
+    rows_of = np.full((2, len(start)), [[_NO_ROW], [-_NO_ROW]], dtype=np.int64)
+    rows_of[:, seen] = first[seen], last[seen]
+    return _Side(*rows_of, place[:-1], values)
+
+
+def _touching_spans(corners, first_row, row_count, width):
+    """(triangle, row, first x, last x) of the runs of unit squares that triangles (T, 3, 2) touch."""
+    low, middle, high = _by_height(corners)
+    area = cross(middle - low, high - low)
+    solid = np.flatnonzero(np.isfinite(area) & (area != 0.0))
+    low, middle, high = low[solid], middle[solid], high[solid]
+    # A triangle that ends on the border between two rows does not reach into the next.
+    last = np.maximum(np.ceil(high[:, 1]) - 1.0, np.floor(low[:, 1]))
+    triangle, row = _rows_of(np.floor(low[:, 1]), last, first_row, row_count)
+    low, middle, high = low[triangle], middle[triangle], high[triangle]
+    inside = np.clip(middle[:, 1], row, row + 1.0) == middle[:, 1]
+    ends = []
+    for border in (row, row + 1.0):
+        ends += _chain_ends(low, middle, high, np.clip(border, low[:, 1], high[:, 1]))
+    ends.append(np.where(inside, middle[:, 0], ends[0]))
+    left, right = np.min(ends, axis=0), np.max(ends, axis=0)
+    last_x = np.maximum(np.ceil(right) - 1.0, np.floor(left))
+    return solid[triangle], row, np.floor(left), np.minimum(last_x, width - 1.0)
+
+
+def _by_height(corners):
+    """Corners (T, 3, 2) sorted by y: three arrays (T, 2)."""
+    order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
+    return np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
+
+
+def _rows_of(first, last, first_row, row_count):
+    """(triangle, row) for every row from `first` (T,) to `last` (T,) within the block."""
+    with np.errstate(invalid="ignore"):
+        seen = np.isfinite(first) & np.isfinite(last)
+    first = np.maximum(np.where(seen, first, 0.0), first_row)
+    last = np.minimum(np.where(seen, last, -1.0), first_row + row_count - 1.0)
+    triangle, step = repeated(last - first + 1.0)
+    return triangle, first[triangle] + step
+
+
+def repeated(counts):
+    """Numbers 0 0 0 1 1 3 ... as often as counts (N,) say, and 0 1 2 0 1 0 ... within each."""
+    counts = np.where(counts > 0.0, counts, 0.0).astype(np.int64)
+    number = np.repeat(np.arange(len(counts)), counts)
+    ends = np.cumsum(counts)
+    return number, np.arange(ends[-1] if len(ends) else 0) - np.repeat(ends - counts, counts)
+
+
+def _chain_ends(low, middle, high, y):
+    """x where a horizontal line at y (S,) meets the long side and the two short sides of triangles."""
+    below = y <= middle[:, 1]
+    start, end = np.where(below[:, None], low, middle), np.where(below[:, None], middle, high)
+    return _x_on(low, high, y), _x_on(start, end, y)
+
+
+def _x_on(start, end, y):
+    rise = end[:, 1] - start[:, 1]
+    share = np.divide(y - start[:, 1], rise, out=np.ones_like(rise), where=rise > 0.0)
+    return start[:, 0] + share * (end[:, 0] - start[:, 0])
+
+
+def _expand(span_triangle, row, first_x, last_x, width, first_row):
+    """(triangle, index in the block) of every texel of the spans, in the order of the triangles."""
+    first_x = np.clip(first_x, 0.0, width)
+    span, step = repeated(last_x - first_x + 1.0)
+    index = ((row[span] - first_row) * width + first_x[span]).astype(np.int64) + step
+    return span_triangle[span], index
+
+
+def barycentric_of_nearest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Weights (Q, 3), none negative, of the point of each triangle (Q, 3, 2) that is nearest to points (Q, 2).
+
+    Of a triangle without area the nearest point of its sides.
+    """
+    a, b, c = np.moveaxis(corners, 1, 0)
+    area = cross(b - a, c - a)
+    safe = np.where(area != 0.0, area, 1.0)
+    weights = np.stack([cross(b - points, c - points), cross(c - points, a - points), cross(a - points, b - points)])
+    weights = (weights / safe).T
+    outside = np.flatnonzero((weights < 0.0).any(axis=1) | (area == 0.0))
+    if len(outside):
+        weights[outside] = _nearest_on_sides(corners[outside], points[outside])
+    return weights
+
+
+def _nearest_on_sides(corners, points):
+    best, distance = np.zeros((len(points), 3)), np.full(len(points), np.inf)
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        start, side = corners[:, first], corners[:, second] - corners[:, first]
+        length2 = (side * side).sum(axis=1)
+        share = ((points - start) * side).sum(axis=1)
+        share = np.clip(np.divide(share, length2, out=np.zeros_like(share), where=length2 > 0.0), 0.0, 1.0)
+        gap = points - start - share[:, None] * side
+        found = (gap * gap).sum(axis=1)
+        nearer = np.flatnonzero(found < distance)
+        distance[nearer] = found[nearer]
+        best[nearer] = 0.0
+        best[nearer, first], best[nearer, second] = 1.0 - share[nearer], share[nearer]
+    return best
+
+
+def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Cross products (...) of vectors (..., 2) in a plane."""
+    return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
+
+
+def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
+    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the area that they
+    have in all, 1 for a tile, where some of it may be outside of these tiles; else 0.
+
+    Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
+    """
+    uv = np.asarray(uv, dtype=np.float64)
+    area = np.abs(cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
+    solid = np.isfinite(area) & (area > 0.0)
+    uv, area = uv[solid], area[solid]
+    column, row = np.moveaxis(np.floor(uv.mean(axis=1)).astype(np.int64), -1, 0)
+    origin = np.stack([column, row], axis=-1)[:, None]
+    within = np.all((uv >= origin - TILE_TOLERANCE) & (uv <= origin + 1.0 + TILE_TOLERANCE), axis=(1, 2))
+    numbered = (column >= 0) & (column < 10) & (row >= 0)
+    if (within & numbered).all():
+        return sorted(set((1001 + column + 10 * row).tolist())), 0.0
+    touching = (uv.min(axis=1) < 1.0).all(axis=1) & (uv.max(axis=1) > 0.0).all(axis=1)
+    return ([1001] if touching.any() else []), float(0.5 * area.sum())
+
+
+# UV coordinates closer than this are one point.
+SAME_UV = 1e-6
+# Points looked up at a time.
+POINTS_PER_BLOCK = 32768
+_NEIGHBORS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+
+
+@dataclass(frozen=True)
+class UvSeams:
+    """E edges of triangles at which a UV map is cut and the surface is not, in texels of one tile."""
+
+    edges: np.ndarray  # (E, 2, 2) both ends
+    outward: np.ndarray  # (E, 2) unit
+    beyond: np.ndarray  # (E, 2, 2) the same ends on the other side of the cut
+    inward: np.ndarray  # (E, 2) unit, into the triangle on the other side
+    island: np.ndarray  # (E,) that the other side belongs to
+    islands: np.ndarray  # (T,) number of the part of the UV map that each triangle belongs to
+    size: tuple[int, int]  # width, height
+    cells: np.ndarray  # (N,) increasing: texels that edges pass through, (y + 1) * (W + 2) + x + 1
+    crossing: np.ndarray  # (N,) the edges
+
+    @classmethod
+    def of(cls, uv: np.ndarray, vertices: np.ndarray, width: int, height: int, tile=(0, 0)) -> UvSeams:
+        """Seams of triangles uv (T, 3, 2) with vertices (T, 3) of the mesh, on a texture that fills the unit square at
+        `tile`."""
+        uv = np.asarray(uv, dtype=np.float64)
+        edge, partner = _paired(vertices)
+        same = _ends(vertices, edge) == _ends(vertices, partner)
+        ends, others = _ends(uv, edge), _ends(uv, partner)
+        others = np.where(same[:, :1, None], others, others[:, ::-1])
+        together = (np.abs(ends - others) <= SAME_UV).all(axis=(1, 2))
+        islands = _connected(len(uv), edge[together] // 3, partner[together] // 3)
+        corners = (uv - np.asarray(tile)) * (width, height)
+        third, other_third = _third(corners, edge), _third(corners, partner)
+        ends, others = ((part - np.asarray(tile)) * (width, height) for part in (ends, others))
+        with np.errstate(invalid="ignore"):
+            inward, other_inward = _towards(ends, third), _towards(others, other_third)
+            cut = ~together & np.isfinite(inward).all(axis=1) & np.isfinite(other_inward).all(axis=1)
+        edges = ends[cut]
+        cells, crossing = _cells(edges, width, height)
+        island = islands[partner[cut] // 3]
+        parts = (edges, -inward[cut], others[cut], other_inward[cut], island, islands)
+        return cls(*parts, (width, height), cells, crossing)
+
+    def reflected(self, points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For points (P, 2) in texels, outside of all triangles, and for each the covered texel `near` (P, 2) closest
+        to it: the points (Q,) that have an edge in front of them, where the surface goes on (Q, 2), and the island."""
+        found = [
+            self._reflected(points[first : first + POINTS_PER_BLOCK], near[first : first + POINTS_PER_BLOCK], first)
+            for first in range(0, max(len(points), 1), POINTS_PER_BLOCK)
+        ]
+        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    def _reflected(self, points, near, first):
+        point, edge = self._candidates(near)
+        start, side = self.edges[edge, 0], self.edges[edge, 1] - self.edges[edge, 0]
+        offset = points[point] - start
+        share = (offset * side).sum(axis=1) / (side * side).sum(axis=1)
+        distance = (offset * self.outward[edge]).sum(axis=1)
+        facing = np.flatnonzero((share >= 0.0) & (share <= 1.0) & (distance > 0.0))
+        order = facing[np.lexsort((edge[facing], distance[facing], point[facing]))]
+        closest = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
+        point, edge, share, distance = point[closest], edge[closest], share[closest, None], distance[closest, None]
+        beyond = self.beyond[edge, 0] * (1.0 - share) + self.beyond[edge, 1] * share
+        return point + first, beyond + distance * self.inward[edge], self.island[edge]
+
+    def _candidates(self, near):
+        """(point, edge) for the edges through the texels around `near`; a pair may come several times."""
+        stride = self.size[0] + 2
+        cell = np.concatenate([(near[:, 1] + 1 + y) * stride + near[:, 0] + 1 + x for x, y in _NEIGHBORS])
+        low = np.searchsorted(self.cells, cell, side="left")
+        which, step = repeated(np.searchsorted(self.cells, cell, side="right") - low)
+        return which % max(len(near), 1), self.crossing[low[which] + step]
+
+
+def _paired(vertices):
+    """Numbers (N,) 3 * triangle + corner of the edges that some other triangle has too, and those of the others."""
+    ends = np.sort(np.stack([vertices, np.roll(vertices, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    new = np.concatenate([[True], (np.diff(ends[order], axis=0) != 0).any(axis=1)]) if len(order) else order
+    start = np.flatnonzero(new)
+    count = np.diff(start, append=len(order))
+    # Of an edge with more than two triangles every one goes on into the next.
+    last = start + count - 1
+    following = np.arange(len(order)) + 1
+    following[last] = start
+    shared = np.repeat(count > 1, count)
+    return order[shared], order[following[shared]]
+
+
+def _ends(values, edge):
+    """Values (T, 3, ...) at both ends of edges (N,): (N, 2, ...)."""
+    return np.stack([values[edge // 3, edge % 3], values[edge // 3, (edge + 1) % 3]], axis=1)
+
+
+def _third(values, edge):
+    return values[edge // 3, (edge + 2) % 3]
+
+
+def _towards(ends, corner):
+    """Unit vectors (N, 2) perpendicular to edges (N, 2, 2) towards the side of a corner (N, 2); NaN without area."""
+    side = ends[:, 1] - ends[:, 0]
+    turn = np.sign(cross(side, corner - ends[:, 0]))
+    length = np.linalg.norm(side, axis=1)
+    scale = np.divide(turn, length, out=np.full(len(side), np.nan), where=(length > 0.0) & (turn != 0.0))
+    return np.stack([-side[:, 1], side[:, 0]], axis=-1) * scale[:, None]
+
+
+def _connected(count, first, second):
+    """The smallest number (count,) that each is connected to by pairs first (N,), second (N,)."""
+    label = np.arange(count)
+    while True:
+        a, b = label[first], label[second]
+        if np.array_equal(a, b):
+            return label
+        smaller = np.minimum(a, b)
+        np.minimum.at(label, a, smaller)
+        np.minimum.at(label, b, smaller)
+        while not np.array_equal(label, label[label]):
+            label = label[label]
+
+
+def _cells(edges, width, height):
+    """(cells, edges) as in UvSeams, found by points half a texel apart on the part of each edge that is in the tile."""
+    start, side = edges[:, 0], edges[:, 1] - edges[:, 0]
+    first, last = np.zeros(len(edges)), np.ones(len(edges))
+    for axis, limit in ((0, width), (1, height)):
+        along = np.where(side[:, axis] != 0.0, side[:, axis], 1e-30)
+        to_low, to_high = (-1.0 - start[:, axis]) / along, (limit + 1.0 - start[:, axis]) / along
+        first, last = np.maximum(first, np.minimum(to_low, to_high)), np.minimum(last, np.maximum(to_low, to_high))
+    steps = np.ceil(2.0 * (last - first) * np.linalg.norm(side, axis=1)) + 1.0
+    edge, step = repeated(np.where(last >= first, steps, 0.0))
+    share = first[edge] + (last - first)[edge] * (step / np.maximum(steps[edge] - 1.0, 1.0))
+    at = np.floor(start[edge] + share[:, None] * side[edge]).astype(np.int64)
+    at = np.clip(at, -1, (width, height)) + 1
+    pairs = np.unique(np.stack([at[:, 1] * (width + 2) + at[:, 0], edge]), axis=1)
+    return pairs[0], pairs[1]

@@ -1,0 +1,1 @@
+"""A .blend in, files out: pictures, bakes, comparisons, tasks."""

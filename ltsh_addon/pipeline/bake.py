@@ -1,0 +1,506 @@
+"""Bakes: the texels of objects, block by block."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from .. import imaging, shading
+from ..scene import AreaLight, Cancelled, SurfaceSamples
+from ..shading.parallel import cores
+from . import picture
+from .bake_files import ErrorPictures, ErrorSums, Planes
+from .picture import Made, percent
+from .tasks import Records, contents_digest, file_stems, options_digest
+
+# Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
+BLOCK_TEXELS = 1 << 18
+
+
+def block_rows(options) -> int:
+    """Rows of texels that are baked at a time."""
+    return max(1, min(options.height, BLOCK_TEXELS // options.width))
+
+
+def shaded_passes(options) -> set[str]:
+    """Passes of `shading.shade` that the wanted ones are made of."""
+    wanted = set(options.passes)
+    if "combined" in wanted:
+        wanted |= {"specular", "diffuse"}
+    return wanted & {"specular", "diffuse"}
+
+
+class ObjectBaker:
+    """Bakes all tiles of one object, or only `tile`, block of rows by block of rows from the top."""
+
+    def __init__(self, options, tables, lights, manifest, record, folder, tile=None):
+        from ..cycles import uv
+        from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
+
+        self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
+        self.mesh = TexelMesh.load(folder / "mesh.npz")
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
+        self.view = BakeView(**manifest["view"])
+        self.manifest = manifest
+        self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
+        self.tiles, self.area = uv.tiles_of(self.mesh.uv)
+        self.wanted = self.tiles if tile is None else [tile]
+        self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
+        if not options.cycles_samples:
+            self.compared = ()
+        self._sample, self._raster = texel_samples, uv.UvTriangles
+        self._seams = uv.UvSeams.of
+
+    def bake(self, stem: str, records, files: list[str], seconds: dict, progress) -> dict:
+        """Write the files of the object that are not finished according to `records` (bake.TileRecords), add all to
+        `files`; the object's record for the report."""
+        name = self.record["name"]
+        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        for tile in self.wanted:
+            file = f"{stem}{self._suffix(tile)}.exr"
+            start = time.perf_counter()
+            record = records.take(name, tile, file)
+            if record is None:
+                found, written = self._tile(tile, stem, progress)
+                record = records.write(name, tile, stem, written, found)
+            seconds[file] = time.perf_counter() - start
+            files += record["files"]
+            found = record["report"]
+            result["tiles"][str(tile)] = {"file": file, **found}
+            if self.area > 0.0:
+                baked = found["covered_times"] / (self.options.width * self.options.height)
+                result["outside"] = max(0.0, 1.0 - baked / self.area)
+        return result
+
+    def _suffix(self, tile) -> str:
+        return "" if len(self.tiles) == 1 else f".{tile}"
+
+    def _tile(self, tile, stem, progress):
+        """Write the files of one tile; its record and their names."""
+        options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
+        path = options.output / file
+        errors, written = ErrorSums(), [file]
+        with self._planes(tile) as planes:
+            record = self._shade(tile, planes, errors, progress)
+            pictures = None
+            if self.compared:
+                size = options.width, options.height
+                pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
+                named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
+                record |= {"pictures": named, "errors": errors.report()}
+                written += named
+            texture = None
+            if options.apply:
+                layer = applied_layer(options)
+                record["texture"] = f"{stem}.{layer}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], layer
+                written.append(record["texture"])
+            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+        return record, written
+
+    def _planes(self, tile) -> Planes:
+        options, seams = self.options, None
+        size = options.width, options.height
+        if options.margin_type == "adjacent" and options.margin > 0:
+            seams = self._seams(self.mesh.uv, self.mesh.vertices, *size, _place(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *size, seams)
+
+    def _shade(self, tile, planes, errors, progress) -> dict:
+        """Shade a tile block by block into `planes`; how many texels there were."""
+        options, covered, covers, overlaps = self.options, 0, 0, 0
+        rows = block_rows(options)
+        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, _place(tile))
+
+        def shaded(first):
+            texels = triangles.texels(first, min(rows, options.height - first), options.conservative)
+            return first, texels, *self._block(tile, first, texels)
+
+        firsts = range(0, options.height, rows)
+        for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
+            covered += len(texels.index)
+            covers += texels.covers
+            overlaps += texels.overlaps
+            planes.put(first, min(rows, options.height - first), texels, values)
+            self._sum_up(errors, values, halves)
+            share = (number + 1) / len(firsts)
+            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
+                raise Cancelled("the bake was stopped")
+        return {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+
+    def _threads(self) -> int:
+        """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
+        return 1 if shading.REFERENCE in self.tables.values() else cores()
+
+    def channels(self) -> list[str]:
+        """Names of the channels of the EXR but for the coverage."""
+        layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
+        if len(self.groups) > 1:
+            names = [group or "ungrouped" for group in self.groups]
+            layers += [f"{layer}@{group}" for layer in layers for group in names]
+        for pass_name in self.compared:
+            layers += [f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")]
+            layers += [f"error_{name}.{pass_name}" for name in self.tables]
+        return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
+
+    def _block(self, tile, first, texels) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Values (Q,) of the channels at the texels (Q) of a block, and Cycles' halves (2, Q, 3) by pass."""
+        maps = None
+        if self.record["maps"]:
+            maps = np.load(self.folder / f"maps_{tile}_{first}.npy")
+
+        def read_map(number):
+            return maps[number].reshape(-1, 3)[texels.index]
+
+        receiver = self.record["receiver"]
+        samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
+        values = {}
+        for name, table in self.tables.items():
+            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table).items():
+                groups = [("", radiance.sum(axis=0))]
+                if len(self.groups) > 1:
+                    groups += [
+                        (f"@{group or 'ungrouped'}", part) for group, part in zip(self.groups, radiance, strict=True)
+                    ]
+                for suffix, image in groups:
+                    _put(values, f"{name}.{pass_name}{suffix}", image)
+        return values, self._compare(tile, first, texels, values)
+
+    def _compare(self, tile, first, texels, values) -> dict[str, np.ndarray]:
+        """Add Cycles' bake of the same texels, and what the techniques have more than it; the halves."""
+        halves = {}
+        for pass_name in shaded_passes(self.options) if self.compared else ():
+            baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
+            halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
+        if "combined" in self.compared:
+            halves["combined"] = halves["specular"] + halves["diffuse"]
+        for pass_name in self.compared:
+            a, b = halves[pass_name]
+            mean = 0.5 * (a + b)
+            for image, pixels in (("cycles", mean), ("cycles_A", a), ("cycles_B", b)):
+                _put(values, f"{image}.{pass_name}", pixels)
+            for name in self.tables:
+                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
+                _put(values, f"error_{name}.{pass_name}", shaded - mean)
+
+        return halves
+
+    def _sum_up(self, errors, values, halves) -> None:
+        """Add a block to the sums that errors follow from."""
+        for pass_name in self.compared:
+            errors.add_halves(pass_name, *halves[pass_name])
+            for name in self.tables:
+                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
+                errors.add(name, pass_name, shaded, *halves[pass_name])
+
+    def _passes(self, samples: SurfaceSamples, texel, count, table) -> dict[str, np.ndarray]:
+        """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
+        found = {}
+        wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
+        workers = 1 if self._threads() > 1 else None
+        if wanted:
+            shaded = shading.shade(samples, self.lights, table, passes=wanted, workers=workers)
+            found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
+        if "diffuse_light" in self.options.passes:
+            first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+            white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
+            light = shading.shade(white, self.lights, table, passes=("diffuse",), workers=workers).diffuse
+            found["diffuse_light"] = _summed(light, texel[first], count)
+        if "combined" in self.options.passes:
+            found["combined"] = found["specular"] + found["diffuse"]
+        return {name: found[name] for name in self.options.passes}
+
+    def _metadata(self, tile) -> dict[str, str]:
+        options, view = self.options, self.view
+        vector = ", ".join(f"{value:g}" for value in view.vector)
+        seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
+        return {
+            "ltsh:scene": Path(options.scene).name,
+            "ltsh:object": self.record["name"],
+            "ltsh:uv": self.record["uv"],
+            "ltsh:tile": str(tile),
+            "ltsh:frame": str(self.manifest["frame"]),
+            "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
+            "ltsh:camera": self.manifest["camera"],
+            "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
+            "ltsh:version": picture.versions(self.manifest["blender_version"])["ltsh"],
+        }
+
+
+def _place(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
+
+
+def _in_order(function, items, threads: int):
+    """Yield function(item) in the order of `items`, of which `threads` are worked on at a time."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting, items = deque(), iter(items)
+        try:
+            for item in itertools.islice(items, threads):
+                waiting.append(pool.submit(function, item))
+            while waiting:
+                found = waiting.popleft().result()
+                for item in itertools.islice(items, 1):
+                    waiting.append(pool.submit(function, item))
+                yield found
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def applied_layer(options) -> str:
+    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
+    pass_name = "combined" if "combined" in options.passes else options.passes[0]
+    return f"{next(iter(picture.technique_names(options.techniques)))}.{pass_name}"
+
+
+def _put(values: dict, layer: str, pixels) -> None:
+    """Add the channels of a layer (Q, 3)."""
+    for channel, letter in enumerate("RGB"):
+        values[f"{layer}.{letter}"] = pixels[:, channel]
+
+
+def _summed(radiance, texel, count):
+    """Radiance (G, count, 3) of texels from that of their samples (G, S, 3)."""
+    if len(texel) == count:
+        return radiance
+    first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+    return np.add.reduceat(radiance, first, axis=1)
+
+
+BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
+SIZES = (64, 8192)
+# Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
+MARGIN_TYPES = ("extend", "adjacent")
+# Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
+NOTED_SHARE_OUTSIDE = 0.01
+
+Progress = Callable[[str, float], "bool | None"]
+
+
+@dataclass(frozen=True)
+class BakeOptions:
+    """What to bake and how; None means as in the file."""
+
+    scene: Path
+    output: Path
+    objects: tuple[str, ...] | str = "all"  # names, "selected" or "all"
+    uv: str | None = None
+    width: int = 1024
+    height: int = 1024
+    margin: int = 16  # texels
+    margin_type: str = "extend"  # one of MARGIN_TYPES
+    conservative: bool = False  # also texels that a triangle touches without covering their center
+    view: tuple[float, float, float] | str = "camera"  # a position in m, "camera" or "above"
+    techniques: tuple[str, ...] = ("ltsh4",)
+    passes: tuple[str, ...] = ("specular", "diffuse")
+    frame: int | None = None
+    camera: str | None = None
+    cycles_samples: int = 0  # 0: no Cycles bake and no error
+    resume: bool = False  # keep what the same job has finished
+    scripts: bool = False  # run those of the file
+    apply: bool = False  # also a texture per object, and a .blend that shows it
+    memory_mib: int = 0  # a bake that needs more is refused; 0: as the environment says, else what is free
+
+
+def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
+    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json and
+    timing.json; return the report with the times as "seconds".
+
+    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
+    but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
+    """
+    check_memory(options)
+    made = bake_objects(options, progress)
+    document = made.report
+    if options.apply and document["objects"]:
+        document["applied"] = apply_textures(
+            options.scene, options.output, document["objects"], applied_layer(options), progress
+        )
+    imaging.write_json(options.output / "report.json", document)
+    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
+    return {**document, "seconds": made.seconds}
+
+
+def bake_objects(
+    options: BakeOptions,
+    progress: Progress | None = None,
+    *,
+    stems: dict[str, str] | None = None,
+    tile: int | None = None,
+    following: tuple[str, ...] = (),
+) -> Made:
+    """Bake the objects and write their files, but no report.json; `stems` are the names of files by object, `tile` is
+    the one UDIM tile that is wanted.
+
+    In `kept_blender` the scene stays open for the next call with the same options: for objects that are named here, or
+    announced as `following`. Raises as `bake_scene` does.
+    """
+    from ..blender.process import client
+
+    start = time.perf_counter()
+    _check(options)
+    tables = picture.prepare(options)
+    client.check_readable(options.scene)
+    tiles = TileRecords(options, stems)
+    with client.temporary_folder() as folder:
+        job = replace(_job(options, tiles.finished), tile=tile, following=following)
+        manifest = client.extract_bake(job, folder, progress=progress)
+        lights = tuple(AreaLight(**record) for record in manifest["lights"])
+        names = [record["name"] for record in manifest["objects"]]
+        found = [stems[name] for name in names] if stems else file_stems(names)
+        records, files, seconds = [], [], {"blender": manifest["seconds"]}
+        for record, stem in zip(manifest["objects"], found, strict=True):
+            if record["problem"] is None:
+                (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
+                baker = ObjectBaker(options, tables, lights, manifest, record, folder / record["folder"], tile)
+                records.append(baker.bake(stem, tiles, files, seconds, progress))
+                shutil.rmtree(folder / record["folder"])
+    document = _report(options, manifest, records)
+    seconds["total"] = time.perf_counter() - start
+    return Made(document, seconds, tuple(files))
+
+
+def check_memory(options: BakeOptions) -> None:
+    """Raise SceneError where the bake of an object needs more memory than there may be."""
+    from ..blender.process import memory
+
+    width, height = options.width, options.height
+    reference = shading.REFERENCE in options.techniques
+    shaded = block_rows(options) * width * (1 if reference else cores())
+    written = min(block_rows(options) + 2 * options.margin, height) * width if options.margin else 0
+    parts = memory.BakeParts(
+        texels=min(shaded, width * height),
+        channels=3 * len(options.techniques) * len(options.passes),
+        margin_texels=written,
+        compared=options.cycles_samples > 0,
+    )
+    memory.check_bake(f"{width}x{height} texels", parts, options.memory_mib)
+
+
+class TileRecords:
+    """Which tiles of objects the same job has finished (with `resume`), and those that follow.
+
+    Where `stems`, names of files by object, are given, no others are looked at.
+    """
+
+    def __init__(self, options: BakeOptions, stems: dict[str, str] | None = None):
+        self._records = Records(options.output, "tiles")
+        self._key = options_digest("bake", options, contents_digest(options))
+        names = None if stems is None else stems.values()
+        whole = self._records.all_whole(self._key, names) if options.resume else []
+        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
+
+    def take(self, name: str, tile: int, file: str) -> dict | None:
+        """What was found for a finished tile of the object `name` in `file`, and its files; else None."""
+        record = self.finished.get((name, tile))
+        return record if record is not None and file in record["files"] else None
+
+    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
+        """Record that a tile is finished."""
+        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
+
+
+def _check(options: BakeOptions) -> None:
+    for side in (options.width, options.height):
+        if not SIZES[0] <= side <= SIZES[1]:
+            raise ValueError(f"size is {options.width}x{options.height}, expected {SIZES[0]} to {SIZES[1]} each")
+    if options.margin_type not in MARGIN_TYPES:
+        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
+    unknown = [name for name in options.passes if name not in BAKE_PASSES]
+    if unknown or not options.passes:
+        raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+
+
+def _job(options, finished):
+    from ..blender.process import client
+
+    shaded = tuple(name for name in ("specular", "diffuse") if name in shaded_passes(options))
+    return client.BakeJob(
+        scene=options.scene,
+        objects=options.objects,
+        uv=options.uv,
+        width=options.width,
+        height=options.height,
+        block_rows=block_rows(options),
+        view=options.view,
+        camera=options.camera,
+        frame=options.frame,
+        scripts=options.scripts,
+        cycles_samples=options.cycles_samples,
+        passes=shaded,
+        finished=tuple(finished),
+    )
+
+
+def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
+    """Save the copy of the .blend whose objects show the textures of `records`, those of a report; its name."""
+    from ..blender.process import client
+
+    textures = []
+    for record in records:
+        files = [
+            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
+            for number, tile in record["tiles"].items()
+        ]
+        name = f"{record['name']} {layer}"
+        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
+    path = output / f"{Path(scene).stem}_baked.blend"
+    client.apply_bake(scene, path, textures, progress=progress)
+    return path.name
+
+
+def _report(options, manifest, records) -> dict:
+    problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
+    lines = [line for record in manifest["objects"] for line in record["warnings"]]
+    warnings = list(dict.fromkeys([*manifest["warnings"], *lines]))
+    for record in records:
+        if record["outside"] > NOTED_SHARE_OUTSIDE:
+            share = f"{100 * record['outside']:.3g} %"
+            warnings.append(
+                f"object {record['name']!r}: {share} of UV map {record['uv']!r} lies outside of the texture, not baked"
+            )
+        for tile in record["tiles"].values():
+            share = tile["overlapping_texels"] / max(tile["texels"], 1)
+            if share > 0.0:
+                share = f"{100 * share:.3g} %"
+                warnings.append(f"object {record['name']!r}: {share} of its texels are covered more than once")
+    return {
+        "scene": str(options.scene),
+        "frame": manifest["frame"],
+        "size": [options.width, options.height],
+        "view": manifest["view"],
+        "objects": records,
+        "problems": problems,
+        "warnings": warnings,
+        "versions": picture.versions(manifest["blender_version"]),
+    }
+
+
+def summary_lines(report: dict, seconds: dict) -> list[str]:
+    """Of one scene, camera and frame: a line per file, and errors where there are any."""
+    found = []
+    for record in report["objects"]:
+        for tile in record["tiles"].values():
+            took = seconds.get(tile["file"])
+            found.append(f"{tile['file']:<40}{tile['texels']:>10} texels" + (f"{took:>8.2f} s" if took else ""))
+            for pass_name, figures in tile.get("errors", {}).items():
+                for name, error in figures["techniques"].items():
+                    beside = "in noise" if error["unbiased_squared_error"] < 0.0 else percent(error["unbiased_error"])
+                    noise = f"(noise {percent(figures['noise'])})"
+                    found.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
+    return found
+
+
+def short_summary(report: dict) -> list[str]:
+    """The same without times, for one of several."""
+    return [f"{report['name']}:", *(f"  {line}" for line in summary_lines(report, {}))]

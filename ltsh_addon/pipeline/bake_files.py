@@ -1,0 +1,211 @@
+"""Files of a bake: planes of texels with margins, signed errors."""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+
+from .. import imaging
+from ..imaging.exr import writing_rows
+from ..imaging.margin import nearest_covered
+
+# Texels that are in memory while the file is written.
+WRITTEN_TEXELS = 1 << 18
+COVERAGE = "coverage.hit.V"
+_OWNER = "owner"  # 1 + the number of the island, 0 where nothing is covered
+
+
+class Planes:
+    """Channels of an image as files, so that only some rows of them need be in memory; a context. Row 0 is below."""
+
+    def __init__(self, folder: Path, names: list[str], width: int, height: int, seams=None):
+        """`seams` (UvSeams): margins show the adjacent faces; None: the nearest texel."""
+        folder.mkdir()
+        self.names, self.shape, self._seams = names, (height, width), seams
+        # A bit per texel, for all that is in memory of the whole image.
+        self._covered = np.zeros((height, -(-width // 8)), dtype=np.uint8)
+        files = [*names, _OWNER] if seams is not None else names
+        self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(files)}
+        self._files = {name: path.open("w+b") for name, path in self._paths.items()}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        for name, file in self._files.items():
+            file.close()
+            self._paths[name].unlink()
+
+    def put(self, first: int, count: int, texels, values) -> None:
+        """Rows from `first`: `values` by channel at the `texels` (Texels)."""
+        width = self.shape[1]
+        covered = np.zeros((count, width), dtype=bool)
+        covered.reshape(-1)[texels.index] = True
+        self._covered[first : first + count] = np.packbits(covered, axis=1)
+        for name, file in self._files.items():
+            rows = np.zeros(count * width, np.int32 if name == _OWNER else np.float32)
+            rows[texels.index] = 1 + self._seams.islands[texels.triangle] if name == _OWNER else values[name]
+            file.seek(4 * first * width)
+            file.write(rows)
+
+    def coverage(self, first: int, last: int) -> np.ndarray:
+        """Mask (last - first, W) of the texels that were put."""
+        return np.unpackbits(self._covered[first:last], axis=1, count=self.shape[1]).view(bool)
+
+    def _rows(self, name, first, last):
+        file, width = self._files[name], self.shape[1]
+        file.seek(4 * first * width)
+        return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
+
+    def _at(self, name, index, dtype=np.float32):
+        """Values of a channel at texels `index` of the whole image."""
+        return np.memmap(self._paths[name], dtype, mode="r")[index]
+
+    def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
+        """Write the EXR with the margin filled, the ErrorPictures (or None) of it, and as `texture`, (path, layer), an
+        EXR with the colors of one layer."""
+        height, width = self.shape
+        rows = max(1, WRITTEN_TEXELS // width)
+        for file in self._files.values():
+            file.flush()
+        with ExitStack() as files:
+            # The last to be entered is the first to take its name: with the large file the tile counts as finished.
+            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], width, height, metadata))
+            small = None
+            if texture is not None:
+                small = files.enter_context(writing_rows(texture[0], "RGB", width, height, metadata))
+            for top in range(height, 0, -rows):
+                bottom = max(top - rows, 0)
+                block = self._filled(bottom, top, margin)
+                writer.write(block)
+                if small is not None:
+                    small.write({letter: block[f"{texture[1]}.{letter}"] for letter in "RGB"})
+                if pictures is not None:
+                    pictures.add(height - top, block)
+            if pictures is not None:
+                pictures.write()
+
+    def _filled(self, bottom, top, margin) -> dict[str, np.ndarray]:
+        """Rows from `bottom` to `top` of all channels with the margin, row 0 on top."""
+        height, width = self.shape
+        low, high = max(bottom - margin, 0), min(top + margin, height)
+        target, source = nearest_covered(self.coverage(low, high), margin)
+        inside = (target >= (bottom - low) * width) & (target < (top - low) * width)
+        target, source = target[inside] - (bottom - low) * width, source[inside]
+        beyond = None
+        if self._seams is not None and len(target):
+            beyond = self._beyond(target + bottom * width, source + low * width)
+        block = {COVERAGE: self.coverage(bottom, top)[::-1].astype(np.float32)}
+        for name in self.names:
+            around = self._rows(name, low, high)
+            plane = around[bottom - low : top - low].copy()
+            plane.reshape(-1)[target] = around.reshape(-1)[source]
+            if beyond is not None:
+                which, index, weights = beyond
+                plane.reshape(-1)[target[which]] = (self._at(name, index) * weights).sum(axis=1)
+            block[name] = plane[::-1]
+        return block
+
+    def _beyond(self, target, source):
+        """Of the texels `target`, to which `source` are the nearest, those that show an adjacent face, (Q,), and the
+        texels (Q, 4) that they show, with weights."""
+        height, width = self.shape
+        points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
+        which, place, island = self._seams.reflected(points + 0.5, near)
+        corner = np.floor(place - 0.5)
+        share = place - 0.5 - corner
+        index, weights = np.empty((len(which), 4), np.int64), np.empty((len(which), 4), np.float32)
+        for number, (x, y) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
+            column, row = corner[:, 0] + x, corner[:, 1] + y
+            within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index[:, number] = np.where(within, row * width + column, 0.0)
+            weight = np.abs(1 - x - share[:, 0]) * np.abs(1 - y - share[:, 1])
+            weights[:, number] = np.where(within, weight, 0.0)
+        # Texels that no face covers, or one beyond another cut, show something else.
+        weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
+        total = weights.sum(axis=1)
+        found = np.flatnonzero(total > 1e-3)
+        return which[found], index[found], weights[found] / total[found, None]
+
+
+LARGEST_PICTURE = 2048
+# The darkest and brightest colors stand for this share of what Cycles' brightest texels show.
+PICTURE_SCALE = 0.1
+PICTURE_PERCENTILE = 99.0
+EMPTY_COLOR = 0.55
+
+
+class ErrorSums:
+    """Sums over texels, from which the figures of `imaging.metrics` follow."""
+
+    def __init__(self):
+        self._products: dict[tuple[str, str], np.ndarray] = {}
+        self._halves: dict[str, np.ndarray] = {}
+
+    def add_halves(self, pass_name: str, a: np.ndarray, b: np.ndarray) -> None:
+        """Two independent halves (Q, 3) of Cycles' bake."""
+        a, b = a.astype(np.float64), b.astype(np.float64)
+        sums = np.array([(a * b).sum(), ((a - b) ** 2).sum(), ((a + b) ** 2).sum(), 0.5 * (a + b).sum()])
+        self._halves[pass_name] = self._halves.get(pass_name, 0.0) + sums
+
+    def add(self, name: str, pass_name: str, shaded: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
+        """What a technique has at the same texels (Q, 3)."""
+        shaded, a, b = (values.astype(np.float64) for values in (shaded, a, b))
+        sums = np.array([((shaded - a) * (shaded - b)).sum(), shaded.sum()])
+        self._products[name, pass_name] = self._products.get((name, pass_name), 0.0) + sums
+
+    def report(self) -> dict:
+        """Per pass: noise of Cycles and for each technique the error without that noise, and the bias."""
+        found = {}
+        for pass_name, (norm, difference, total, light) in self._halves.items():
+            techniques = {}
+            for (name, of_pass), (product, shaded) in self._products.items():
+                if of_pass == pass_name:
+                    squared = product / norm if norm > 0.0 else 0.0
+                    techniques[name] = {
+                        "unbiased_error": math.sqrt(max(squared, 0.0)) if norm > 0.0 else None,
+                        "unbiased_squared_error": squared,
+                        "bias": shaded / light - 1.0 if light > 0.0 else None,
+                    }
+            noise = math.sqrt(difference / total) if total > 0.0 else None
+            found[pass_name] = {"noise": noise, "techniques": techniques}
+        return found
+
+
+class ErrorPictures:
+    """Every n-th texel of errors as PNG beside the EXR `path`: red too bright, blue too dark, gray not baked."""
+
+    def __init__(self, width: int, height: int, path: Path, techniques: list[str], passes: list[str]):
+        self.folder = path.parent
+        self.step = max(1, -(-max(width, height) // LARGEST_PICTURE))
+        layers = [(f"error_{name}.{pass_name}", pass_name) for pass_name in passes for name in techniques]
+        self._pictures = {f"{path.stem}.{layer}.png": (layer, pass_name) for layer, pass_name in layers}
+        self._rows: dict[str, dict[int, np.ndarray]] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the files."""
+        return list(self._pictures)
+
+    def add(self, first: int, planes: dict[str, np.ndarray]) -> None:
+        """Rows (R, W) of the EXR's channels from the row `first`, counted from the top."""
+        picked = slice(-first % self.step, None, self.step), slice(None, None, self.step)
+        for error, pass_name in self._pictures.values():
+            for layer in (error, f"cycles.{pass_name}"):
+                pixels = np.stack([planes[f"{layer}.{letter}"][picked] for letter in "RGB"], axis=-1)
+                self._rows.setdefault(layer, {})[first] = pixels
+        self._rows.setdefault("coverage", {})[first] = planes["coverage.hit.V"][picked]
+
+    def write(self) -> None:
+        """Write the files."""
+        images = {layer: np.concatenate(list(rows.values())) for layer, rows in self._rows.items()}
+        covered = images["coverage"] > 0.0
+        for name, (layer, pass_name) in self._pictures.items():
+            brightness = images[f"cycles.{pass_name}"].max(axis=-1)[covered]
+            scale = PICTURE_SCALE * float(np.percentile(brightness, PICTURE_PERCENTILE)) if brightness.size else 0.0
+            colors = imaging.signed_error_colors(images[layer], scale or 1.0)
+            colors[~covered] = EMPTY_COLOR
+            imaging.write_png(self.folder / name, np.round(255.0 * colors).astype(np.uint8))

@@ -1,0 +1,271 @@
+"""Many tasks one after another, and their reports merged."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+from ..imaging import write_json, write_overview
+from . import bake, picture
+from .tasks import FOLDER, FORMAT, Job, Records, Task, shard_of, tasks_of
+
+OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
+
+Progress = Callable[[str, float], "bool | None"]
+
+
+@dataclass(frozen=True)
+class Done:
+    """How many tasks of the shard were done now, how many were there already, and what was wrong with others."""
+
+    tasks: int
+    done: int
+    kept: int
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TaskState:
+    """Task `number` of `tasks`, from 1, begins, or, where there are `seconds`, has ended."""
+
+    number: int
+    tasks: int
+    name: str
+    seconds: float | None = None
+    problem: str | None = None
+
+
+def run_tasks(
+    job: Job,
+    *,
+    shard: tuple[int, int] = (1, 1),
+    existing: str = OVERWRITE,
+    progress: Progress | None = None,
+    tell: Callable[[TaskState], None] | None = None,
+) -> Done:
+    """Do the tasks of shard (I, N) of `job`, I from 1 to N.
+
+    `existing` says what becomes of tasks that are done already: "overwrite" does them again, "resume" keeps what the
+    same options, version, scene and tables have made, "skip" all that is whole. A task whose scene fails, or whose
+    files cannot be written, is a problem and the others are done all the same, unless it is the only one: then
+    SceneError or OSError is raised. Raises TableError, ValueError, Cancelled at once, and OSError where not even a
+    record can be written.
+    """
+    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.client import temporary_folder
+
+    picture.prepare(job.options)
+    if job.command == "bake":
+        bake.check_memory(job.options)
+    with temporary_folder() as folder, kept_blender(folder):
+        tasks = tasks_of(job, progress)
+        mine = shard_of(tasks, shard)
+        records = Records(job.options.output, "tasks")
+        wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
+        problems = []
+        told = len(wanted) < len(mine)
+        if told:
+            _write_job(job, tasks, existing)
+        for number, task in enumerate(wanted, 1):
+            if tell is not None:
+                tell(TaskState(number, len(wanted), task.name))
+            following = tuple(other.object for other in wanted[number:] if other.unit == task.unit)
+            found, seconds, files = _attempt(job, task, following, existing, progress, alone=len(tasks) == 1)
+            try:
+                # Once: it holds all tasks, which may be thousands.
+                if not told:
+                    _write_job(job, tasks, existing)
+                    told = True
+                _write_timing(job.options.output, task, seconds)
+                records.write(task.name, task.key, task.to_dict(), files, **found)
+            except OSError as error:
+                raise OSError(found.get("problem", str(error))) from error
+            wrong = [found["problem"]] if "problem" in found else found["report"].get("problems", [])
+            problems += wrong
+            if tell is not None:
+                tell(TaskState(number, len(wanted), task.name, seconds["total"], "; ".join(wrong) or None))
+    return Done(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
+
+
+def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
+    """What is to be recorded of a task, its seconds and files; a failure is a "problem", unless `alone`."""
+    from ..blender.process.blender_process import SceneError
+
+    start = time.perf_counter()
+    try:
+        made = _perform(job, task, following, existing, progress)
+        return {"report": made.report}, made.seconds, made.files
+    except (SceneError, OSError) as error:
+        if alone:
+            raise
+        problem = f"{task.name}: {' '.join(str(error).split())}"
+        return {"problem": problem}, {"total": time.perf_counter() - start}, ()
+
+
+def _is_done(records, task, existing) -> bool:
+    record = records.whole(task.name, task.key if existing == RESUME else None)
+    # What was wrong may be put right by now.
+    return record is not None and "problem" not in record and not record["report"].get("problems")
+
+
+def _perform(job: Job, task: Task, following: tuple, existing: str, progress) -> picture.Made:
+    options = task.options(job)
+    if job.command == "bake":
+        options = replace(options, resume=existing == RESUME)
+        stems = {task.object: task.stem}
+        return bake.bake_objects(options, progress, stems=stems, tile=task.tile, following=following)
+    return picture.make_picture(options, job.command == "compare", progress)
+
+
+def _write_job(job, tasks, existing) -> None:
+    """Say what the whole job is: the same from every shard, so that `merge` knows what to wait for."""
+    applied = job.command == "bake" and job.options.apply
+    document = {
+        "format": FORMAT,
+        "command": job.command,
+        "single": job.single,
+        "any_key": existing == SKIP,
+        "applied_layer": bake.applied_layer(job.options) if applied else None,
+        "tasks": [task.to_dict() for task in tasks],
+    }
+    path = Path(job.options.output) / FOLDER / "job.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, document)
+
+
+def _write_timing(output, task, seconds) -> None:
+    path = Path(output) / FOLDER / "timing" / f"{task.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, seconds)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The report, the seconds, the names of tasks that are not done, and what was wrong with others."""
+
+    report: dict
+    seconds: dict
+    missing: tuple[str, ...]
+    problems: tuple[str, ...]
+    command: str
+    single: bool
+
+
+def merge(output: Path, progress=None) -> Merged:
+    """Assemble report.json and timing.json of the job in the folder `output`; of comparisons of several pictures also
+    report.html, and of a bake with `apply` the .blend.
+
+    A report from which something is missing says so under "missing". Raises OSError, and ValueError where there is
+    no job in the folder or nothing of it is done.
+    """
+    output = Path(output)
+    job = _read_job(output)
+    tasks = [Task(**task) for task in job["tasks"]]
+    records = Records(output, "tasks")
+    found = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
+    missing = tuple(task.name for task in tasks if found[task.name] is None)
+    if len(missing) == len(tasks):
+        raise ValueError(f"{output}: no task of its job is done, expected {', '.join(missing[:5])}; run it first")
+    units = [
+        _unit(job, output, list(members), found, progress) for _, members in groupby(tasks, key=lambda task: task.unit)
+    ]
+    units = [unit for unit in units if unit is not None]
+    problems = [problem for _, report in units for problem in report.get("problems", ())]
+    problems += [record["problem"] for record in found.values() if record and "problem" in record]
+    problems += _different_versions(found)
+    seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}
+    if job["single"] and units:
+        report, seconds = units[0][1], _sum_of(seconds.values())
+    else:
+        reports = [{"name": name, **report} for name, report in units]
+        report = {"command": job["command"], "reports": reports, "problems": problems}
+    if missing:
+        report = {**report, "missing": list(missing)}
+    write_json(output / "report.json", report)
+    write_json(output / "timing.json", {"seconds": seconds})
+    if job["command"] == "compare" and "reports" in report:
+        write_overview(output, "report.html", report)
+    return Merged(report, seconds, missing, tuple(problems), job["command"], job["single"])
+
+
+def _read_job(output: Path) -> dict:
+    path = output / FOLDER / "job.json"
+    try:
+        job = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise ValueError(
+            f"{output}: no task has finished there; expected the folder that was given to -o of shade, compare or bake"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{path}: is damaged ({error}); run the job again with --resume") from None
+    if not isinstance(job, dict) or job.get("format") != FORMAT:
+        raise ValueError(f"{path}: was written by another version of LTSH, expected format {FORMAT}; run the job again")
+    return job
+
+
+def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
+    """Name and report of one picture, or of the objects of one bake; None where nothing of it is done."""
+    records = [found[task.name] for task in tasks if found[task.name] and "report" in found[task.name]]
+    if not records:
+        return None
+    files = sorted(file for record in records for file in record["files"])
+    reports = [record["report"] for record in records]
+    if job["command"] != "bake":
+        return tasks[0].name, reports[0] if job["single"] else {"files": files, **reports[0]}
+    report = {
+        **reports[0],
+        "objects": _objects(item for part in reports for item in part["objects"]),
+        "problems": list(dict.fromkeys(line for part in reports for line in part["problems"])),
+        "warnings": list(dict.fromkeys(line for part in reports for line in part["warnings"])),
+    }
+    if job["applied_layer"] and report["objects"]:
+        report["applied"] = bake.apply_textures(
+            Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
+        )
+    name = " ".join(str(part) for part in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if part is not None)
+    return name, report if job["single"] else {"files": files, **report}
+
+
+def _objects(items) -> list[dict]:
+    """Reports of objects, each once with all of its tiles."""
+    objects: dict[str, dict] = {}
+    for item in items:
+        known = objects.setdefault(item["name"], {**item, "tiles": {}})
+        known["tiles"] |= item["tiles"]
+    return list(objects.values())
+
+
+def _different_versions(found) -> list[str]:
+    """What to say where shards ran on different versions: their results must not be mixed."""
+    names = {}
+    for name, record in found.items():
+        if record and "report" in record:
+            names.setdefault(json.dumps(record["report"]["versions"], sort_keys=True), name)
+    if len(names) < 2:
+        return []
+    (first, a), (second, b) = list(names.items())[:2]
+    return [f"{a} and {b} were made by different versions, {first} and {second}: do one of them again"]
+
+
+def _read_seconds(output, task) -> dict:
+    try:
+        return json.loads((output / FOLDER / "timing" / f"{task.name}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _sum_of(seconds) -> dict:
+    """The seconds of several tasks as those of one."""
+    total: dict = {}
+    for part in seconds:
+        for name, value in part.items():
+            before = total.get(name)
+            if isinstance(value, dict):
+                total[name] = _sum_of([before or {}, value])
+            else:
+                total[name] = value + (before or 0.0)
+    return total

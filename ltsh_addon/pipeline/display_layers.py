@@ -1,0 +1,138 @@
+"""Results as one small EXR per picture, which Blender's Image Editor shows as they are, and an index of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .. import imaging, shading
+from ..imaging.exr import write_channels
+from ..imaging.report import FILE, write_index
+from ..imaging.sheet import common_error_scale
+
+FOLDER = "images"
+CYCLES = "cycles"
+ERROR = "error_"
+COMBINED = "combined"
+# As on the buttons of the panels.
+LABELS = {"ltc": "LTC", "ltsh2": "LTSH 2", "ltsh4": "LTSH 4", "reference": "Reference", CYCLES: "Cycles"}
+FILES = {"shade": "shade.exr", "compare": "compare.exr"}
+
+
+def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
+    """Write OUT/images/<layer>.exr and index.json for what `command` left in `output`; the folder.
+
+    `partial` says what is missing, where something is.
+    """
+    folder = output / FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    if command == "bake":
+        groups = {}
+        for record in report["objects"]:
+            for tile in record["tiles"].values():
+                path = output / tile["file"]
+                groups[path.stem] = _group(path, folder, f"{path.stem}.", {})
+    else:
+        groups = {"": _group(output / FILES[command], folder, "", report["passes"])}
+    index = {"command": command, "partial": partial, "groups": groups, "report": report}
+    write_index(folder, index)
+    _remove_others(folder, groups)
+    return folder
+
+
+def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
+    """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
+    layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
+    names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
+    passes = [name for name in ("specular", "diffuse", "diffuse_light", COMBINED) if f"{names[0]}.{name}" in layers]
+    _add_combined(layers, names, passes)
+    written = {}
+    for name in names:
+        for pass_name in passes:
+            for layer in (f"{name}.{pass_name}", f"{ERROR}{name}.{pass_name}"):
+                if layer in layers:
+                    written[layer] = f"{prefix}{layer}.exr"
+                    write_channels(folder / written[layer], _unnamed(layers[layer]))
+    height, width = layers[f"{names[0]}.{passes[0]}"].shape[:2]
+    return {
+        "size": [width, height],
+        "names": names,
+        "labels": {name: LABELS.get(name, name) for name in names},
+        "passes": passes,
+        "files": written,
+        "multilayer": path.name,
+        "figures": _figures(layers, names, passes, report),
+        "scales": {pass_name: _scale(layers, names, pass_name) for pass_name in passes},
+    }
+
+
+def _techniques(layers) -> list[str]:
+    """Names that have radiance, techniques in their usual order, then tables of the user, Cycles last."""
+    passes = ("specular", "diffuse", "diffuse_light", COMBINED)
+    found = {name.rpartition(".")[0] for name in layers if name.rpartition(".")[2] in passes}
+    usual = (*shading.SHIPPED_TABLES, shading.REFERENCE)
+    others = sorted(found - {*usual, CYCLES})
+    return [name for name in (*usual, *others, CYCLES) if name in found]
+
+
+def _add_combined(layers, names, passes) -> None:
+    """Specular and diffuse together, where both are there and their sum is not."""
+    if COMBINED in passes or not {"specular", "diffuse"} <= set(passes):
+        return
+    for name in names:
+        for layer in (name, ERROR + name, f"{name}_A", f"{name}_B"):
+            if f"{layer}.specular" in layers:
+                layers[f"{layer}.{COMBINED}"] = layers[f"{layer}.specular"] + layers[f"{layer}.diffuse"]
+    passes.append(COMBINED)
+
+
+def _unnamed(pixels: np.ndarray) -> dict:
+    """Channels R, G and B without a layer's name, as any program reads them."""
+    return {letter: pixels[..., index] for index, letter in enumerate("RGB")}
+
+
+def _scale(layers, names, pass_name) -> float:
+    """The radiance at which the colors of the error end."""
+    picture = layers[f"{names[-1]}.{pass_name}"]
+    errors = [layers[layer] for name in names if (layer := f"{ERROR}{name}.{pass_name}") in layers]
+    if not errors:
+        errors = [layers[f"{name}.{pass_name}"] - picture for name in names[:-1]]
+    return common_error_scale(errors, picture)
+
+
+def _figures(layers, names, passes, report) -> dict:
+    """Errors against Cycles by pass and technique: those of the report by pass, and of what is not in it."""
+    figures = {}
+    for pass_name in passes if CYCLES in names else ():
+        known = report.get(pass_name)
+        if known is not None:
+            rows = {name: row["against_cycles"] for name, row in known["techniques"].items()}
+            figures[pass_name] = {"noise": known["noise"], "techniques": rows}
+        else:
+            figures[pass_name] = _measured(layers, names, pass_name)
+    return figures
+
+
+def _measured(layers, names, pass_name) -> dict:
+    halves = [layers[f"cycles_{half}.{pass_name}"] for half in "AB"]
+    hit, mean = layers["coverage.hit"] > 0.0, layers[f"{CYCLES}.{pass_name}"]
+    rows = {}
+    for name in names:
+        if name == CYCLES:
+            continue
+        picture = layers[f"{name}.{pass_name}"]
+        # The reference may stand for a part of the pixels only, the others are black.
+        mask = hit & picture.any(axis=-1) if name == shading.REFERENCE else hit
+        statistics = imaging.noisy_error_statistics(picture, *halves, mask).to_dict()
+        flip = imaging.mean_flip(mean, np.where(mask[..., None], picture, mean), mask)
+        rows[name] = {**statistics, "flip": flip}
+    return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
+
+
+def _remove_others(folder: Path, groups: dict) -> None:
+    """Remove pictures of an earlier run, which would be taken for those of this one."""
+    kept = {FILE} | {name for group in groups.values() for name in group["files"].values()}
+    for path in folder.iterdir():
+        if path.name not in kept and path.suffix == ".exr":
+            path.unlink()

@@ -1,0 +1,162 @@
+"""Lookup tables for other engines: `ltsh tables export` writes one EXR and one header per table (tables/EXPORT.md).
+
+The EXR holds every stored quantity as a channel over the grid of the table, the header all numbers and the functions
+that shade with them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..files import replacing
+from ..imaging.exr import write_channels
+from ..scene import VERSION
+from ..shading import load_table
+from ..shading.header import header_text
+from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
+from ..shading.spherical_harmonics import hemisphere_integrals
+
+_WARP_NAMES = ("A", "B", "C", "tilt")
+
+
+class _ImageError(Exception):
+    """The EXR cannot be written; no OSError, so that its message passes through the file around it as it is."""
+
+
+def export_tables(
+    prefixes: Mapping[str, str], folder: str | os.PathLike, progress: Callable[[str, float], object] | None = None
+) -> dict[str, list[Path]]:
+    """Write the tables of `export_prefixes` into `folder`, which is made; returns the files by table.
+
+    All tables are read before anything is written, and of each table both files appear or none. Raises TableError,
+    OSError.
+    """
+    folder = Path(folder)
+    tables = {given: load_table(given) for given in prefixes}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another with -o") from error
+    files = {}
+    for number, (given, table) in enumerate(tables.items(), start=1):
+        files[given] = export_table(table, Path(given).stem, prefixes[given], folder)
+        if progress is not None:
+            progress("export", number / len(tables))
+    return files
+
+
+def export_prefixes(given: list[str] | tuple[str, ...]) -> dict[str, str]:
+    """What the names in the header of each table, shipped or a path, begin with; raises ValueError where two agree."""
+    prefixes: dict[str, str] = {}
+    for name in dict.fromkeys(given):
+        prefix = identifier(Path(name).stem)
+        other = next((other for other, taken in prefixes.items() if taken == prefix), None)
+        if other is not None:
+            raise ValueError(f"tables {other} and {name} would get the same names ({prefix}); export one at a time")
+        prefixes[name] = prefix
+    return prefixes
+
+
+def identifier(name: str) -> str:
+    """`name` as the beginning of identifiers in C and GLSL, apart from those that both headers and GLSL use."""
+    words = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    return words if re.match(r"[a-z]", words) and words not in ("gl", "ltsh") else f"table_{words}".rstrip("_")
+
+
+def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> list[Path]:
+    """Write `folder`/`name`.exr and .h, both or none; returns them. Raises OSError."""
+    image, header = folder / f"{name}.exr", folder / f"{name}.h"
+    text = header_text(table, prefix, _about(table, name))
+    try:
+        with replacing(header) as temporary:
+            temporary.write_text(text, encoding="ascii", newline="\n")
+            try:
+                write_channels(image, table_channels(table), _attributes(table))
+            except OSError as error:
+                raise _ImageError(str(error)) from error
+    except _ImageError as error:
+        raise OSError(str(error)) from error
+    return [image, header]
+
+
+def table_channels(table: LookupTable) -> dict[str, np.ndarray]:
+    """All quantities (R, T), float32, by the name of their channel; row 0 is roughness 0, column 0 is theta_o = 0."""
+    channels = {f"warp.{_WARP_NAMES[n]}": table.warp[..., n] for n in range(table.warp.shape[2])}
+    albedo = _directional_albedo(table)
+    for curve in range(table.coefficients.shape[2]):
+        for k, suffix in enumerate(_coefficient_suffixes(table)):
+            channels[f"curve{curve}.c{suffix}"] = table.coefficients[:, :, curve, k]
+        channels[f"curve{curve}.albedo"] = albedo[..., curve]
+        average = table.average_albedo[:, None, curve]
+        channels[f"curve{curve}.average_albedo"] = np.broadcast_to(average, table.warp.shape[:2])
+    return {name: np.ascontiguousarray(plane, dtype=np.float32) for name, plane in channels.items()}
+
+
+def _coefficient_suffixes(table) -> list[str]:
+    if table.family == "ltc":
+        return [""]
+    return [f"_{l}_{m}" for l in range(table.degree + 1) for m in range(l + 1)]  # noqa: E741 (the field's letter)
+
+
+def _directional_albedo(table) -> np.ndarray:
+    """(R, T, F): integral over the hemisphere of the lobe of every node and curve."""
+    coefficients = table.coefficients.astype(float)
+    if table.family == "ltc":
+        return coefficients[..., 0] * (0.5 + 0.5 * np.cos(table.warp[..., 3:].astype(float)))
+    return coefficients @ hemisphere_integrals(table.degree)
+
+
+def _attributes(table) -> dict[str, str]:
+    """EXR attributes; arrays as JSON, so that the image alone is enough to rebuild the table."""
+    conventions = {
+        "table": table.name,
+        "family": table.family,
+        "degree": table.degree,
+        "made_by": f"ltsh tables export {VERSION}",
+        "rows": "top to bottom: roughness, uniform from 0 to 1; alpha = roughness^2 of GGX",
+        "columns": "left to right: theta_o, uniform in 1 - sqrt(1 - theta_o / 90 deg) from 0 to 1",
+        "frame": "z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o)",
+        "lobe": "BRDF times cosine in sr^-1 = D_orig(W w / |W w|) |W| / |W w|^3",
+        "W": "[[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 max(alpha, min_alpha)]]",
+        "g^2": f"cos^2(theta_o) + {WARP_REGULARIZATION**2} max(alpha, min_alpha)^2 sin^2(theta_o)",
+        "min_alpha": MIN_ALPHA,
+        "D_orig": _original(table),
+        "lookup": "bilinear in the stored channels",
+        "fresnel_curves": _curve_names(table),
+        "fit": table.metadata,
+    }
+    fresnel = {
+        "cosine_count": table.fresnel_curves.shape[1],
+        "curves": table.fresnel_curves.tolist(),
+        "ior": table.fresnel_ior.tolist(),
+        "dielectric_weights": table.fresnel_weights.tolist(),
+    }
+    return {"ltsh:conventions": json.dumps(conventions), "ltsh:fresnel": json.dumps(fresnel)}
+
+
+def _original(table) -> str:
+    if table.family == "ltc":
+        return "c max(0, w . (sin(tilt), 0, cos(tilt))) / pi"
+    return "sum c_l_m Y_lm, Y_lm = K_lm P_l^(m)(z) Re((x + i y)^m), orthonormal, P_l^(m) the m-th derivative"
+
+
+def _curve_names(table) -> list[str]:
+    count = table.coefficients.shape[2]
+    return list(table.metadata.get("fresnel_curve_names") or (f"curve {n}" for n in range(count)))
+
+
+def _about(table, name) -> str:
+    curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
+    return f"""\
+{name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
+Made by `ltsh tables export` {VERSION} (SPDX-License-Identifier: GPL-3.0-or-later). C99, C++ and GLSL 3.30.
+Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
+Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
+{curves}
+Every function is explained where it stands; tables/EXPORT.md of LTSH has examples."""

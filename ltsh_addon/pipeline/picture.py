@@ -1,0 +1,537 @@
+"""Pictures: techniques beside each other and beside Cycles, and the files of a comparison."""
+
+from __future__ import annotations
+
+import itertools
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import imaging, shading
+from ..scene import VERSION, Cancelled, Film, SurfaceSamples
+
+DEFAULT_TECHNIQUES = ("ltc", "ltsh2", "ltsh4", shading.REFERENCE)
+REFERENCE_SEED = 20160725
+LABELS = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", shading.REFERENCE: "Reference quadrature"}
+
+Progress = Callable[[str, float], "bool | None"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to shade and how; None means as in the file."""
+
+    scene: Path
+    output: Path
+    techniques: tuple[str, ...] = DEFAULT_TECHNIQUES
+    passes: tuple[str, ...] = shading.PASSES
+    width: int | None = None
+    height: int | None = None
+    sub_samples: int = 1
+    frame: int | None = None
+    camera: str | None = None
+    cycles_samples: int = 512  # of both halves together
+    reference_samples: int = 150_000  # above this many, `reference` takes a random subset
+    name: str | None = None  # stem of the files, below `output`; None: "shade" or "compare"
+    page: str = "report.html"  # of a comparison
+    scripts: bool = False  # run those of the file
+    memory_mib: int = 0  # a picture that needs more is refused; 0: as the environment says, else what is free
+
+
+@dataclass(frozen=True)
+class Result:
+    """One technique on the samples, or on a subset (Q,) of them: radiance per pass (G, Q, 3), time per pass."""
+
+    shading: shading.Shading
+    seconds: dict[str, float]
+    subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
+
+
+@dataclass(frozen=True)
+class Made:
+    """What a task has done: its report, the seconds it took, and its files by their names below the output folder."""
+
+    report: dict
+    seconds: dict
+    files: tuple[str, ...]
+
+
+def shade_scene(options: Options, progress: Progress | None = None) -> dict:
+    """Shade a scene per pixel, write shade.exr, report.json and timing.json; the report with times as "seconds".
+
+    Raises SceneError, TableError, OSError, Cancelled.
+    """
+    return _with_report(options, False, progress)
+
+
+def compare_scene(options: Options, progress: Progress | None = None) -> dict:
+    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html too."""
+    return _with_report(options, True, progress)
+
+
+def _with_report(options, with_cycles, progress):
+    from .. import imaging
+
+    picture = make_picture(options, with_cycles, progress)
+    imaging.write_json(Path(options.output) / "report.json", picture.report)
+    imaging.write_json(Path(options.output) / "timing.json", {"seconds": picture.seconds})
+    return {**picture.report, "seconds": picture.seconds}
+
+
+def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
+    """Tables by the names under which techniques appear in results; proves that the output folder takes files.
+
+    Done before anything takes long. Raises TableError, OSError.
+    """
+    tables = load_tables(options.techniques)
+    _make_writable(Path(options.output))
+    return tables
+
+
+def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
+    """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
+    names = technique_names(techniques)
+    return {name: given if given == shading.REFERENCE else _table(given) for name, given in names.items()}
+
+
+def _table(given: str) -> shading.LookupTable:
+    return _shipped_table(given) if given in shading.SHIPPED_TABLES else shading.load_table(given)
+
+
+@cache
+def _shipped_table(name: str) -> shading.LookupTable:
+    """Read once: a job of many frames needs it for each."""
+    return shading.load_table(name)
+
+
+def technique_names(techniques: Sequence[str]) -> dict[str, str]:
+    """What was given, by the names under which techniques appear in results: those of tables are short."""
+    names = {}
+    for given in techniques:
+        name = given if given in (*shading.SHIPPED_TABLES, shading.REFERENCE) else _short_name(given, names)
+        names[name] = given
+    return names
+
+
+def _short_name(path: str, taken) -> str:
+    """The name of a table's file without folder and dots, which separate the parts of a layer's name."""
+    stem = Path(path).stem.replace(".", "_")
+    candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
+    reserved = {*shading.SHIPPED_TABLES, shading.REFERENCE, "cycles", *taken}
+    return next(name for name in candidates if name not in reserved)
+
+
+def make_picture(options: Options, with_cycles: bool, progress: Progress | None = None) -> Made:
+    """Shade one picture, beside Cycles where asked for, and write its files but report.json.
+
+    Raises as `shade_scene` does.
+    """
+    from ..blender.process import client
+
+    if with_cycles and options.cycles_samples < 2:
+        raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
+    start = time.perf_counter()
+    tables = prepare(options)
+    extraction = client.extract(
+        client.ExtractOptions(
+            scene=options.scene,
+            width=options.width,
+            height=options.height,
+            sub_samples=options.sub_samples,
+            cycles_samples=options.cycles_samples if with_cycles else 0,
+            frame=options.frame,
+            camera=options.camera,
+            scripts=options.scripts,
+            techniques=len(tables),
+            memory_mib=options.memory_mib,
+        ),
+        progress=progress,
+    )
+    results = {name: _evaluate(name, table, extraction, options, progress) for name, table in tables.items()}
+
+    comparison = Comparison(options, extraction, results)
+    report = comparison.report()
+    files = comparison.write(Path(options.output), report, with_cycles, progress)
+    techniques = {name: result.seconds for name, result in results.items()}
+    seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
+    return Made(report, seconds, tuple(files))
+
+
+def _make_writable(path: Path) -> None:
+    """Make the output folder and prove that it takes files."""
+    from ..files import check_takes_files
+
+    try:
+        check_takes_files(path)
+    except OSError as error:
+        raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
+
+
+def _evaluate(name, table, extraction, options, progress) -> Result:
+    """Shade all samples, or for the reference those of randomly chosen pixels where the image is large."""
+    samples, subset = extraction.samples, None
+    if name == shading.REFERENCE and len(samples) > options.reference_samples:
+        subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
+        samples = samples.take(subset)
+
+    shaded, seconds = {}, {}
+    for index, pass_name in enumerate(options.passes):
+
+        def report(fraction, done=index):
+            whole = (done + fraction) / len(options.passes)
+            return None if progress is None else progress(LABELS.get(name, name), whole)
+
+        if report(0.0) is False:
+            raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
+        start = time.perf_counter()
+        shaded[pass_name] = shading.shade(samples, extraction.lights, table, passes=(pass_name,), progress=report)
+        seconds[pass_name] = time.perf_counter() - start
+    return Result(_joined(shaded), seconds, subset)
+
+
+def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
+    """One Shading of those of single passes."""
+    first = next(iter(shaded.values()))
+    passes = {name: getattr(part, name) for name, part in shaded.items()}
+    error = shaded["specular"].quadrature_error if "specular" in shaded else None
+    return shading.Shading(first.groups, passes.get("specular"), passes.get("diffuse"), error)
+
+
+def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:
+    """Sorted indices of at most `limit` samples: all those of some pixels, which a seeded generator chose."""
+    generator = np.random.default_rng(REFERENCE_SEED)
+    order = generator.permutation(film.width * film.height)
+    count = np.bincount(film.pixel, minlength=len(order))[order]
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[order[np.cumsum(count) <= limit]] = True
+    return np.nonzero(chosen[film.pixel])[0]
+
+
+def material_classes(samples: SurfaceSamples) -> dict[str, np.ndarray]:
+    """Masks (P,) of the samples whose specular lobe is mostly a metal's, or mostly a dielectric's."""
+    metal = samples.specular_f90.max(axis=1, initial=0.0)
+    dielectric = samples.dielectric.max(axis=1, initial=0.0)
+    return {
+        "metals": (metal > dielectric) & (metal > 0.0),
+        "dielectrics": (dielectric >= metal) & (dielectric > 0.0),
+    }
+
+
+def versions(blender_version: str) -> dict[str, str]:
+    """Versions that a result depends on."""
+    import OpenEXR
+
+    return {
+        "ltsh": VERSION,
+        "blender": blender_version,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "OpenEXR": getattr(OpenEXR, "__version__", "unknown"),
+    }
+
+
+def known_technique(name: str) -> bool:
+    """True for shipped tables, "reference", and paths of .npz files."""
+    names: Sequence[str] = (*shading.SHIPPED_TABLES, shading.REFERENCE)
+    return name in names or name.endswith(".npz")
+
+
+def percent(value) -> str:
+    """A share as text."""
+    return "-" if value is None else f"{100.0 * value:.2f} %"
+
+
+def unbiased(figures: dict) -> str:
+    """The error against two noisy halves; its square is negative where the noise is all there is to see."""
+    squared = figures.get("unbiased_squared_error")
+    return "in noise" if squared is not None and squared < 0.0 else percent(figures.get("unbiased_relative_error"))
+
+
+def summary_lines(report: dict, seconds: dict) -> list[str]:
+    """A table of one picture: errors and seconds per pass and technique."""
+    found = []
+    for pass_name, figures in report["passes"].items():
+        noise = f", noise of Cycles {percent(figures['noise'])}" if "noise" in figures else ""
+        found.append(f"{pass_name}{noise}")
+        heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
+        found.append(f"  {'technique':<12}{heads}")
+        for name, row in figures["techniques"].items():
+            reference = row.get("against_reference", {})
+            classes = [percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
+            cycles, truth = unbiased(row.get("against_cycles", {})), percent(reference.get("relative_l2"))
+            errors = f"{cycles:>12}{truth:>14}{classes[0]:>10}{classes[1]:>13}"
+            took = seconds.get("techniques", {}).get(name, {}).get(pass_name)
+            found.append(f"  {name:<12}{errors}" + (f"{took:>8.2f}" if took is not None else f"{'-':>8}"))
+    return found
+
+
+def short_summary(report: dict) -> list[str]:
+    """A line for a picture: the errors of one pass, against Cycles where there is one."""
+    passes = report["passes"]
+    pass_name = "specular" if "specular" in passes else next(iter(passes))
+    errors = []
+    for name, row in passes[pass_name]["techniques"].items():
+        if "against_cycles" in row:
+            errors.append(f"{name} {unbiased(row['against_cycles'])}")
+        elif "against_reference" in row:
+            errors.append(f"{name} {percent(row['against_reference']['relative_l2'])}")
+    return [f"{report['name']:<32}" + (f" {pass_name}: " + ", ".join(errors) if errors else "")]
+
+
+# Layers of the G-buffer: field of SurfaceSamples and its channel letters.
+SAMPLE_LAYERS = {
+    "position": "XYZ",
+    "view": "XYZ",
+    "normal": "XYZ",
+    "diffuse_normal": "XYZ",
+    "geometric_normal": "XYZ",
+    "smooth_normal": "XYZ",
+    "bump_alpha2": "V",
+    "roughness": "V",
+    "specular_f0": "RGB",
+    "specular_f90": "RGB",
+    "specular_dip": "RGB",
+    "dielectric": "RGB",
+    "ior": "V",
+    "diffuse_albedo": "RGB",
+    "receiver": "V",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The results of one scene, ready to be measured and written."""
+
+    options: Options
+    extraction: Any  # blender.child.Extraction, which the core does not import
+    results: dict[str, Result]
+
+    @property
+    def film(self) -> Film:
+        return self.extraction.film
+
+    @property
+    def cycles(self) -> dict[str, np.ndarray]:
+        """Halves (2, H, W, 3) per pass; empty without a Cycles reference."""
+        return self.extraction.reference or {}
+
+    @cached_property
+    def images(self) -> dict[tuple[str, str], np.ndarray]:
+        """Image (H, W, 3) per technique and pass, summed over light groups."""
+        return {
+            (name, pass_name): self._image(result, self._radiance(result, pass_name).sum(axis=0))
+            for name, result in self.results.items()
+            for pass_name in self.options.passes
+        }
+
+    def _radiance(self, result, pass_name) -> np.ndarray:
+        return self.extraction.exposure * getattr(result.shading, pass_name)
+
+    def _image(self, result, values) -> np.ndarray:
+        return self._film_of(result).image(values)
+
+    def _film_of(self, result) -> Film:
+        if result.subset is None:
+            return self.film
+        return self.film.take(result.subset)
+
+    def _mask(self, result) -> np.ndarray:
+        """Pixels (H, W) that see a surface and, for a subset, were evaluated."""
+        return self._film_of(result).coverage() > 0.0
+
+    # -- figures ------------------------------------------------------------------------------------------------------
+
+    def report(self) -> dict:
+        """The report as a JSON-able document."""
+        extraction, options = self.extraction, self.options
+        return {
+            "scene": str(options.scene),
+            "camera": extraction.camera,
+            "frame": extraction.frame,
+            "resolution": [self.film.width, self.film.height],
+            "border": None if extraction.border is None else vars(extraction.border),
+            "pixel_aspect": extraction.pixel_aspect,
+            "pixel_filter": extraction.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
+            "exposure": extraction.exposure,
+            "color_space": extraction.color_space.name,
+            "sub_samples": self.film.sub_samples,
+            "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
+            "cycles_samples": options.cycles_samples if self.cycles else 0,
+            "lights": [_light_report(light) for light in extraction.lights],
+            "versions": versions(extraction.blender_version),
+            "tables": dict(zip(self.results, options.techniques, strict=True)),
+            "reference": self._reference_facts(),
+            "passes": {name: self._pass_report(name) for name in options.passes},
+            "warnings": list(extraction.warnings),
+        }
+
+    def _reference_facts(self) -> dict | None:
+        result = self.results.get(shading.REFERENCE)
+        if result is None:
+            return None
+        count = len(self.extraction.samples) if result.subset is None else len(result.subset)
+        error = result.shading.quadrature_error
+        return {
+            "samples": count,
+            "of": len(self.extraction.samples),
+            "seed": None if result.subset is None else REFERENCE_SEED,
+            "largest_error_estimate": None if error is None or not len(error) else float(error.max()),
+        }
+
+    def _subset_notice(self) -> str:
+        """What to know about the reference where it stands for a part of the samples only, else nothing."""
+        facts = self._reference_facts()
+        if facts is None or facts["samples"] == facts["of"]:
+            return ""
+        return f"reference on {facts['samples']} of {facts['of']} samples, randomly chosen pixels; elsewhere zero"
+
+    def _pass_report(self, pass_name: str) -> dict:
+        report = {}
+        if self.cycles:
+            halves = self.cycles[pass_name]
+            report["noise"] = imaging.reference_noise(halves[0], halves[1], self.film.coverage() > 0.0)
+        report["techniques"] = {name: self._technique_report(name, pass_name) for name in self.results}
+        return report
+
+    def _technique_report(self, name: str, pass_name: str) -> dict:
+        result = self.results[name]
+        report = {}
+        if self.cycles:
+            halves = self.cycles[pass_name]
+            statistics = imaging.noisy_error_statistics(
+                self.images[name, pass_name], halves[0], halves[1], self._mask(result)
+            )
+            # Only pixels that the technique has shaded may differ.
+            shaded = np.where(self._mask(result)[..., None], self.images[name, pass_name], halves.mean(axis=0))
+            rec709, mask = self.extraction.color_space.rec709, self._mask(result)
+            difference = imaging.mean_flip(rec709(halves.mean(axis=0)), rec709(shaded), mask)
+            report["against_cycles"] = {**statistics.to_dict(), "flip": difference}
+        reference = self.results.get(shading.REFERENCE)
+        if reference is not None and name != shading.REFERENCE:
+            report["against_reference"] = self._against_reference(result, reference, pass_name)
+        return report
+
+    def _against_reference(self, result, reference, pass_name) -> dict:
+        """Statistics per sample, over all samples and over those of each class of material."""
+        index = slice(None) if reference.subset is None else reference.subset
+        values = self._radiance(result, pass_name).sum(axis=0)[index]
+        truth = self._radiance(reference, pass_name).sum(axis=0)
+        report = imaging.error_statistics(values, truth).to_dict()
+        for label, mask in material_classes(self.extraction.samples.take(index)).items():
+            report[label] = imaging.error_statistics(values, truth, mask).to_dict()
+        return report
+
+    # -- files --------------------------------------------------------------------------------------------------------
+
+    def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> list[str]:
+        """Write all files into the folder `output`, once all that goes into them is there; their names."""
+        if progress is not None and progress("write", 0.0) is False:
+            raise Cancelled("stopped before the files were written")
+        name = self.options.name or ("compare" if with_cycles else "shade")
+        metadata = {
+            "ltsh:scene": Path(self.options.scene).name,
+            "ltsh:frame": str(self.extraction.frame),
+            "ltsh:camera": self.extraction.camera,
+            "ltsh:version": document["versions"]["ltsh"],
+            "ltsh:exposure": repr(self.extraction.exposure),
+            "ltsh:color_space": self.extraction.color_space.name,
+        }
+        if self.extraction.border is not None:
+            metadata["ltsh:border"] = str(self.extraction.border)
+        if notice := self._subset_notice():
+            metadata["ltsh:reference"] = notice
+        layers, sheet = self.layers(), self.sheet() if with_cycles else None
+        chromaticities = imaging.chromaticities(self.extraction.color_space)
+        files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
+        (output / files[0]).parent.mkdir(parents=True, exist_ok=True)
+        imaging.write_layers(output / files[0], layers, metadata, chromaticities, self.extraction.pixel_aspect)
+        if with_cycles:
+            imaging.write_png(output / files[1], sheet)
+            imaging.write_html(output, self.options.page, files[1], files[0], document)
+        if progress is not None:
+            progress("write", 1.0)
+        return files
+
+    def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
+        """All layers of the EXR by name."""
+        layers = {}
+        for (name, pass_name), image in self.images.items():
+            layers[f"{name}.{pass_name}"] = image
+            result = self.results[name]
+            groups = result.shading.groups
+            if len(groups) > 1:
+                for group, values in zip(_group_names(groups), self._radiance(result, pass_name), strict=True):
+                    layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)
+        for pass_name, halves in self.cycles.items():
+            if pass_name not in self.options.passes:
+                continue
+            mean = halves.mean(axis=0)
+            layers[f"cycles.{pass_name}"] = mean
+            for half, pixels in zip("AB", halves, strict=True):
+                layers[f"cycles_{half}.{pass_name}"] = pixels
+            for name, result in self.results.items():
+                error = self.images[name, pass_name] - mean
+                layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
+        # Of a surface with several lobes its first.
+        first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
+        film = self.film.take(first)
+        for field, letters in SAMPLE_LAYERS.items():
+            values = getattr(self.extraction.samples, field)[first]
+            layers[f"samples.{field}"] = imaging.Layer(film.image(values), letters)
+        layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
+        return layers
+
+    def sheet(self) -> np.ndarray:
+        """The comparison sheet (H, W, 3), 8 bit: the specular pass where there is one."""
+        pass_name = "specular" if "specular" in self.options.passes else self.options.passes[0]
+        halves = self.cycles[pass_name]
+        mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
+        hit = self.film.coverage() > 0.0
+        noise = imaging.reference_noise(halves[0], halves[1], hit)
+        tiles = []
+        for name, result in self.results.items():
+            report = self._technique_report(name, pass_name)
+            error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
+            label = LABELS.get(name, name)
+            image = self.images[name, pass_name]
+            tiles.append(imaging.Tile(label, rec709(image), rec709(error), _caption(report)))
+        title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
+        notes = [
+            f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
+            f"noise of the Cycles reference {percent(noise)}",
+        ]
+        if notice := self._subset_notice():
+            notes.append(notice)
+        return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
+
+
+def _group_names(groups) -> list[str]:
+    """Names of the light groups for layers; lights without a group get one that no group has."""
+    ungrouped = "ungrouped"
+    while ungrouped in groups:
+        ungrouped += "_"
+    return [group or ungrouped for group in groups]
+
+
+def _caption(report: dict) -> list[str]:
+    lines = [f"against Cycles {unbiased(report['against_cycles'])}"]
+    if "against_reference" in report:
+        lines.append(f"against reference {percent(report['against_reference']['relative_l2'])}")
+    return lines
+
+
+def _light_report(light) -> dict:
+    """What report.json says about `light`; `radiance` is the mean of its patches."""
+    return {
+        "name": light.name,
+        "shape": light.shape,
+        "group": light.group,
+        "radiance": light.radiance.tolist(),
+        "patches": len(light.patches),
+    }

@@ -1,0 +1,318 @@
+"""Tasks of a job: names of their files, shards, records of what is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import string
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from glob import escape
+from pathlib import Path, PurePath
+from typing import Any
+
+from ..imaging import write_json
+from ..scene import VERSION
+
+FIELDS = ("scene", "camera", "frame", "object")
+LONGEST_STEM = 100
+LONGEST_PATTERN = 200
+# Neither names of files anywhere nor harmless: separators of folders and drives, wildcards, quotes.
+_REFUSED = '\\:*?"<>|'
+
+
+class NameClash(ValueError):
+    """Two tasks would write the same file."""
+
+
+def file_stems(names: Iterable[str]) -> list[str]:
+    """A file name for each of `names`: only letters that every file system takes, each once, in any case."""
+    stems, taken = [], set()
+    for name in names:
+        stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
+        candidate, number = stem[:LONGEST_STEM], 1
+        while candidate.casefold() in taken:
+            number += 1
+            candidate = f"{stem[:LONGEST_STEM]}_{number}"
+        taken.add(candidate.casefold())
+        stems.append(candidate)
+    return stems
+
+
+def check_pattern(pattern: str, fields: tuple[str, ...]) -> str:
+    """`pattern` itself; raises ValueError where it is no pattern of `fields` or names a file outside of the folder."""
+    expected = f"expected fields {', '.join('{' + name + '}' for name in fields)}, such as {{scene}}_{{frame:04d}}"
+    if not pattern or len(pattern) > LONGEST_PATTERN:
+        raise ValueError(f"name has {len(pattern)} letters, expected 1 to {LONGEST_PATTERN}")
+    try:
+        parsed = list(string.Formatter().parse(pattern))
+        for _, name, _, conversion in parsed:
+            if name is not None and (name not in fields or conversion):
+                raise ValueError(f"name {pattern!r}: {{{name}}} is unknown, {expected}")
+        example = pattern.format(**{name: 1 if name == "frame" else "x" for name in fields})
+    except (KeyError, IndexError, ValueError) as error:
+        text = str(error)
+        raise ValueError(text if text.startswith("name ") else f"name {pattern!r}: {text}; {expected}") from None
+    for part in example.split("/"):
+        if not part.strip(" ") or part.startswith(".") or part.endswith((".", " ")):
+            raise ValueError(
+                f"name {pattern!r} gives {example!r}, expected names below the output folder that do not begin or end "
+                "with a dot: folders are separated by single /"
+            )
+    if bad := [letter for letter in example if letter in _REFUSED or not letter.isprintable()]:
+        raise ValueError(f"name {pattern!r} has the letter {bad[0]!r}, which not every file system takes: leave it out")
+    return pattern
+
+
+def fields_of(pattern: str) -> set[str]:
+    """The fields that a pattern has."""
+    return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
+
+
+def default_pattern(first: str, varying: Iterable[str]) -> str:
+    """`first` alone, or followed by the fields of which there are several: compare, compare_{frame:04d}."""
+    parts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
+    return "_".join([first, *(text for name, text in parts.items() if name in set(varying))])
+
+
+_digests: dict[tuple, str] = {}
+
+FOLDER = ".ltsh"
+FORMAT = 1
+# What says where results go, which of them are wanted and what becomes of old ones, not what is in them.
+_NO_INFLUENCE = ("output", "scene", "resume", "objects", "name", "page", "memory_mib")
+
+
+def contents_digest(options) -> str:
+    """Digest of the files that a task reads: the scene and tables. Libraries and textures of the scene do not count."""
+    tables = [Path(name) for name in options.techniques if name.endswith(".npz")]
+    return " ".join(_known_digest(path) for path in (Path(options.scene), *tables))
+
+
+def _known_digest(path: Path) -> str:
+    """`file_digest`, computed again only where the file has changed: it is asked for every object of a bake."""
+    status = path.stat()
+    key = str(path.absolute()), status.st_mtime_ns, status.st_size, status.st_ino
+    if key not in _digests:
+        _digests[key] = file_digest(path)
+    return _digests[key]
+
+
+def options_digest(command: str, options, contents: str) -> str:
+    """Digest of the options of a task (a dataclass), the version and `contents_digest`."""
+    values = {name: value for name, value in asdict(options).items() if name not in _NO_INFLUENCE}
+    found = [VERSION, command, values, contents]
+    return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Records:
+    """Records of one kind ("tasks", "tiles") in the folder `output`."""
+
+    def __init__(self, output: Path, kind: str):
+        self.output, self._folder = Path(output), Path(output) / FOLDER / kind
+
+    def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
+        """Write the record `name`: the task's `files`, by names below the folder, are there; returns it.
+
+        What was `found` is stored with it, "report" or "problem".
+        """
+        digests = {}
+        for file in sorted(files):
+            path = self.output / file
+            digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
+        path = self._path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, record)
+        # As it will be read: numbers and letters are what JSON makes of them.
+        return json.loads(path.read_text(encoding="utf-8"))
+
+    def read(self, name: str) -> dict | None:
+        """The record `name`, or None where there is none that can be read."""
+        return _read(self._path(name))
+
+    def whole(self, name: str, key: str | None) -> dict | None:
+        """The record `name` if its key is `key` (None: any) and all of its files are as they were written."""
+        record = self.read(name)
+        if record is None or (key is not None and record["key"] != key) or not self.has_files(record):
+            return None
+        return record
+
+    def has_files(self, record: dict) -> bool:
+        """True where the files are there, with the sizes and digests of the record."""
+        try:
+            return all(
+                (self.output / file).stat().st_size == facts["bytes"]
+                and file_digest(self.output / file) == facts["sha256"]
+                for file, facts in record["files"].items()
+            )
+        except OSError:
+            return False
+
+    def all_whole(self, key: str, stems: Iterable[str] | None = None) -> list[dict]:
+        """All records with that key whose files are whole, or those that are named "<stem>.<anything>"."""
+        if stems is None:
+            paths = sorted(self._folder.rglob("*.json"))
+        else:
+            # A name may hold anything that a pattern would take for more.
+            found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
+            paths = sorted(path for group in found for path in group)
+        records = map(_read, paths)
+        return [record for record in records if record and record["key"] == key and self.has_files(record)]
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.json"
+
+
+def _read(path: Path) -> dict | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None  # absent, or not ours: the task is done again
+    known = isinstance(record, dict) and record.get("format") == FORMAT
+    return record if known and isinstance(record.get("files"), dict) and "key" in record else None
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done: one command for every combination of scene, camera, frame (and object of a bake).
+
+    `options` are compare.Options or bake.BakeOptions; of them scene, camera and frame are set for each task. No
+    cameras or frames means those of the file. `name` is a pattern of output_names, None the default one.
+    """
+
+    command: str  # "shade", "compare" or "bake"
+    options: Any
+    scenes: tuple[Path, ...]
+    cameras: tuple[str, ...] = ()
+    frames: tuple[int, ...] = ()
+    name: str | None = None
+
+    @property
+    def single(self) -> bool:
+        """True where all is one picture or one bake of some objects."""
+        return len(self.scenes) * max(len(self.cameras), 1) * max(len(self.frames), 1) == 1
+
+    @property
+    def pattern(self) -> str:
+        """The pattern of the names of files."""
+        counts = {"scene": self.scenes, "camera": self.cameras, "frame": self.frames}
+        varying = [name for name, values in counts.items() if len(values) > 1]
+        first = "{object}" if self.command == "bake" else self.command
+        return self.name or default_pattern(first, varying)
+
+
+@dataclass(frozen=True)
+class Task:
+    """One picture, or one object of a bake, or of that one of several UDIM tiles.
+
+    `name` is the stem of its files, below the output folder.
+    """
+
+    scene: str
+    camera: str | None
+    frame: int | None
+    object: str | None
+    name: str
+    key: str
+    tile: int | None = None
+
+    @property
+    def stem(self) -> str:
+        """`name` without the tile."""
+        return self.name if self.tile is None else self.name.removesuffix(f".{self.tile}")
+
+    @property
+    def unit(self) -> tuple:
+        """What the objects of a bake have in common."""
+        return self.scene, self.camera, self.frame
+
+    def to_dict(self) -> dict:
+        """As JSON has it."""
+        return asdict(self)
+
+    def options(self, job: Job) -> Any:
+        """The job's options for this task."""
+        options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
+        if self.object is not None:
+            return replace(options, objects=(self.object,))
+        return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
+
+
+def tasks_of(job: Job, progress=None) -> list[Task]:
+    """All tasks of `job`. Opens the files in Blender where tasks or names depend on what is in them.
+
+    Raises NameClash where two tasks would write the same file, SceneError, OSError.
+    """
+    from ..blender.process.client import check_readable
+
+    for scene in job.scenes:
+        check_readable(Path(scene))
+    tasks = []
+    camera_stems = file_stems(job.cameras) or [None]
+    for scene, stem in zip(job.scenes, file_stems(Path(scene).stem for scene in job.scenes), strict=True):
+        facts = _facts(job, scene, progress)
+        contents = contents_digest(replace(job.options, scene=Path(scene)))
+        for camera, camera_stem in zip(job.cameras or (None,), camera_stems, strict=True):
+            for frame, found in zip(job.frames or (None,), facts, strict=True):
+                fields = {
+                    "scene": stem,
+                    "camera": camera_stem or file_stems([found.get("camera") or "camera"])[0],
+                    "frame": found.get("frame", 0) if frame is None else frame,
+                }
+                tasks += _tasks(job, (scene, camera, frame), fields, found, contents)
+    _check_names(job, tasks)
+    return tasks
+
+
+def shard_of(tasks: list[Task], shard: tuple[int, int]) -> list[Task]:
+    """The tasks of shard (I, N), I from 1 to N: every N-th."""
+    number, count = shard
+    return tasks[number - 1 :: count]
+
+
+def _facts(job, scene, progress) -> list[dict]:
+    """What the file says, per frame: camera, frame and objects; empty where nothing of it is needed."""
+    from ..blender.process import client
+
+    fields = fields_of(job.pattern)
+    unknown = ("camera" in fields and not job.cameras) or ("frame" in fields and not job.frames)
+    if job.command != "bake" and not unknown:
+        return [{}] * max(len(job.frames), 1)
+    objects, uv = (job.options.objects, job.options.uv) if job.command == "bake" else (None, None)
+    frames, scripts = job.frames or (None,), job.options.scripts
+    return client.scene_facts(Path(scene), frames, objects, uv, scripts=scripts, progress=progress)
+
+
+def _tasks(job, unit, fields, facts, contents) -> list[Task]:
+    """The tasks of one scene, camera and frame: one for each of the objects of a bake, or of their UDIM tiles."""
+    scene, camera, frame = unit
+    key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
+    if job.command != "bake":
+        return [Task(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
+    tasks, objects = [], list(dict.fromkeys(facts["objects"]))
+    for name, stem in zip(objects, file_stems(objects), strict=True):
+        stem = job.pattern.format(**fields, object=stem)
+        tiles = facts["tiles"].get(name, ())
+        tasks += [Task(str(scene), camera, frame, name, f"{stem}.{tile}", key, tile) for tile in tiles]
+        tasks += [] if tiles else [Task(str(scene), camera, frame, name, stem, key)]
+    return tasks
+
+
+def _check_names(job, tasks) -> None:
+    counts = Counter(task.name.casefold() for task in tasks)
+    for task in tasks:
+        if counts[task.name.casefold()] > 1:
+            counts = {"scene": job.scenes, "camera": job.cameras, "frame": job.frames}
+            missing = [name for name, values in counts.items() if len(values) > 1]
+            missing += ["object"] if job.command == "bake" else []
+            missing = [f"{{{name}}}" for name in missing if name not in fields_of(job.pattern)]
+            hint = f"; add {' or '.join(missing)}" if missing else ""
+            raise NameClash(f"name {job.pattern!r} gives several tasks the same name {task.name!r}{hint}")

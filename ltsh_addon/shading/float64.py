@@ -1,0 +1,153 @@
+"""Shading in double precision: exact polygons, any degree, and the reference quadrature.
+
+`single_precision` is the fast path; the points for which that is not accurate come here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import light_cone
+from .edge_integrals import vector_irradiance
+from .light_polygons import light_view, local_frames, seen_parts, to_local
+from .lobes import form_factor, integrals_on_sphere, polygon_integrals, tilted
+from .lookup_table import Lobe, LookupTable
+from .reference import reference_integrals
+
+REFERENCE = "reference"
+
+
+@dataclass(frozen=True)
+class LightOfEachSample:
+    """One light per sample, in place of an AreaLight for all; its corners are (V, P, 3)."""
+
+    center: np.ndarray  # (P, 3)
+    direction: np.ndarray  # (P, 3)
+    radiance: np.ndarray  # (P, 3)
+    affects_diffuse: bool = True
+    affects_specular: bool = True
+    is_focused: bool = False
+    is_round: bool = False
+
+    def receives(self, receiver, index):
+        """None, as of a light without receivers: those that the light does not reach were left out before."""
+        return None
+
+
+def _of(vector, index):
+    """The vector (3,) that is the same for all samples, or those of the samples `index`."""
+    return vector if vector.ndim == 1 else vector[index]
+
+
+def shade_diffuse(samples, lights, radiance):
+    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+    frame = local_frames(samples.diffuse_normal, samples.view)
+    lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
+    bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
+
+    def open_lobe(polygon, _):
+        return np.abs(form_factor(polygon))
+
+    def shadowed_lobe(polygon, index):
+        return _shadowed_form_factor(samples, frame, index, polygon)
+
+    kinds = ((lit[~bumped], None, open_lobe), (lit[bumped], samples.smooth_normal, shadowed_lobe))
+    for light, group, corners in lights:
+        if not light.affects_diffuse:
+            continue
+        for candidates, second_normal, integral in kinds:
+            for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
+                if light.is_focused:
+                    view = light_view(samples, frame, light, index, lambda vectors: vectors)
+                    irradiance = _focused(light, view, effort, index, polygon, integral, 1)[0]
+                else:
+                    irradiance = integral(polygon, index)
+                reflected = irradiance[:, None] * samples.diffuse_albedo[index]
+                radiance[group, index] += reflected * _of(light.radiance, index)
+
+
+def lobe_width(samples, index) -> np.ndarray:
+    """About how many radians (Q,) wide the specular lobes are: alpha."""
+    return np.maximum(samples.roughness[index].astype(np.float64), 1e-3) ** 2
+
+
+def _focused(light, view, effort, index, polygon, integral, count):
+    """Integrals (count, Q) over polygons (5, W, Q) times the factor of the light's spread; integral(polygons, index) is
+    that without it."""
+    result = np.zeros((count, len(index)))
+    for near, weights, corners in light_cone.layers(view, polygon[3:], light.spread, effort):
+        result[:, near] += weights * integral(corners[3:], index[near])
+    return result
+
+
+def _shadowed_form_factor(samples, frame, index, polygon):
+    """Form factor (Q,) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+    direction = -integrals_on_sphere(vector_irradiance, polygon)
+    smooth = to_local(frame[:, :, index], samples.smooth_normal[index].T)
+    along = (direction * smooth).sum(axis=0)
+    tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
+    shadowing = 2.0 / (1.0 + np.sqrt(1.0 + samples.bump_alpha2[index] * np.maximum(tangent2, 0.0)))
+    return np.where(along > 0.0, np.abs(form_factor(polygon)) * shadowing, 0.0)
+
+
+def shade_specular(samples, lights, table, radiance, error=None):
+    """As `shade_diffuse` for the specular lobes; `table` or REFERENCE, which adds its estimates to error (P,)."""
+    cosine = (samples.normal * samples.view).sum(axis=1)
+    frame = local_frames(samples.normal, samples.view)
+    terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip, samples.dielectric)
+    reflective = np.any([term.any(axis=1) for term in terms], axis=0)
+    lit = np.nonzero((cosine > 0.0) & reflective)[0]
+    cosine = np.clip(cosine, 0.0, 1.0)
+    lobe = None
+    if table != REFERENCE and len(lit):
+        lobe = _fresnel_lobe(table, cosine, samples)
+    for light, group, corners in lights:
+        if not light.affects_specular:
+            continue
+        if table == REFERENCE:
+            parts = reference_integrals(samples, cosine, frame, light, corners, lit, error)
+        else:
+            width = lobe_width(samples, lit)
+            visible = seen_parts(samples, frame, light, corners, lit, width, samples.geometric_normal)
+            parts = (
+                (index, _table_integrals(table, lobe, samples, frame, light, effort, index, polygon))
+                for index, polygon, effort in visible
+            )
+        for index, integrals in parts:
+            plain, schlick, dip, dielectric = integrals[..., None]
+            f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
+            reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
+            reflected -= samples.specular_dip[index] * dip
+            radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
+
+
+def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
+    """Lobes with four coefficient vectors: F = 1, (1 - c)^5, c (1 - c)^6 and the dielectric of each sample's IOR."""
+    if not samples.dielectric.any():
+        lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype), curves=3)
+        return lobe.with_coefficients(np.concatenate([lobe.coefficients, np.zeros_like(lobe.coefficients[:1])]))
+    lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype))
+    weights = table.dielectric_weights(samples.ior)
+    dielectric = sum(weight * vector for weight, vector in zip(weights, lobe.coefficients, strict=True))
+    return lobe.with_coefficients(np.stack([*lobe.coefficients[:3], dielectric]))
+
+
+def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon):
+    """Integrals (4, Q), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
+
+    def integral(polygon, index):
+        part = lobe.take(index)
+        return np.maximum(-polygon_integrals(table, part, polygon, part.coefficients), 0.0)
+
+    if not light.is_focused:
+        return integral(polygon, index)
+    own = lobe.take(index)
+
+    def to_lobe(vectors):
+        warped = own.to_original_domain(vectors)
+        return warped if own.tilt is None else tilted(warped, own.tilt)
+
+    view = light_view(samples, frame, light, index, to_lobe)
+    return _focused(light, view, effort, index, polygon, integral, 4)

@@ -1,0 +1,474 @@
+"""The hot path in float32: moments of polygon edges (equation numbers are the paper's), lobes along ridges."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+from math import prod
+
+import numpy as np
+
+from .edge_integrals import RIDGE_DIRECTIONS
+from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
+from .spherical_harmonics import coefficient_count
+
+_PHI_DEGREE, _PSI_DEGREE = 7, 8
+
+
+@cache
+def _arc_polynomials() -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients in s = sqrt(1 + cos theta), highest power first, of s theta / sin(theta) and of s psi.
+
+    psi = (theta / sin(theta) - 1) / (1 - cos theta). Interpolated at Chebyshev points; relative errors 8e-7 and 6e-7.
+    """
+
+    def phi(s):
+        return s * _phi(s)
+
+    def psi(s):
+        rest = 2.0 - s * s
+        small = rest < 1e-3
+        return s * np.where(small, 1.0 / 3.0 + 2.0 / 15.0 * rest, (_phi(s) - 1.0) / np.where(small, 1.0, rest))
+
+    domain = [0.0, np.sqrt(2.0)]
+    fits = [
+        np.polynomial.Chebyshev.interpolate(function, degree, domain=domain).convert(kind=np.polynomial.Polynomial)
+        for function, degree in ((phi, _PHI_DEGREE), (psi, _PSI_DEGREE))
+    ]
+    return tuple(fit.coef[::-1].astype(np.float32) for fit in fits)
+
+
+def _phi(s):
+    cosine = np.clip(s * s - 1.0, -1.0, 1.0)
+    theta = 2.0 * np.arctan2(np.sqrt(1.0 - cosine), np.sqrt(1.0 + cosine))
+    return np.where(theta > 0.0, theta / np.where(theta > 0.0, np.sin(theta), 1.0), 1.0)
+
+
+def _horner(coefficients, variable, out):
+    np.multiply(variable, coefficients[0], out=out)
+    for coefficient in coefficients[1:-1]:
+        out += coefficient
+        out *= variable
+    out += coefficients[-1]
+    return out
+
+
+def phi_of(shifted, scratch):
+    """theta / sin(theta) of edges with 1 + cos(theta) in `shifted` (V, P)."""
+    root = np.sqrt(shifted, out=scratch("root", shifted.shape))
+    phi = _horner(_arc_polynomials()[0], root, scratch("phi", shifted.shape))
+    phi /= root
+    return phi
+
+
+class ArcFactors:
+    """What all ridges share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None where unused."""
+
+    def __init__(self, degree, shifted, scratch):
+        shape = shifted.shape
+        self.q = self.psi = self.square = self.cube = None
+        if degree < 3:
+            self.phi = phi_of(shifted, scratch)
+        else:
+            root = np.sqrt(shifted, out=scratch("root", shape))
+            self.psi = _horner(_arc_polynomials()[1], root, scratch("psi", shape))
+            self.psi /= root
+            self.phi = np.subtract(np.float32(2.0), shifted, out=scratch("phi", shape))
+            self.phi *= self.psi
+            self.phi += np.float32(1.0)
+        if degree > 1:
+            self.q = np.divide(np.float32(1.0), shifted, out=scratch("q", shape))
+        if degree > 2:
+            self.square = np.add(self.psi, np.float32(1.0), out=scratch("square", shape))
+            self.square *= self.q
+            self.square *= np.float32(0.5)
+        if degree > 3:
+            self.cube = np.add(self.q, np.float32(1.0), out=scratch("cube", shape))
+            self.cube *= np.float32(1.0 / 3.0)
+
+
+MAX_DEGREE = 4
+# Where single precision fails, points are reported as fragile. An edge short of a half circle, here by 8 degrees, has
+# no direction: least 1 + cos(theta). The edges of a tiny polygon cancel: least sum of their angles, if all are equal.
+# Corners are as exact as the farthest of them: least distance of a corner, as a share of that.
+SHORTEST_SAFE = 0.01
+SMALLEST_SAFE = 0.08
+NEAREST_SAFE = 0.01
+# Solid angles close to 2 pi are close to the branch cut of the arc tangent.
+LARGEST_SAFE_ANGLE = 5.9
+# Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
+MANY_CORNERS = 64
+# Corners of the polygons whose moments are computed at a time: their arrays stay in a second-level cache of 1 MiB.
+PIECE_CORNERS = 24624
+VIEWS_KEPT = 1000
+_TINY = np.float32(1e-30)
+
+
+class Scratch:
+    """Float32 arrays by name that are made once and reused: `scratch("name", shape)`."""
+
+    def __init__(self):
+        self._arrays: dict[str, np.ndarray] = {}
+        self._views: dict[tuple, np.ndarray] = {}
+
+    def __call__(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        view = self._views.get((name, shape))
+        return self._view(name, shape) if view is None else view
+
+    def _view(self, name, shape):
+        size = prod(shape)
+        array = self._arrays.get(name)
+        if array is None or array.size < size:
+            # A larger array replaces this one: views of it would keep it alive.
+            self._views = {key: view for key, view in self._views.items() if key[0] != name}
+            array = self._arrays[name] = np.empty(size, dtype=np.float32)
+        elif len(self._views) > VIEWS_KEPT:
+            self._views.clear()
+        view = self._views[name, shape] = array[:size].reshape(shape)
+        return view
+
+
+def project(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (3, V + 1, P) along the corners (>= 3 rows, V, P), the first corner once more at the end, and the
+    mask (P,) of polygons with a corner that is fragile because it is near."""
+    _, count, points = corners.shape
+    unit = scratch("unit", (3, count + 1, points))
+    length = scratch("two", (count, points))
+    squares = np.multiply(corners[:3], corners[:3], out=scratch("three", (3, count, points)))
+    np.add.reduce(squares, axis=0, out=length)
+    near = np.maximum.reduce(length, axis=0)
+    near *= np.float32(NEAREST_SAFE**2)
+    fragile = np.minimum.reduce(length, axis=0) < near
+    # A corner at the point itself becomes the zero vector.
+    length += _TINY
+    np.divide(np.float32(1.0), np.sqrt(length, out=length), out=length)
+    np.multiply(corners[:3], length, out=unit[:, :-1])
+    unit[:, -1] = unit[:, 0]
+    return unit, fragile
+
+
+def shifted_cosines(unit: np.ndarray, scratch: Scratch, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+    """1 + cos(theta) (V, P) of the edges, kept positive, and the mask (P,) of fragile polygons, among them those whose
+    edges are shorter than `smallest` in all."""
+    _, count, points = unit.shape
+    products = np.multiply(unit[:, :-1], unit[:, 1:], out=scratch("three", (3, count - 1, points)))
+    shifted = np.add.reduce(products, axis=0, out=scratch("shifted", (count - 1, points)))
+    shifted += np.float32(1.0)
+    least = np.minimum.reduce(shifted, axis=0)
+    np.absolute(shifted, out=shifted)
+    shifted += np.float32(1e-12)
+    fragile = least < np.float32(SHORTEST_SAFE)
+    if smallest > 0.0:
+        fragile |= least > np.float32(2.0 - 0.5 * (smallest / min(count - 1, MANY_CORNERS)) ** 2)
+    return shifted, fragile
+
+
+def _cross_component(unit, first, second, scratch, out):
+    """Component (V, P) of the cross products of the ends of the edges: a[first] b[second] - a[second] b[first]."""
+    np.multiply(unit[first, :-1], unit[second, 1:], out=out)
+    out -= np.multiply(unit[second, :-1], unit[first, 1:], out=scratch("one", out.shape))
+    return out
+
+
+def cosine_integral(
+    corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed integral (P,) of z over polygons (>= 3 rows, V, P) in z >= 0, and the mask (P,) of fragile points."""
+    unit, near = project(corners, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
+    fragile |= near
+    normal = _cross_component(unit, 0, 1, scratch, scratch("normal", shifted.shape))
+    normal *= phi_of(shifted, scratch)
+    integral = np.add.reduce(normal, axis=0)
+    integral *= np.float32(0.5)
+    return integral, fragile
+
+
+def vector_irradiance(
+    corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Signed integrals (3, P) of the direction over polygons (>= 3 rows, V, P), and the mask (P,) of fragile points."""
+    unit, near = project(corners, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
+    fragile |= near
+    phi = phi_of(shifted, scratch)
+    integrals = np.empty((3, corners.shape[2]), dtype=np.float32)
+    for axis in range(3):
+        out = scratch("normal", shifted.shape)
+        normal = _cross_component(unit, (axis + 1) % 3, (axis + 2) % 3, scratch, out)
+        normal *= phi
+        np.add.reduce(normal, axis=0, out=integrals[axis])
+    integrals *= np.float32(0.5)
+    return integrals, fragile
+
+
+def form_matrix(degree: int) -> np.ndarray:
+    """Matrix (K, K) from the `moments` here to those of `edge_integrals.moments`.
+
+    The sum of (u.X) K_k over the edges is a form in u, homogeneous of degree k + 1. Here are the coefficients of
+    u_x^(k+1), u_x^k u_z, ..., u_z^(k+1), there the values for the first k + 2 directions.
+    """
+    matrix = np.zeros((coefficient_count(degree),) * 2)
+    matrix[0, 0] = 1.0
+    for k in range(degree):
+        rows = slice(1 + k * (k + 3) // 2, 1 + (k + 1) * (k + 4) // 2)
+        power = np.arange(k + 2)
+        matrix[rows, rows] = [u_x ** power[::-1] * u_z**power for u_x, u_z in RIDGE_DIRECTIONS[: k + 2]]
+    return matrix
+
+
+def moments(
+    corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0 that need not be unit, in the order of `form_matrix`, and
+    the mask (P,) of fragile points. `degree` 1 to 4. The result is overwritten by the next call."""
+    unit, near = project(corners, scratch)
+    shifted, fragile = shifted_cosines(unit, scratch, smallest)
+    fragile |= near
+    shape = shifted.shape
+    result = scratch("moments", (coefficient_count(degree), shape[1]))
+    normal = scratch("normal", (2, *shape))
+    for row, (first, second) in zip(normal, ((1, 2), (0, 1)), strict=True):
+        _cross_component(unit, first, second, scratch, row)
+    total = np.add(unit[::2, :-1], unit[::2, 1:], out=scratch("total", normal.shape))
+    result[0] = angle = _solid_angle(shifted, total[1], normal[1], scratch)
+    fragile |= np.abs(angle) > np.float32(LARGEST_SAFE_ANGLE)
+    factors = ArcFactors(degree, shifted, scratch)
+    pair = scratch("pair", normal.shape)
+    _sum_edges(np.multiply(normal, factors.phi, out=pair), result[1:3])
+    if degree == 1:
+        return result, fragile
+    np.multiply(normal, factors.q, out=pair)
+    linear = _product(pair, total, scratch("linear", (3, *shape)), scratch)
+    _sum_edges(linear, result[3:6])
+    if degree == 2:
+        return result, fragile
+    product = _product(unit[::2, :-1], unit[::2, 1:], scratch("product", linear.shape), scratch)
+    squared = _product(total, total, scratch("squared", linear.shape), scratch)
+    if degree == 4:
+        _sum_edges(_quartic(linear, product, squared, factors.cube, pair, scratch), result[10:15])
+    squared *= factors.square
+    product *= factors.psi
+    squared -= product
+    cubic = scratch("cubic", (4, *shape))
+    np.multiply(normal, squared[::2], out=cubic[::3])
+    np.multiply(normal, squared[1], out=cubic[1:3])
+    cubic[1:3] += np.multiply(normal[::-1], squared[::2], out=pair)
+    _sum_edges(cubic, result[6:10])
+    return result, fragile
+
+
+def _product(a, b, out, scratch):
+    """Coefficients (3, V, P) of the product of linear forms a and b (2, V, P): x x, x z + z x, z z."""
+    np.multiply(a, b, out=out[::2])
+    np.multiply(a[0], b[1], out=out[1])
+    out[1] += np.multiply(a[1], b[0], out=scratch("one", out.shape[1:]))
+    return out
+
+
+def _quartic(linear, product, squared, cube, pair, scratch):
+    """Coefficients (5, V, P) of (u.X) K_3 for a quadratic form `linear` (3, V, P), q (u.X) (u.c) with c = a + b, and
+    those of (u.a) (u.b) and (u.c)^2; `pair` (2, V, P) is overwritten."""
+    inner = np.multiply(squared, cube, out=scratch("inner", linear.shape))
+    inner -= product
+    result = scratch("quartic", (5, *cube.shape))
+    np.multiply(linear[::2], inner[::2], out=result[::4])
+    np.multiply(linear[::2], inner[1], out=result[1::2])
+    result[1::2] += np.multiply(inner[::2], linear[1], out=pair)
+    np.multiply(linear[1], inner[1], out=result[2])
+    np.multiply(linear[::2], inner[::-2], out=pair)
+    result[2] += pair[0]
+    result[2] += pair[1]
+    return result
+
+
+def weighted_moments(
+    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
+    in sr, and the mask (P,) of fragile points. `degree` 1 to 4."""
+    vectors, _, points = weights.shape
+    sums = np.empty((vectors, points), np.float32)
+    angle, fragile = np.empty(points, np.float32), np.empty(points, bool)
+    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
+        found, fragile[part] = moments(corners[:, :, part], degree, scratch, smallest)
+        weight = weights[:, :, part]
+        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
+        np.add.reduce(products, axis=1, out=sums[:, part])
+        angle[part] = found[0]
+    return sums, angle, fragile
+
+
+def pieces(count: int, most: int) -> list[slice]:
+    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
+    number = max(-(-count // max(most, 512)), 1)
+    size = max(-(-count // number), 1)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+def _sum_edges(values, out):
+    """Sum (D, P) over the edges of values (D, V, P)."""
+    np.add.reduce(values, axis=1, out=out)
+
+
+def _normalize(real, imaginary, scratch):
+    """Divide complex numbers (V, P) by about their magnitude: only their arguments matter."""
+    size = np.abs(real, out=scratch("one", real.shape))
+    size += np.abs(imaginary)
+    size += _TINY
+    real /= size
+    imaginary /= size
+
+
+def _solid_angle(shifted, total_z, normal_z, scratch):
+    """Signed solid angle (P,): the product over the edges of (1 + a_z + b_z + a.b) + i X_z has half of it."""
+    count, points = shifted.shape
+    real = np.add(shifted, total_z, out=scratch("real", shifted.shape))
+    imaginary = scratch("imaginary", shifted.shape)
+    many = count > MANY_CORNERS
+    if count > 8:  # keep the product of many factors in range
+        real *= np.float32(0.5)
+        np.multiply(normal_z, np.float32(0.5), out=imaginary)
+    else:
+        np.copyto(imaginary, normal_z)
+    while count > 1:
+        half = count // 2
+        if many:
+            _normalize(real[:count], imaginary[:count], scratch)
+        a, b = real[:half], imaginary[:half]
+        c, d = real[half : 2 * half], imaginary[half : 2 * half]
+        new_real = np.multiply(a, c, out=scratch("product_real", (half, points)))
+        new_real -= np.multiply(b, d, out=scratch("one", (half, points)))
+        b *= c
+        b += np.multiply(a, d, out=scratch("one", (half, points)))
+        real[:half] = new_real
+        if count % 2:
+            real[half], imaginary[half] = real[count - 1], imaginary[count - 1]
+        count -= half
+    angle = np.arctan2(imaginary[0], real[0])
+    angle *= np.float32(2.0)
+    return angle
+
+
+# Sharper lobes amplify the rounding of directions too much for single precision: at this roughness 2 alpha = 0.02.
+SHARP_ROUGHNESS = 0.1
+DIELECTRICS_KEPT = 64
+
+
+@dataclass(frozen=True)
+class RidgeTable:
+    """One table; `fetch` interpolates chosen vectors of its weights.
+
+    A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each sample's own IOR.
+    """
+
+    source: LookupTable
+    parameters: np.ndarray  # (3 or 4, R * T): A, B, C and the tilt of "ltc"
+    weights: np.ndarray  # (F, K, R * T): weights of the moments; of the clamped cosine for "ltc"
+    _stacked: dict = field(default_factory=dict)
+
+    @property
+    def degree(self) -> int:
+        """Degree of the moments; 1 for "ltc", which needs the integral of z alone."""
+        return self.source.degree
+
+    def channels(self, vectors: tuple) -> np.ndarray:
+        """Float32 array (C, R * T): the warp's parameters, then the K weights of each vector."""
+        stacked = self._stacked.get(vectors)
+        if stacked is None:
+            if len(self._stacked) >= DIELECTRICS_KEPT:
+                self._stacked.clear()
+            parts = [self.parameters, *(self._vector(vector) for vector in vectors)]
+            stacked = self._stacked[vectors] = np.concatenate(parts).astype(np.float32)
+        return stacked
+
+    def _vector(self, vector):
+        if not isinstance(vector, tuple):
+            return self.weights[vector]
+        _, ior = vector
+        shares = self.source.dielectric_weights(np.array([ior]))[:, 0]
+        return sum(share * weights for share, weights in zip(shares, self.weights, strict=True))
+
+    def fetch(self, vectors, cosine, sine, roughness, ior, scratch) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Warp entries (4, P) xx, xz, yy, zz, weights (len(vectors), K, P), and the tilt (P,) of "ltc", else None.
+
+        cosine and sine (P,) of theta_o and roughness (P,) in float32; ior (P,). Valid until the next call with this
+        scratch.
+        """
+        many = vectors[-1] == "dielectric"
+        curves = tuple(range(len(self.weights)))
+        channels = self.channels(vectors[:-1] + curves if many else vectors)
+        shape = self.source.warp.shape[:2]
+        theta = np.arctan2(sine, cosine)
+        coordinate = 1.0 - np.sqrt(np.maximum(1.0 - theta * np.float32(2.0 / np.pi), np.float32(0.0)))
+        values = _bilinear(channels, shape, roughness, coordinate, scratch)
+        alpha = np.maximum(roughness * roughness, np.float32(MIN_ALPHA))
+        warp = np.stack(warp_entries(cosine, alpha, *values[:3], sine=sine))
+        count = len(self.parameters)
+        weights = values[count:].reshape(-1, self.weights.shape[1], len(roughness))
+        if many:
+            first = len(vectors) - 1
+            shares = self.source.dielectric_weights(ior).astype(np.float32)
+            combined = sum(share * vector for share, vector in zip(shares, weights[first:], strict=True))
+            weights = np.concatenate([weights[:first], combined[None]])
+        return warp, weights, values[3] if count == 4 else None
+
+
+def prepare(table: LookupTable) -> RidgeTable:
+    """The table for the hot path, with weights of the moments of `edge_loop`, made once per table. Degrees above
+    `edge_loop.MAX_DEGREE` have none: ValueError."""
+    return _kept(table, "_ridge_table", lambda: _ridge_product(table.ridge_weights, form_matrix(table.degree)))
+
+
+def along_directions(table: LookupTable) -> RidgeTable:
+    """As `prepare`, with weights of the moments of `edge_integrals`, which shaders use."""
+    return _kept(table, "_direction_table", lambda: table.ridge_weights)
+
+
+def _kept(table, name, matrix):
+    """The table made once, weights of moments by matrix() (K, K)."""
+    if table.degree > MAX_DEGREE:
+        raise ValueError(
+            f"table {table.name} has degree {table.degree}, the single precision path goes up to "
+            f"{MAX_DEGREE}: use float64"
+        )
+    # Stored with the table, which is frozen but for what it caches, so that both end together.
+    ridges = table.__dict__.get(name)
+    if ridges is None:
+        ridges = table.__dict__[name] = _build(table, matrix)
+    return ridges
+
+
+def _build(table, matrix):
+    rows, columns, curves, count = table.coefficients.shape
+    flat = table.coefficients.reshape(rows * columns, curves, count)
+    if table.family == "ltsh":
+        flat = _ridge_product(flat, matrix())
+    return RidgeTable(table, table.warp.reshape(rows * columns, -1).T, flat.transpose(1, 2, 0))
+
+
+def _ridge_product(vectors, matrix):
+    """Vectors (..., K) times a matrix (K, K). Not a matrix product of numpy's: the same bits on every machine."""
+    return sum(vectors[..., k, None] * row for k, row in enumerate(matrix))
+
+
+def _bilinear(channels, shape, roughness, coordinate, scratch):
+    """Channels (C, P) at roughness and theta coordinate (P,) in [0, 1]."""
+    rows, columns = shape
+    row_position = roughness * np.float32(rows - 1)
+    column_position = coordinate * np.float32(columns - 1)
+    row = np.minimum(row_position.astype(np.intp), rows - 2)
+    column = np.minimum(column_position.astype(np.intp), columns - 2)
+    row_weight = (row_position - row).astype(np.float32)
+    column_weight = (column_position - column).astype(np.float32)
+    corner = row * columns + column
+    size = (len(channels), len(roughness))
+    taps = [scratch(f"tap{number}", size) for number in range(4)]
+    for tap, step in zip(taps, (0, 1, columns, columns + 1), strict=True):
+        np.take(channels, corner + step, axis=1, out=tap, mode="clip")
+    for near, far, weight in ((taps[0], taps[1], column_weight), (taps[2], taps[3], column_weight),
+                              (taps[0], taps[2], row_weight)):  # fmt: skip
+        far -= near
+        far *= weight
+        near += far
+    return taps[0]

@@ -1,0 +1,353 @@
+"""Blocks of samples for several processes: shared memory, the queue, the children."""
+
+from __future__ import annotations
+
+import logging
+import mmap
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from ..scene import SCALAR_FIELDS, Cancelled, SurfaceSamples
+from . import moments32, worker
+
+_ALIGNMENT = 64
+
+
+class SharedBlock:
+    """`size` bytes of shared memory; `handle` is what a child process needs to attach to them."""
+
+    def __init__(self, size: int):
+        self._file = None
+        if sys.platform == "win32":
+            self.handle = f"ltsh-{uuid.uuid4().hex}"
+            self._memory = mmap.mmap(-1, size, tagname=self.handle)
+            return
+        if hasattr(os, "memfd_create"):
+            self._file = os.fdopen(os.memfd_create("ltsh"), "r+b")
+        else:
+            self._file = tempfile.TemporaryFile()
+        self.handle = self._file.fileno()
+        os.ftruncate(self.handle, size)
+        self._memory = mmap.mmap(self.handle, size)
+
+    @property
+    def inherited(self) -> tuple[int, ...]:
+        """File descriptors that the child must inherit."""
+        return () if self._file is None else (self.handle,)
+
+    def arrays(self, layout) -> dict[str, np.ndarray]:
+        return arrays_in(self._memory, layout)
+
+    def close(self) -> None:
+        """Let go of the memory; arrays in it keep it until they are gone."""
+        self._memory = None
+        if self._file is not None:
+            self._file.close()
+
+
+def attach(handle, size: int) -> mmap.mmap:
+    """The memory of a parent's SharedBlock."""
+    if isinstance(handle, str):
+        return mmap.mmap(-1, size, tagname=handle)
+    return mmap.mmap(handle, size)
+
+
+def layout_of(arrays: dict[str, tuple[tuple[int, ...], np.dtype]]) -> tuple[list, int]:
+    """Layout [(name, shape, type, offset)] of arrays given by shape and type, and its size in bytes."""
+    layout, offset = [], 0
+    for name, (shape, dtype) in arrays.items():
+        layout.append((name, shape, np.dtype(dtype).str, offset))
+        size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+        offset += -(-size // _ALIGNMENT) * _ALIGNMENT
+    return layout, max(offset, mmap.PAGESIZE)
+
+
+def arrays_in(memory, layout) -> dict[str, np.ndarray]:
+    """Arrays by name in a buffer."""
+    return {name: np.ndarray(shape, dtype, memory, offset) for name, shape, dtype, offset in layout}
+
+
+# Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
+_ONLY_DIFFUSE = {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"}
+_ONLY_SPECULAR = {
+    "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
+}  # fmt: skip
+
+
+class ParentSide:
+    """Sends blocks of `samples`, of `block_size` samples at most, to one child that works on `task`."""
+
+    def __init__(self, task, samples: SurfaceSamples, block_size: int):
+        self.samples = samples
+        unread = set()
+        if "diffuse" not in task.passes:
+            unread |= _ONLY_DIFFUSE
+        if "specular" not in task.passes:
+            unread |= _ONLY_SPECULAR
+        if all(light.receivers is None for light in task.lights):
+            unread.add("receiver")
+        self.sent, self.same, first = [], {}, {}
+        for field in fields(samples):
+            values = getattr(samples, field.name)
+            # What is left out counts as 0 on the other side.
+            if field.name in unread or _is_zero_everywhere(values):
+                continue
+            # A normal that stands for another is the same array: sent once.
+            if id(values) in first:
+                self.same[field.name] = first[id(values)]
+            else:
+                first[id(values)] = field.name
+                self.sent.append(field.name)
+        self.task = task
+        self.memory = SharedBlock(self._layouts(block_size)[2])
+        self.size = self._layouts(block_size)[2]
+
+    def _layouts(self, count):
+        """Layouts of the samples sent and of the results, and the bytes of both."""
+        arrays = {}
+        for name in self.sent:
+            values = getattr(self.samples, name)
+            arrays[f"in {name}"] = ((count, *values.shape[1:]), values.dtype)
+        shape = (len(self.task.groups), count, 3)
+        for name in self.task.passes:
+            arrays[f"out {name}"] = (shape, self.task.dtype)
+        if self.task.has_error:
+            arrays["error"] = ((count,), np.float64)
+        layout, size = layout_of(arrays)
+        return [entry for entry in layout if entry[0].startswith("in ")], layout, size
+
+    def put(self, block: slice) -> dict:
+        """Copy a block into the shared memory; the message that tells the child."""
+        inputs, layout, _ = self._layouts(block.stop - block.start)
+        for name, values in self.memory.arrays(inputs).items():
+            np.copyto(values, getattr(self.samples, name.removeprefix("in "))[block])
+        return {"layout": layout, "same": self.same, "count": block.stop - block.start}
+
+    def take(self, block: slice):
+        """Radiance by pass and the error, views of the shared memory, once the child has answered."""
+        _, layout, _ = self._layouts(block.stop - block.start)
+        arrays = self.memory.arrays([entry for entry in layout if not entry[0].startswith("in ")])
+        return {name: arrays[f"out {name}"] for name in self.task.passes}, arrays.get("error")
+
+    def close(self) -> None:
+        self.memory.close()
+
+
+class ChildSide:
+    """Shades the blocks that the parent puts into the memory."""
+
+    def __init__(self, task, handle, size: int):
+        self.task = task
+        self.memory = attach(handle, size)
+        self.scratch = moments32.Scratch()
+
+    def shade(self, message: dict) -> None:
+        """Shade the block that `message` describes; the result goes into the memory."""
+        arrays, count = arrays_in(self.memory, message["layout"]), message["count"]
+        values = {name.removeprefix("in "): array for name, array in arrays.items() if name.startswith("in ")}
+        values.update({name: values[other] for name, other in message["same"].items()})
+        for field in fields(SurfaceSamples):
+            if field.name not in values:
+                values[field.name] = np.broadcast_to(0.0, (count,) if field.name in SCALAR_FIELDS else (count, 3))
+        found, estimates = self.task.shade(SurfaceSamples(**values), self.scratch)
+        for name, radiance in found.items():
+            arrays[f"out {name}"][:] = radiance
+        if estimates is not None:
+            arrays["error"][:] = estimates
+
+
+def _is_zero_everywhere(values) -> bool:
+    """True for one zero that stands for all elements, as `SurfaceSamples` has it for what is left out."""
+    return values.size > 0 and not any(values.strides) and not values.flat[0]
+
+
+# A child takes some 0.2 s to start: shorter tasks are done in this process.
+SECONDS_WORTH_A_CHILD = 0.5
+PATIENCE_SECONDS = 0.1
+ENDING_SECONDS = 5.0
+CORES_VARIABLE = "LTSH_CORES"
+_PACKAGE = __package__.rpartition(".")[0]
+_logger = logging.getLogger(__name__)
+
+
+def run(
+    task,
+    samples: SurfaceSamples,
+    blocks: list[slice],
+    workers: int | None,
+    keep: Callable,
+    progress: Callable[[float], bool | None] | None = None,
+) -> None:
+    """Call keep(block, radiance, error) with the result of every block, from this thread or another one.
+
+    `workers` processes in all (None: as many as `cores` says). After every block `progress` is called from this
+    thread; where it returns False Cancelled is raised. No child is left when this returns or raises.
+    """
+    queue = _Queue(blocks, keep)
+    children = []
+    try:
+        for _ in range(_children_wanted(task, len(samples), blocks, workers)):
+            children.append(_Child(task, samples, queue, max(block.stop - block.start for block in blocks)))
+        _work(task, samples, queue, progress)
+    finally:
+        queue.stop()
+        for child in children:
+            child.end()
+
+
+def _children_wanted(task, count, blocks, workers) -> int:
+    if workers is None:
+        workers = cores()
+    if workers < 2 or task.seconds(count) < SECONDS_WORTH_A_CHILD or interpreter() is None:
+        return 0
+    return min(workers, len(blocks)) - 1
+
+
+def cores() -> int:
+    """Cores that this process may use: those it may run on, at most as many as the environment's LTSH_CORES says."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = os.environ.get(CORES_VARIABLE, "").strip()
+    return min(there, int(limit)) if limit.isdecimal() and int(limit) > 0 else there
+
+
+def interpreter() -> str | None:
+    """The Python that runs children: inside Blender the one it brings along. None where there is none."""
+    path = sys.executable
+    if not path or not Path(path).stem.lower().startswith("python"):
+        return None
+    return path
+
+
+def _work(task, samples, queue, progress):
+    """Shade blocks in this thread until all are done, by whomever."""
+    scratch = moments32.Scratch()
+    while not queue.finished():
+        block = queue.next()
+        if block is None:
+            queue.wait(PATIENCE_SECONDS)
+        else:
+            queue.done(block, *task.shade(samples.take(block), scratch))
+        if progress is not None and progress(queue.share()) is False:
+            raise Cancelled("shading was stopped")
+
+
+class _Queue:
+    """The blocks that are left, for several threads."""
+
+    def __init__(self, blocks, keep):
+        self._keep = keep
+        self._left, self._total, self._done = deque(blocks), len(blocks), 0
+        self._changed = threading.Condition()
+        self.stopped = False
+
+    def next(self):
+        """A block that nobody works on, or None."""
+        with self._changed:
+            return self._left.popleft() if self._left and not self.stopped else None
+
+    def give_back(self, block):
+        with self._changed:
+            self._left.append(block)
+            self._changed.notify_all()
+
+    def done(self, block, radiance, error):
+        self._keep(block, radiance, error)
+        with self._changed:
+            self._done += 1
+            self._changed.notify_all()
+
+    def wait(self, seconds):
+        """Until something changes, or some seconds have passed."""
+        with self._changed:
+            if not self._left and self._done < self._total:
+                self._changed.wait(seconds)
+
+    def stop(self):
+        with self._changed:
+            self.stopped = True
+
+    def share(self) -> float:
+        return self._done / self._total
+
+    def finished(self) -> bool:
+        return self._done == self._total
+
+
+class _Child:
+    """One worker process and the thread that feeds it. Whatever goes wrong, its block goes back to the queue."""
+
+    def __init__(self, task, samples, queue, block_size):
+        self._side = ParentSide(task, samples, block_size)
+        self._task, self._queue = task, queue
+        self._process = None
+        self._thread = threading.Thread(target=self._feed, name="ltsh-worker", daemon=True)
+        try:
+            self._process = subprocess.Popen(
+                [interpreter(), worker.__file__],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                pass_fds=self._side.memory.inherited,
+                # Nothing here uses BLAS, whose threads take time to start.
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+                # Ctrl-C goes to the parent alone, which ends the child; no console window on Windows.
+                start_new_session=True,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            _logger.warning("worker process: %s cannot be started (%s); shading goes on without", interpreter(), error)
+            return
+        self._thread.start()
+
+    def _feed(self):
+        block = None
+        try:
+            commands, answers = self._process.stdin, self._process.stdout
+            memory = self._side.memory
+            worker.send(
+                commands, {"path": sys.path, "handle": memory.handle, "size": self._side.size, "package": _PACKAGE}
+            )
+            worker.send(commands, self._task)
+            self._check(worker.receive(answers))
+            while (block := self._queue.next()) is not None:
+                worker.send(commands, self._side.put(block))
+                self._check(worker.receive(answers))
+                self._queue.done(block, *self._side.take(block))
+        except (OSError, EOFError, ValueError, _ChildError) as error:
+            if self._queue.stopped:
+                return  # `end` has killed the process
+            if block is not None:
+                # This process computes it instead, and meets the same error if the block is at fault.
+                self._queue.give_back(block)
+            _logger.warning("worker process ended early (%s); shading goes on without", error or type(error).__name__)
+
+    def _check(self, answer):
+        if answer is not None:
+            raise _ChildError(answer.strip().splitlines()[-1])
+
+    def end(self):
+        """End and reap the process, wherever it is."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait(ENDING_SECONDS)
+            self._thread.join(ENDING_SECONDS)
+            for stream in (self._process.stdin, self._process.stdout):
+                try:
+                    stream.close()
+                except OSError:
+                    pass  # what could not be sent any more
+        self._side.close()
+
+
+class _ChildError(Exception):
+    """A child met an error; the text is its last line."""

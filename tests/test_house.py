@@ -1,0 +1,269 @@
+"""The house: which room may import which, no circle of files, no crowd of small files; lazy imports count.
+
+Read from the source, and tried in fresh interpreters.
+"""
+
+import ast
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "ltsh_addon"
+MOST_FILES = 130
+FEWEST_LINES = 50  # of a file that only one other imports
+BLENDER_MODULES = frozenset(
+    "aud bl_operators bl_ui blf bmesh bpy bpy_extras gpu gpu_extras idprop imbuf mathutils".split()
+)
+# A room imports only from itself and from rooms to its left. Rooms are files and folders of the package; what no line
+# names belongs to the room of its folder.
+ROOMS = """
+    interruption scene files shading visibility cycles imaging
+    blender.process blender.evaluated blender.render_settings blender.saving blender.materials blender.lights
+    blender.extract blender.demo_meshes blender.demo blender.viewport
+    pipeline cli panel_job
+    blender.ui blender.engine blender.registration
+""".split()
+# Room or folder of rooms -> distributions that it may use besides the standard library.
+MAY_USE = {
+    "blender": {"numpy", "OpenEXR", "zstandard"} | BLENDER_MODULES,  # bpy requires zstandard
+    "imaging": {"numpy", "OpenEXR", "Imath"},  # one distribution
+    "pipeline": {"numpy", "OpenEXR"},
+    "interruption": set(),
+}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported name: `target` is dotted and absolute ("ltsh_addon.scene", "numpy.linalg")."""
+
+    target: str
+    relative: bool
+    lazy: bool  # inside a function, so not executed when the module is imported
+    line: int
+
+
+def read_imports(source: str, module: str, is_package: bool = False) -> list[Import]:
+    """All imports of a module's source; `module` is its dotted name, against which relative ones are resolved."""
+    found = []
+
+    def visit(node, lazy):
+        for child in ast.iter_child_nodes(node):
+            inside = lazy or isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            if isinstance(child, ast.Import):
+                found.extend(Import(alias.name, False, lazy, child.lineno) for alias in child.names)
+            elif isinstance(child, ast.ImportFrom):
+                # One dot is the package the module lies in, which is the module itself for an __init__.py.
+                drop = child.level - (1 if is_package else 0)
+                base = module.split(".")[: len(module.split(".")) - drop] if child.level else []
+                stem = base + ([child.module] if child.module else [])
+                found.extend(
+                    Import(".".join([*stem, alias.name]), child.level > 0, lazy, child.lineno) for alias in child.names
+                )
+            visit(child, inside)
+
+    visit(ast.parse(source), False)
+    return found
+
+
+def room_of(target: str) -> str | None:
+    """The room of a dotted name inside the package; None for the package itself and its entry points."""
+    name = target.removeprefix("ltsh_addon").lstrip(".")
+    return next((room for room in sorted(ROOMS, key=len, reverse=True) if f"{name}.".startswith(f"{room}.")), None)
+
+
+def violations(source: str, module: str, is_package: bool = False) -> list[str]:
+    """What in a module of the package breaks the rules, one line each."""
+    room, problems = room_of(module), []
+    top = "blender" if room and room.startswith("blender.") else room
+    for item in read_imports(source, module, is_package):
+        head = item.target.split(".")[0]
+        where = f"{module} line {item.line} imports {item.target}"
+        if head == "ltsh_addon":
+            other = room_of(item.target)
+            if not item.relative:
+                problems.append(f"{where}: expected a relative import, Blender loads the package under another name")
+            if room is not None and (other is None or ROOMS.index(other) > ROOMS.index(room)):
+                problems.append(f"{where}: {room} stands left of {other or 'the entry points'}")
+            if top != "blender" and other is not None and other.startswith("blender.") and not item.lazy:
+                problems.append(f"{where}: expected inside a function, so that the core works without Blender")
+        elif head not in sys.stdlib_module_names and head not in MAY_USE.get(top, {"numpy"}):
+            problems.append(f"{where}: {top} may use {sorted(MAY_USE.get(top, {'numpy'}))}")
+    return problems
+
+
+def sources(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*.py") if "__pycache__" not in path.parts)
+
+
+def dotted(path: Path) -> str:
+    names = list(path.relative_to(ROOT).with_suffix("").parts)
+    return ".".join(names[:-1] if names[-1] == "__init__" else names)
+
+
+def imports_of(path: Path) -> list[Import]:
+    return read_imports(path.read_text(encoding="utf-8"), dotted(path), path.name == "__init__.py")
+
+
+def module_of(target: str, modules) -> str | None:
+    """The module that the dotted name is, or is in."""
+    return next((name for name in (target, target.rpartition(".")[0]) if name in modules), None)
+
+
+def arrows_of(paths) -> dict[str, set[str]]:
+    """Module -> modules of these files that it imports."""
+    modules = {dotted(path): path for path in paths}
+    arrows = {}
+    for name, path in modules.items():
+        found = {module_of(item.target, modules) for item in imports_of(path)}
+        arrows[name] = found - {None, name}
+    return arrows
+
+
+def circles(arrows: dict[str, set[str]]) -> list[str]:
+    """One way around each circle that a walk along the arrows meets."""
+    found, done = [], set()
+
+    def walk(name, way):
+        if name in way:
+            found.append(" -> ".join([*way[way.index(name) :], name]))
+        elif name not in done:
+            for target in sorted(arrows[name]):
+                walk(target, [*way, name])
+            done.add(name)
+
+    for name in sorted(arrows):
+        walk(name, [])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "complaint"),
+    [
+        ("ltsh_addon.scene", "import scipy.optimize", "scene may use ['numpy']"),
+        ("ltsh_addon.scene", "from .shading import shade", "scene stands left of shading"),
+        ("ltsh_addon.shading.ltc", "def f():\n    import bpy", "shading may use ['numpy']"),
+        ("ltsh_addon.shading.ltc", "from ..imaging import exr", "left of imaging"),
+        ("ltsh_addon.shading.ltc", "def f():\n    from .. import cycles", "left of cycles"),
+        ("ltsh_addon.cycles.uv", "from ltsh_addon.scene import AreaLight", "relative import"),
+        ("ltsh_addon.cycles.uv", "from .. import __version__", "left of the entry points"),
+        ("ltsh_addon.blender.materials.aovs", "from ..lights import area", "left of blender.lights"),
+        ("ltsh_addon.blender.extract.bake", "from ...pipeline import bake", "left of pipeline"),
+        ("ltsh_addon.blender.ui.panels", "def f():\n    from ..engine import view", "left of blender.engine"),
+        ("ltsh_addon.blender.lights.area", "import scipy", "blender may use"),
+        ("ltsh_addon.cli.commands", "from ..blender.process import client", "inside a function"),
+        ("ltsh_addon.cli.output", "if True:\n    from ..blender import evaluated", "inside a function"),
+        ("ltsh_addon.pipeline.bake", "import bpy", "pipeline may use"),
+    ],
+)
+def test_the_rules_name_a_forbidden_import(module, source, complaint):
+    problems = violations(source, module)
+    assert len(problems) == 1 and complaint in problems[0], problems
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "is_package"),
+    [
+        ("ltsh_addon.shading.ltc", "import math\nimport numpy as np\nfrom ..scene import AreaLight", False),
+        ("ltsh_addon.shading", "from .brdf import ggx\nfrom ..scene import SurfaceSamples", True),
+        ("ltsh_addon", "def register():\n    from . import blender", True),
+        ("ltsh_addon.pipeline.bake", "def f():\n    from ..blender.process import client\n    import OpenEXR", False),
+        ("ltsh_addon.blender.engine.view", "import bpy\nfrom ...pipeline import bake\nfrom ..ui import job", False),
+    ],
+)
+def test_the_rules_let_the_allowed_imports_pass(module, source, is_package):
+    assert violations(source, module, is_package) == []
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"a"}}) == ["b -> c -> b"]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def test_the_rooms_import_from_left_to_right():
+    problems = [
+        problem
+        for path in sources(PACKAGE)
+        for problem in violations(path.read_text(encoding="utf-8"), dotted(path), path.name == "__init__.py")
+    ]
+    assert not problems, "\n".join(problems)
+
+
+def test_every_file_is_in_a_room():
+    entries = {"ltsh_addon", "ltsh_addon.__main__", "ltsh_addon.blender"}
+    lost = [name for name in map(dotted, sources(PACKAGE)) if room_of(name) is None and name not in entries]
+    assert not lost, f"no room in ROOMS for: {lost}"
+
+
+@pytest.mark.parametrize("folder", ["ltsh_addon", "tables"])
+def test_no_file_imports_itself_by_way_of_others(folder):
+    assert circles(arrows_of(sources(ROOT / folder))) == []
+
+
+def test_there_are_few_files_and_no_crumbs():
+    paths = sources(PACKAGE) + sources(ROOT / "tables")
+    assert len(paths) <= MOST_FILES, f"{len(paths)} files, expected at most {MOST_FILES}: which belong together?"
+    importers = {dotted(path): set() for path in paths}
+    for name, targets in arrows_of(paths).items():
+        for target in targets:
+            importers[target].add(name)
+    crumbs = [
+        f"{path.relative_to(ROOT)} is only imported by {next(iter(importers[dotted(path)]))}"
+        for path in paths
+        if path.name != "__init__.py"
+        and len(importers[dotted(path)]) == 1
+        and len(path.read_text(encoding="utf-8").splitlines()) < FEWEST_LINES
+    ]
+    assert not crumbs, f"fewer than {FEWEST_LINES} lines, belongs into its importer: {crumbs}"
+
+
+@pytest.mark.parametrize("folder", ["shading", "imaging"])
+def test_core_tests_do_not_need_blender(folder):
+    users = [
+        str(path.relative_to(ROOT))
+        for path in sources(ROOT / "tests" / folder)
+        for item in imports_of(path)
+        if item.target.split(".")[0] in BLENDER_MODULES or item.target.startswith("ltsh_addon.blender")
+    ]
+    assert not users, users
+
+
+def test_table_scripts_use_the_core_scipy_and_matplotlib_only():
+    scripts = sources(ROOT / "tables")
+    allowed = {"numpy", "scipy", "matplotlib", "tables"} | {path.stem for path in scripts} | sys.stdlib_module_names
+    problems = []
+    for script in scripts:
+        for item in imports_of(script):
+            head = item.target.split(".")[0]
+            inside = head == "ltsh_addon" and room_of(item.target) in ("shading", "scene")
+            if not inside and head not in allowed:
+                problems.append(f"{script.name} line {item.line} imports {item.target}")
+    assert scripts and not problems, problems
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["scene", "shading", "cycles.texels", "imaging", "pipeline.picture", "cli", "__main__", "blender.process.client"],
+)
+def test_importing_loads_neither_blender_nor_scipy(module):
+    forbidden = sorted(BLENDER_MODULES | {"scipy"})
+    code = (
+        f"import sys, ltsh_addon.{module}\n"
+        f"print(','.join(name for name in {forbidden} if name in sys.modules) or 'none')"
+    )
+    run = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert run.stdout.strip() == "none", f"importing ltsh_addon.{module} loads: {run.stdout.strip()}\n{run.stderr}"
+
+
+def test_the_extension_entry_point_imports_without_its_package():
+    """pytest and Blender's validation both load the file alone; a relative import at its top level would fail."""
+    code = "import __init__ as entry; assert callable(entry.register) and callable(entry.unregister)"
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert run.returncode == 0, run.stderr

@@ -1,25 +1,15 @@
-"""stdout for one document alone, in a Blender that prints on it too. Imports no bpy."""
+"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
 from __future__ import annotations
 
 import atexit
 import importlib
-import os
-import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 
 import bpy
 
-
-def reserve() -> None:
-    """From now on to the end of the process what is not printed through sys.stdout goes to stderr: Blender's own lines,
-    from C, also those that it prints when it ends."""
-    sys.stdout.flush()
-    ours = os.dup(1)
-    os.dup2(2, 1)
-    sys.stdout = open(ours, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, buffering=1)
-
+from ..cli.output import reserve_stdout
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
 PARTS = (
@@ -44,7 +34,7 @@ def register(command_line: Callable[..., int]) -> None:
 
     def run(arguments: list[str]) -> int:
         if "--json" in arguments:
-            reserve()
+            reserve_stdout()
         return command_line(arguments, program="blender --command ltsh", open_file=bpy.data.filepath)
 
     with ExitStack() as added:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 
 from ..imaging.report import json_text
@@ -105,3 +106,11 @@ def _summary(merged: Merged, output) -> str:
     else:
         lines = [line for report in merged.report["reports"] for line in tables.short_summary(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])
+
+
+def reserve_stdout() -> None:
+    """Keep stdout for what sys.stdout prints: from now on, Blender's own lines (from C) go to stderr."""
+    sys.stdout.flush()
+    ours = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = open(ours, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, buffering=1)

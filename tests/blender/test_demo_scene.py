@@ -165,9 +165,9 @@ def fingerprint_in_fresh_interpreter():
     code = (
         "import hashlib\n"
         "import numpy as np\n"
-        "from ltsh_addon.blender.demo import demo_objects, demo_textures as t\n"
+        "from ltsh_addon.blender import demo_meshes as t\n"
         "digest = hashlib.sha256()\n"
-        "for part in demo_objects.everything():\n"
+        "for part in t.everything():\n"
         "    shape = part.shape\n"
         "    digest.update(f'{part.name} {part.material} {part.location} {part.bevel}'.encode())\n"
         "    digest.update(np.ascontiguousarray(shape.vertices).tobytes() + repr(shape.faces()).encode())\n"

@@ -223,8 +223,8 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path):
 
 def test_json_is_alone_on_stdout_whatever_blender_prints():
     code = (
-        "import os, sys\nfrom ltsh_addon.blender import registration as standard_output\n"
-        "print('before', flush=True)\nstandard_output.reserve()\n"
+        "import os, sys\nfrom ltsh_addon.cli.output import reserve_stdout\n"
+        "print('before', flush=True)\nreserve_stdout()\n"
         "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
     )
     done = run_python("-c", code)

@@ -131,7 +131,7 @@ def test_emission_that_depends_on_the_direction_is_named(kind):
     tree.links.new(output, emission.inputs["Strength"])
     try:
         warnings = scene_parts.prepare()[3]
-    except scene_parts.extraction.SceneError:
+    except scene_parts.pixels.SceneError:
         return  # dark when seen head-on
     assert sum("'Odd'" in line and "direction" in line for line in warnings) == 1, warnings
 

@@ -191,6 +191,7 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
     for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
         with pytest.raises(RuntimeError, match="OpenEXR cannot be imported"):
             operator()
+    monkeypatch.undo()
     assert preflight.missing_libraries() is None
 
 

@@ -1,4 +1,4 @@
-"""The shared vocabulary: lights, surface samples and film, as frozen dataclasses of arrays.
+"""The shared vocabulary: techniques, passes, lights, surface samples and film.
 
 World space is Blender's: metres, right-handed, z up. Radiance is scene-referred linear RGB in W m^-2 sr^-1.
 """
@@ -6,6 +6,7 @@ World space is Blender's: metres, right-handed, z up. Radiance is scene-referred
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -16,6 +17,50 @@ VERSION = "0.1.0"  # also in blender_manifest.toml and pyproject.toml
 
 class Cancelled(Exception):
     """A long computation was stopped on request."""
+
+
+class SceneError(Exception):
+    """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
+
+
+# Called with a stage and the share of it that is done; returns False to stop the work.
+Progress = Callable[[str, float], "bool | None"]
+
+
+def error_line(error: BaseException) -> str:
+    """The message of an error in one line; its class where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@dataclass(frozen=True)
+class Technique:
+    """How a technique is called: on buttons, on comparison sheets and as a stage of progress, and what it does."""
+
+    label: str
+    title: str
+    description: str
+
+
+# By the names that options, layers of files and reports have. REFERENCE is the only one without a table.
+REFERENCE = "reference"
+TECHNIQUES = {
+    "ltc": Technique("LTC", "LTC", "Linearly transformed cosines, as EEVEE has them: fastest, least accurate"),
+    "ltsh2": Technique(
+        "LTSH 2", "LTSH N=2", "Linearly transformed spherical harmonics of degree 2: nearly as fast as LTC"
+    ),
+    "ltsh4": Technique(
+        "LTSH 4", "LTSH N=4", "Linearly transformed spherical harmonics of degree 4: the most accurate closed form"
+    ),
+    REFERENCE: Technique(
+        "Reference",
+        "Reference quadrature",
+        "Quadrature of the true lobe: exact and slow, on some of the pixels of large images",
+    ),
+}
+SHIPPED_TABLES = tuple(name for name in TECHNIQUES if name != REFERENCE)
+CYCLES = "cycles"  # pictures of Cycles, beside those of techniques
+PASSES = ("specular", "diffuse")
+BAKE_PASSES = (*PASSES, "diffuse_light", "combined")
 
 
 # In m. Squares of what is much farther away, or larger, do not fit into single precision.

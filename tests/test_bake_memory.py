@@ -6,8 +6,8 @@ import pytest
 
 from ltsh_addon import cli
 from ltsh_addon.blender.process import client, memory
-from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.pipeline.bake import BakeOptions, check_memory
+from ltsh_addon.scene import SceneError
 
 LIMIT = ["--memory-limit", "450M"]
 

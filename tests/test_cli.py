@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import cli, files
-from ltsh_addon.blender.process.blender_process import SceneError
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, SceneError
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -7,8 +7,8 @@ import fake_scene
 import pytest
 
 from ltsh_addon import panel_job
-from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.cli.progress import MESSAGE, LineProgress
+from ltsh_addon.scene import SceneError
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
 

@@ -8,11 +8,11 @@ import fake_scene
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.pipeline import batch, tasks
 from ltsh_addon.pipeline.batch import merge
 from ltsh_addon.pipeline.picture import Options
 from ltsh_addon.pipeline.tasks import Job
+from ltsh_addon.scene import SceneError
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 

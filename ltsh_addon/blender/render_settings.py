@@ -11,10 +11,10 @@ import bpy
 import mathutils
 import numpy as np
 
-from ..scene import Border
+from ..scene import Border, SceneError
 from ..shading.parallel import cores
 from .evaluated import SURFACE_TYPES
-from .process.blender_process import SceneError, listed
+from .process.blender_process import listed
 
 DEFAULTS = {"film_exposure": 1.0, "is_portal": False, "use_bump_map_correction": True}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from .process.blender_process import SceneError
+from ..scene import SceneError, error_line
 
 # What a compressed .blend ends with (Zstandard seekable format 0.1.1, facebook/zstd, contrib/seekable_format).
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
@@ -53,7 +53,7 @@ def save_copy(path: Path, **options) -> None:
         bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=True, **options)
     except RuntimeError as error:
         path.with_name(f"{path.name}@").unlink(missing_ok=True)
-        reason = " ".join(str(error).split()).removeprefix("Error: ")
+        reason = error_line(error).removeprefix("Error: ")
         raise SceneError(f"{path.parent}: Blender cannot save there: {reason}") from error
     check_whole(path)
 

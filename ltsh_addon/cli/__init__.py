@@ -15,7 +15,7 @@ import sys
 
 from .. import interruption
 from ..pipeline.tasks import NameClash
-from ..scene import VERSION, Cancelled
+from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Misuse
 from .commands import add_bake, add_compare, add_demo, add_merge, add_run, add_shade, add_tables
@@ -85,18 +85,14 @@ def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
 
 def _explained(error) -> tuple[list[str], int]:
     """What is to be said about an error, and the exit code."""
-    from ..blender.process import blender_process
-
-    text = " ".join(str(error).split()) or type(error).__name__
+    text = error_line(error)
     if isinstance(error, Mistakes):
         return error.lines, 1 if error.of_the_world else 2
     if isinstance(error, Misuse | NameClash):
         return [text], 2
     if isinstance(error, KeyboardInterrupt):
         return [interruption.message(error)], interruption.exit_code(error)
-    if not isinstance(
-        error, TableError | OSError | ValueError | ImportError | Cancelled | MemoryError | blender_process.SceneError
-    ):
+    if not isinstance(error, TableError | OSError | ValueError | ImportError | Cancelled | MemoryError | SceneError):
         logging.getLogger(__name__).error("unexpected error", exc_info=error)
         text = f"unexpected error: {type(error).__name__}: {text}"
     return [text], 1

@@ -14,6 +14,7 @@ from ..pipeline.baseline import Baseline
 from ..pipeline.batch import merge
 from ..pipeline.picture import DEFAULT_TECHNIQUES, Options, prepare
 from ..pipeline.tasks import Job
+from ..scene import SceneError, error_line
 from ..shading import PASSES, SHIPPED_TABLES, TableError
 from . import arguments as arguments_module
 from .arguments import (
@@ -383,8 +384,6 @@ def _run_jobs(arguments, bar, open_file) -> int:
 
 def _each(jobs: list[Wanted], do, arguments, bar) -> int:
     """Do something with every job; the world's faults in one do not keep the others from being done."""
-    from ..blender.process.blender_process import SceneError
-
     baselines = [_baseline(wanted) for wanted in jobs]
     documents, worst = [], 0
     for number, (wanted, baseline) in enumerate(zip(jobs, baselines, strict=True), 1):
@@ -395,7 +394,7 @@ def _each(jobs: list[Wanted], do, arguments, bar) -> int:
         try:
             document, code = do(wanted, settings, baseline)
         except (SceneError, TableError, OSError, ValueError, ImportError, MemoryError) as error:
-            text = " ".join(str(error).split()) or type(error).__name__
+            text = error_line(error)
             bar.note(f"failed: {label}: {text}")
             document, code = {"error": text}, 1
         documents.append({"command": wanted.job.command, "output": str(output), **document})

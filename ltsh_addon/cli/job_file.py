@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ..pipeline import picture
 from ..pipeline.tasks import Job
+from ..scene import SceneError
 from ..shading import TableError
 from .arguments import Misuse
 
@@ -192,7 +193,6 @@ class _Reader:
 
     def _checked(self, where, command, words, scenes) -> Wanted | None:
         """The job, if its options make sense together and its files are there."""
-        from ..blender.process.blender_process import SceneError
         from ..blender.process.client import check_readable
 
         try:

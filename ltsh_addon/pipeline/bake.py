@@ -6,7 +6,6 @@ import itertools
 import shutil
 import time
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -14,7 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from .. import imaging, shading
-from ..scene import AreaLight, Cancelled, SurfaceSamples
+from ..scene import AreaLight, Cancelled, Progress, SurfaceSamples
 from ..shading.parallel import cores
 from . import picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
@@ -283,8 +282,6 @@ SIZES = (64, 8192)
 MARGIN_TYPES = ("extend", "adjacent")
 # Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
 NOTED_SHARE_OUTSIDE = 0.01
-
-Progress = Callable[[str, float], "bool | None"]
 
 
 @dataclass(frozen=True)

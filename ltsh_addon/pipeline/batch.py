@@ -10,12 +10,11 @@ from itertools import groupby
 from pathlib import Path
 
 from ..imaging import write_json, write_overview
+from ..scene import Progress, SceneError, error_line
 from . import bake, picture
 from .tasks import FOLDER, FORMAT, Job, Records, Task, shard_of, tasks_of
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
-
-Progress = Callable[[str, float], "bool | None"]
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,6 @@ def run_tasks(
 
 def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
     """What is to be recorded of a task, its seconds and files; a failure is a "problem", unless `alone`."""
-    from ..blender.process.blender_process import SceneError
-
     start = time.perf_counter()
     try:
         made = _perform(job, task, following, existing, progress)
@@ -102,7 +99,7 @@ def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dic
     except (SceneError, OSError) as error:
         if alone:
             raise
-        problem = f"{task.name}: {' '.join(str(error).split())}"
+        problem = f"{task.name}: {error_line(error)}"
         return {"problem": problem}, {"total": time.perf_counter() - start}, ()
 
 

@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 
 from .. import imaging, shading
-from ..scene import VERSION, Cancelled, Film, SurfaceSamples
+from ..scene import VERSION, Cancelled, Film, Progress, SurfaceSamples
 
 DEFAULT_TECHNIQUES = ("ltc", "ltsh2", "ltsh4", shading.REFERENCE)
 REFERENCE_SEED = 20160725
 LABELS = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", shading.REFERENCE: "Reference quadrature"}
-
-Progress = Callable[[str, float], "bool | None"]
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ Letters: P samples, L lights, V polygon corners, K coefficients, F Fresnel curve
 functions have space as the last axis, kernels work on (3, V, P).
 """
 
-from .float64 import REFERENCE
-from .integrator import PASSES, Shading, shade
+from ..scene import PASSES, REFERENCE, SHIPPED_TABLES
+from .integrator import Shading, shade
 from .lobes import clamped_form_factor, evaluate_lobe, integrate_polygon
-from .lookup_table import SHIPPED_TABLES, LookupTable, TableError, load_table
+from .lookup_table import LookupTable, TableError, load_table
 
 __all__ = [
     "PASSES",

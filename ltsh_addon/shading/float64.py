@@ -9,14 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..scene import REFERENCE
 from . import light_cone
 from .edge_integrals import vector_irradiance
 from .light_polygons import light_view, local_frames, seen_parts, to_local
 from .lobes import form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
 from .reference import reference_integrals
-
-REFERENCE = "reference"
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import AreaLight, SurfaceSamples
+from ..scene import PASSES, REFERENCE, AreaLight, SurfaceSamples
 from . import float32, float64, light_cone, moments32, parallel
-from .float64 import REFERENCE
 from .light_polygons import fitting_patches
 from .lookup_table import LookupTable, load_table
 
@@ -112,7 +111,6 @@ def _corners_integrated(light, is_reference):
     return count
 
 
-PASSES = ("specular", "diffuse")
 # Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
 # one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
 BLOCK_LIMITS = (24592, 49184)

@@ -26,11 +26,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ..scene import SHIPPED_TABLES, error_line
 from .edge_integrals import MAX_DEGREE, ridge_matrix
 from .spherical_harmonics import coefficient_count, degree_of, hemisphere_integrals
 
 FORMAT_VERSION = 2
-SHIPPED_TABLES = ("ltc", "ltsh2", "ltsh4")
 WARP_REGULARIZATION = 0.5
 # Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
 MIN_ALPHA = 1e-5
@@ -189,7 +189,7 @@ def load_table(name_or_path: str | Path) -> LookupTable:
             metadata = json.loads(str(_member(archive, "metadata")))
     # A damaged file can raise almost anything: BadZipFile, zlib.error, KeyError, NotImplementedError, MemoryError ...
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = error_line(error)
         raise TableError(f"lookup table {path}: cannot be read ({reason}); fit it again or reinstall") from error
     return _validated(path, arrays, metadata)
 

@@ -9,10 +9,10 @@ import scene_parts
 
 from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.blender.render_settings import enable_passes, render_exr
 from ltsh_addon.pipeline.picture import Options, shade_scene
+from ltsh_addon.scene import SceneError
 
 
 def room(width=26, height=15):

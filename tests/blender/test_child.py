@@ -15,9 +15,9 @@ import programs
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.process.blender_process import SceneError, child_command
+from ltsh_addon.blender.process.blender_process import child_command
 from ltsh_addon.blender.process.client import ExtractOptions, extract
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, SceneError
 
 ROOT = Path(__file__).resolve().parents[2]
 

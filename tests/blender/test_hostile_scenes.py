@@ -15,7 +15,7 @@ import pytest
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.extract import pixels
 from ltsh_addon.blender.process import blender_process, client
-from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.scene import SceneError
 
 # `make soak` takes 10,000.
 MANY = int(os.environ.get("LTSH_MANY_LIGHTS", "500"))

@@ -8,8 +8,8 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, assert_agrees, into_collection, start
 
-from ltsh_addon.blender.process.blender_process import SceneError
 from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.scene import SceneError
 
 
 def names_of_lights():

@@ -10,8 +10,7 @@ import quadrature
 import scene_parts
 
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.blender.process.blender_process import SceneError
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import AreaLight, SceneError, SurfaceSamples
 
 LAMBERT = "ShaderNodeBsdfDiffuse"
 CASES = {

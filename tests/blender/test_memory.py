@@ -12,7 +12,7 @@ import scene_parts
 
 from ltsh_addon import cli
 from ltsh_addon.blender.process import memory
-from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.scene import SceneError
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -19,7 +19,7 @@ from lit_plane import (
 
 from ltsh_addon.blender.extract import pixels
 from ltsh_addon.blender.lights import meshes
-from ltsh_addon.blender.process.blender_process import SceneError
+from ltsh_addon.scene import SceneError
 from ltsh_addon.shading import shade
 
 L_SHAPE = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (0.3, 0.3, 0), (0.3, 1, 0), (0, 1, 0)]

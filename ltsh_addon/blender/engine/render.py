@@ -15,11 +15,10 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ... import shading
-from ...scene import Cancelled
+from ...scene import Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
 from ..process import client
-from ..process.blender_process import SceneError
 from ..saving import save_working_copy
 from ..ui.preview import ENGINE
 from . import view
@@ -41,7 +40,7 @@ def _take(*_) -> None:
     try:
         save_working_copy(path, keep_engine=True)
     except RuntimeError as error:
-        _current["error"] = " ".join(str(error).split()).removeprefix("Error: ")
+        _current["error"] = error_line(error).removeprefix("Error: ")
 
 
 @persistent
@@ -80,7 +79,6 @@ def _drop_copies() -> None:
     _drop()
 
 
-Progress = Callable[[str, float], "bool | None"]
 ASK_SECONDS = 0.05
 
 
@@ -289,7 +287,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self._fail(f"{type(error).__name__}: {error}")
 
     def _fail(self, error) -> None:
-        message = f"LTSH: {' '.join(str(error).split()) or type(error).__name__}"
+        message = f"LTSH: {error_line(error)}"
         self.error_set(message)
         # Only a reported error makes bpy.ops.render.render fail.
         self.report({"ERROR"}, message)

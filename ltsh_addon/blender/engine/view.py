@@ -14,6 +14,7 @@ import numpy as np
 
 from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
+from ...scene import error_line
 from ..render_settings import cycles_setting
 from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
@@ -363,7 +364,7 @@ class EngineView:
 
     def _note(self, error: Exception) -> str:
         """Keep what went wrong for the view; the console gets it once."""
-        text = " ".join(str(error).split()) or type(error).__name__
+        text = error_line(error)
         if text != self._error:
             _logger.exception("the viewport could not be drawn")
         self._error = text

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import bpy
 
+from ...scene import SceneError
 from ..materials.graph import cut, ensure_nodes, material_output
-from ..process.blender_process import SceneError
 from ..saving import save_copy
 from .pixels import open_scene
 

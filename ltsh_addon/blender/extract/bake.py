@@ -14,7 +14,7 @@ import numpy as np
 from ...cycles.texels import BakeView, TexelMesh
 from ...cycles.uv import tiles_of
 from ...files import save_array
-from ...scene import FARTHEST
+from ...scene import FARTHEST, SceneError, error_line
 from .. import render_settings
 from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights, seen_lights
@@ -29,7 +29,7 @@ from ..materials.aovs import (
 from ..materials.graph import ensure_nodes
 from ..materials.maps import MaterialPlan
 from ..materials.values import SavedImages
-from ..process.blender_process import SceneError, listed
+from ..process.blender_process import listed
 from ..render_settings import working_space
 from . import pixels
 from .pixels import remove_occlusion
@@ -447,7 +447,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
             try:
                 record |= _object(opened, name, images, job, folder / f"object_{number}", progress)
             except (ObjectError, RuntimeError) as error:
-                record["problem"] = " ".join(str(error).split())
+                record["problem"] = error_line(error)
         records.append(record)
     return {
         "blender_version": bpy.app.version_string,

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ...scene import SceneError, error_line
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
@@ -22,7 +23,7 @@ from ..materials.aovs import (
     remove_aovs,
 )
 from ..process import client, memory
-from ..process.blender_process import SceneError, listed
+from ..process.blender_process import listed
 from ..render_settings import (
     enable_passes,
     filter_name,
@@ -171,7 +172,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
 
 def _reason(error: RuntimeError, path: Path) -> str:
     """What Blender says is wrong with a file, without the file's name."""
-    text = " ".join(str(error).split()).removeprefix("Error: ")
+    text = error_line(error).removeprefix("Error: ")
     for named in (f'Loading "{path}" failed: ', f"Failed to read blend file '{path}': ", f' in file "{path}"'):
         text = text.replace(named, "")
     return text

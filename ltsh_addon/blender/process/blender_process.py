@@ -13,11 +13,11 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextvars import ContextVar
 from pathlib import Path
 
-from ...scene import Cancelled
+from ...scene import Cancelled, Progress, SceneError
 
 NICENESS = 10
 # Linux weighs sessions against each other, and niceness only within one (sched(7), "The autogroup feature").
@@ -68,12 +68,6 @@ def listed(names: Iterable[str], wanted: str) -> str:
 WORKER = Path(__file__).with_name("worker.py")
 OUTPUT_LINES_KEPT = 12
 BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
-
-Progress = Callable[[str, float], "bool | None"]
-
-
-class SceneError(Exception):
-    """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
 
 
 def disk_is_full(error: OSError) -> bool:

@@ -18,9 +18,9 @@ import numpy as np
 from ...cycles import gbuffer, lobes
 from ...cycles.horizons import end_at_horizons_of_cycles
 from ...files import locked_folder, replacing_by_copy
-from ...scene import REC709, AreaLight, Border, ColorSpace, Film, SurfaceSamples
+from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples
 from . import blender_process
-from .blender_process import Progress, SceneError, disk_is_full, no_room, run_child
+from .blender_process import disk_is_full, no_room, run_child
 
 # Of a .blend as it is, or compressed by Blender since 3.0 and before.
 PLAIN, ZSTANDARD, GZIP = b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b"
@@ -335,7 +335,7 @@ class BakeJob:
     tile: int | None = None  # the UDIM tile that is wanted, None for all
 
 
-def extract_bake(job: BakeJob, folder: Path, *, progress: blender_process.Progress | None = None) -> dict:
+def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
     """Meshes, materials, maps and Cycles' bake of a .blend as files in `folder`; the manifest.
 
     Raises as `extract` does.
@@ -346,9 +346,7 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: blender_process.Progre
         return blender_process.run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
 
-def apply_bake(
-    scene: Path, path: Path, textures: list[dict], *, progress: blender_process.Progress | None = None
-) -> list[str]:
+def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
     """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
 
     Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
@@ -360,7 +358,7 @@ def apply_bake(
 
 
 def scene_facts(
-    scene: Path, frames, objects, uv=None, *, scripts: bool = False, progress: blender_process.Progress | None = None
+    scene: Path, frames, objects, uv=None, *, scripts: bool = False, progress: Progress | None = None
 ) -> list[dict]:
     """For each of `frames` (None: the file's own) "frame", "camera" (name or None), names of "objects" to bake, and
     "tiles", the UDIM tiles by name of those of which each can be a task of its own.

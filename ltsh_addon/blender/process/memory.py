@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from .blender_process import SceneError
+from ...scene import SceneError
 
 # The preferences of the extension set it, a farm may.
 VARIABLE = "LTSH_MEMORY_MIB"

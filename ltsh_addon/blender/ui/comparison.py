@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
+from ...scene import error_line
 from . import drawing, results
 
 NAME = "LTSH Comparison"
@@ -28,7 +29,7 @@ def changed(settings, context) -> None:
 
 def _warn(error: RuntimeError) -> None:
     """A picture is gone; the panels say so when the results are shown anew."""
-    logging.getLogger(__name__).warning("%s", " ".join(str(error).split()))
+    logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def refresh(scene) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
-from ..process.blender_process import SceneError
+from ...scene import SceneError, error_line
 from ..saving import save_working_copy
 from . import comparison, preflight, results
 from . import job as job_module
@@ -101,7 +101,7 @@ class _JobOperator:
         """End the job with one line, whatever happened here; preferences say whether the console gets more."""
         logging.getLogger(__name__).info("unexpected error", exc_info=error)
         self._job.cancel()
-        self._job.error = f"{self._job.title} failed: {' '.join(str(error).split()) or type(error).__name__}"
+        self._job.error = f"{self._job.title} failed: {error_line(error)}"
         return self._finish(context)
 
     def _begin(self, context) -> bool:
@@ -120,7 +120,7 @@ class _JobOperator:
             job.start(runs, background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
-            self.report({"ERROR"}, " ".join(str(error).split()))
+            self.report({"ERROR"}, error_line(error))
             return False
         self._job = _running["job"] = job
         return True

@@ -12,6 +12,7 @@ from pathlib import Path
 import bpy
 from bpy.props import StringProperty
 
+from ...scene import error_line
 from ..extract.bake import ObjectError, check_object
 from ..lights.emission import emission_behind
 from ..materials.graph import material_output
@@ -31,7 +32,7 @@ def missing_libraries() -> str | None:
     except (ImportError, AttributeError) as error:
         version = ".".join(platform.python_version_tuple()[:2])
         return (
-            f"OpenEXR cannot be imported ({' '.join(str(error).split())}): install the LTSH zip for "
+            f"OpenEXR cannot be imported ({error_line(error)}): install the LTSH zip for "
             f"{platform.system()} {platform.machine()} and Python {version}; only Live Preview works without"
         )
     return None

@@ -80,7 +80,7 @@ bench:
 
 soak:
 	@python=$$($(SETUP) python newest) && "$$python" tests/soak/kill_soak.py $(KILL_OPTIONS) && \
-	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/test_hostile_scenes.py -k many_lights && \
+	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/pipeline/test_hostile_scenes.py -k many_lights && \
 	"$$python" tests/benchmarks/animation.py $(ANIMATION_OPTIONS) && \
 	"$$python" tests/soak/soak.py $(SOAK_OPTIONS)
 

@@ -36,8 +36,8 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     archive = built_zip()
     fixed = ["--blend", str(demo_scene(arguments.out))]
-    for name in ("random_surfaces.py", "blender_state.py"):
-        fixed += ["--file", str(HERE.parent / "blender" / name)]
+    for name in ("helpers/random_surfaces.py", "blender/helpers/blender_state.py"):
+        fixed += ["--file", str(HERE.parent / name)]
     for helper in sorted(set(HERE.glob("*.py")) - set(HERE.glob("drive_*.py")) - {Path(__file__).resolve()}):
         fixed += ["--file", str(helper)]
     failed = [path.stem for path in drivers if not run(arguments.runner, path, archive, fixed, arguments.out)]

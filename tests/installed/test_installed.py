@@ -216,7 +216,7 @@ def test_enabling_disabling_and_uninstalling_leaves_nothing(tmp_path):
     installed = InstalledBlender(tmp_path)
     script = Path(__file__).with_name("enable_and_disable.py")
     background = ("--background", "--python-exit-code", "3", "--python", script)
-    done = installed.run(*background, "--", ROOT / "tests" / "blender")
+    done = installed.run(*background, "--", ROOT / "tests" / "blender" / "helpers")
     assert done.returncode == 0, done.stdout + done.stderr
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("LTSH-REPORT ")]
     report = json.loads(line.removeprefix("LTSH-REPORT "))

@@ -193,7 +193,7 @@ shading.shade(random_samples(100000), four_lights(), "reference", workers=2)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_children_of_a_killed_parent_end():
-    code = PARENT.format(root=str(ROOT), tests=str(Path(__file__).parent))
+    code = PARENT.format(root=str(ROOT), tests=str(ROOT / "tests" / "helpers"))
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     with parent:
         child = int(parent.stdout.readline())

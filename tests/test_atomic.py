@@ -9,7 +9,7 @@ import pytest
 
 from ltsh_addon.files import check_takes_files, machine, replacing, replacing_by_copy, write_bytes
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # Writes half a file and ends as a killed process does, or waits for a line before it goes on.
 HALF = """
 import os, sys

@@ -12,7 +12,7 @@ import scene_parts
 
 from ltsh_addon import cli, imaging
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 ALWAYS = ("report.json", "timing.json", ".ltsh")
 SMALL = ["--resolution", "32x18", "--cycles-samples", "8"]
 

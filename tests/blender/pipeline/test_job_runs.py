@@ -19,7 +19,7 @@ from ltsh_addon.pipeline.batch import merge
 from ltsh_addon.pipeline.picture import Options, make_picture
 from ltsh_addon.pipeline.tasks import Job, tasks_of
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from ltsh_addon.files import PREFIX, locked_folder
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # Makes a folder with a file, and waits for a line or is killed.
 MAKER = """
 import sys

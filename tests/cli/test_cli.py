@@ -15,7 +15,7 @@ import pytest
 from ltsh_addon import cli, files
 from ltsh_addon.scene import Cancelled, SceneError
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture

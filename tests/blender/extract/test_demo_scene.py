@@ -13,7 +13,7 @@ from ltsh_addon.blender import demo_meshes
 from ltsh_addon.blender.process import blender_process, client
 from ltsh_addon.blender.saving import check_whole
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 LOCKS = sorted((ROOT / "requirements").glob("py*.txt"))
 ADDITIONS = [ROOT / "requirements" / name for name in ("blender.txt", "wheels.txt")]
 needs_bash = pytest.mark.skipif(shutil.which("bash") is None, reason="the set-up script needs bash")

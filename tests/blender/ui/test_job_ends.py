@@ -14,7 +14,7 @@ from kills import is_running
 from ltsh_addon.blender.ui import job as job_module
 from ltsh_addon.blender.ui import operators, results
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # Runs a job until its first stage, and waits to be killed or cancels it and ends.
 OWNER = """
 import json, threading, time

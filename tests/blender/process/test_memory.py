@@ -14,7 +14,7 @@ from ltsh_addon import cli
 from ltsh_addon.blender.process import memory
 from ltsh_addon.scene import SceneError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import scene_parts
 
 from ltsh_addon import imaging
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 EXTRAS = {
     "Glass": {"Transmission_Weight": 1.0},
     "Wax": {"Subsurface_Weight": 1.0},

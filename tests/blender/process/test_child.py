@@ -19,7 +19,7 @@ from ltsh_addon.blender.process.blender_process import child_command
 from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.scene import Cancelled, SceneError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def saved_scene(path: Path, *, camera=True, light=True, look=(0.0, 0.0, 0.0)) -> Path:

@@ -13,7 +13,7 @@ import pytest
 import scene_parts
 from kills import is_blenders_own
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 LINES = {signal.SIGINT: "ltsh: interrupted", signal.SIGTERM: "ltsh: terminated"}
 LARGE = "--reference-samples", "1000000"
 # Less than what the commands below would take; `make soak` prints in how many seconds signals end commands.

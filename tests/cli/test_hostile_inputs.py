@@ -1,6 +1,6 @@
 """Inputs that nobody meant, as far as no Blender is needed to refuse them: one line, the right exit code, at once.
 
-Those that are scenes: tests/blender/test_hostile_scenes.py.
+Those that are scenes: tests/blender/pipeline/test_hostile_scenes.py.
 """
 
 import gzip
@@ -16,7 +16,7 @@ import zstandard
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.process import client
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 TABLE = (ROOT / "tables" / "ltsh2.npz").read_bytes()
 SHADE = ["shade", "room.blend", "-o", "out"]
 COMPARE = ["compare", "room.blend", "-o", "out"]

@@ -18,7 +18,7 @@ from ltsh_addon.imaging import read_channels
 from ltsh_addon.pipeline import export
 from ltsh_addon.shading import lookup_table
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"
 
 

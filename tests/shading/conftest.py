@@ -1,4 +1,4 @@
-"""The headers that the tests of this folder look at."""
+"""The exported headers that tests of this folder look at."""
 
 import header_harness
 import pytest

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 MARK = "LTSH_TEST_RUN"
 # Seconds within which processes see that the one which started them is gone, also on a busy machine.
 PATIENCE = 60.0

@@ -15,7 +15,7 @@ from test_symbolic_wheel import fake_library, fake_wheel
 from requirements import build_extension
 from requirements.build_extension import PLATFORMS, PYTHONS, BuildError, run_tool, with_wheels
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 WHEEL_TAGS = {
     "linux-x64": "manylinux_2_28_x86_64",
     "macos-arm64": "macosx_11_0_arm64",

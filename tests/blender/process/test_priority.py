@@ -10,7 +10,7 @@ import pytest
 from ltsh_addon.blender.process import blender_process
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "setpriority"), reason="Windows has classes of priority instead")
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 # What the child of a job does, and what Blender does as its child.
 SCRIPT = f"""
 import os, subprocess, sys

@@ -101,7 +101,7 @@ def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatc
     from ltsh_addon.blender.process import client
 
     found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}}
-    monkeypatch.setattr(client, "ask", lambda *arguments, **options: [found])
+    monkeypatch.setattr(client, "scene_facts", lambda *arguments, **options: [found])
     name = "{camera}_{frame:03d}"
     assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0
     assert (tmp_path / "out" / "Main_1_012.exr").is_file() and child.asked[0].frame is None

@@ -305,8 +305,8 @@ class BakeScene:
             if material.name_full not in made:
                 lobes, lines = self.lobes[material.name_full]
                 values = lobes.values if lobes is not None else ()
-                trees = tuple(leaf.tree for leaf in lobes.leaves) if lobes is not None else ()
-                made[material.name_full] = MaterialPlan(material, values, trees, images, uv_names)
+                paths = tuple(leaf.source.groups for leaf in lobes.leaves) if lobes is not None else ()
+                made[material.name_full] = MaterialPlan(material, values, paths, images, uv_names)
                 warnings += lines
         return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,8 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ..materials.graph import live_link, source_of
+from ..materials.bsdfs import EMISSION, emission_sockets, emits
+from ..materials.graph import Source, is_socket, shaders_behind, source_of, value_of
 from ..render_settings import enable_passes
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
@@ -35,13 +35,6 @@ DIRECTIONAL = {
     "ShaderNodeNewGeometry": ("Incoming",),
     "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),
 }
-# What each shader node's emission is made of: shader inputs, and value inputs.
-SHADERS = {
-    "ShaderNodeMixShader": ((1, 2), (0,)),
-    "ShaderNodeAddShader": ((0, 1), ()),
-    "ShaderNodeEmission": ((), ("Color", "Strength")),
-    "ShaderNodeBsdfPrincipled": ((), ("Emission Color", "Emission Strength", "Alpha")),
-}
 
 
 @dataclass
@@ -56,59 +49,43 @@ class Emission:
 
 def emission_behind(tree, socket, groups: tuple = ()) -> Emission:
     """What emits behind the shader input `socket` of `tree`; `groups` leads there, as (tree, group node) pairs."""
-    found = Emission()
-    for owner, node, _, path in _sources(tree, socket, groups):
-        if node.bl_idname not in SHADERS:
+    found, seen = Emission(), set()
+    leaves = shaders_behind(tree, socket, groups).leaves
+    found.plain = len(leaves) == 1 and leaves[0].terms == ((),) and _is_neutral(leaves[0].node)
+    for leaf in leaves:
+        if not emits(leaf.node):
             continue
-        shaders, values = SHADERS[node.bl_idname]
-        found.plain = node.bl_idname == "ShaderNodeEmission" and _is_neutral(node)
-        parts = [emission_behind(owner, node.inputs[name], path) for name in shaders]
-        found.emits |= any(part.emits for part in parts) or (not shaders and not _is_dark(node))
-        for part in parts:
-            found.varies |= part.varies
-            found.directional |= part.directional
-        if found.emits:
-            for name in values:
-                _note_values(owner, node.inputs[name], path, found, set())
+        found.emits = True
+        alpha = (leaf.node.inputs["Alpha"],) if "Alpha" in leaf.node.inputs else ()
+        for value in (*emission_sockets(leaf.node), *alpha):
+            _note_value(source_of(leaf.tree, value, leaf.source.groups), found, seen)
+        for factor in {factor for term in leaf.terms for factor in term}:
+            _note_value(factor.source, found, seen)
     return found
 
 
-def _is_dark(node) -> bool:
-    """True if an Emission or Principled node certainly emits nothing."""
-    prefix = "Emission " if "Emission Strength" in node.inputs else ""
-    strength, color = node.inputs[prefix + "Strength"], node.inputs[prefix + "Color"]
-    if live_link(strength) is None and strength.default_value == 0.0:
-        return True
-    return live_link(color) is None and not any(color.default_value[:3])
-
-
 def _is_neutral(node) -> bool:
-    """True if an Emission node multiplies by 1."""
-    strength, color = node.inputs["Strength"], node.inputs["Color"]
-    linked = live_link(strength) or live_link(color)
-    return not linked and strength.default_value == 1.0 and tuple(color.default_value[:3]) == (1.0, 1.0, 1.0)
+    """True for an Emission node that multiplies by 1."""
+    if node.bl_idname != EMISSION:
+        return False
+    color, strength = (value_of(socket) for socket in emission_sockets(node))
+    return strength == 1.0 and not is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
 
 
-def _note_values(tree, socket, groups, found: Emission, seen: set) -> None:
-    """Note in `found` what the value at the input `socket` depends on."""
-    for owner, node, output, path in _sources(tree, socket, groups):
-        key = (owner.name_full, node.name, output.identifier, len(path))
-        if key in seen:
-            continue
-        seen.add(key)
-        kind = node.bl_idname
-        if kind in DIRECTIONAL and (not DIRECTIONAL[kind] or output.name in DIRECTIONAL[kind]):
-            found.directional.add(node.bl_label)
-        found.varies |= kind not in CONSTANT_NODES
-        for entry in node.inputs:
-            _note_values(owner, entry, path, found, seen)
-
-
-def _sources(tree, socket, groups) -> Iterator[tuple]:
-    """(tree, node, output, groups) of what feeds the input `socket`, past reroutes, muted nodes and groups."""
-    source = source_of(tree, socket, groups)
-    if source is not None and source.node is not None:
-        yield source.tree, source.node, source.socket, source.groups
+def _note_value(source: Source | None, found: Emission, seen: set) -> None:
+    """Note in `found` what a value depends on."""
+    if source is None or source.node is None:
+        return
+    key = source.node, source.socket.identifier, source.groups
+    if key in seen:
+        return
+    seen.add(key)
+    kind = source.node.bl_idname
+    if kind in DIRECTIONAL and (not DIRECTIONAL[kind] or source.socket.name in DIRECTIONAL[kind]):
+        found.directional.add(source.node.bl_label)
+    found.varies |= kind not in CONSTANT_NODES
+    for entry in source.node.inputs:
+        _note_value(source_of(source.tree, entry, source.groups), found, seen)
 
 
 PIXELS = 256

@@ -7,8 +7,28 @@ from dataclasses import dataclass, field
 import bpy
 
 from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
-from .bsdfs import TRANSPARENT_NODES, Leaf, bsdf_leaves, cut_alpha, emits, is_emission, is_group, lobe_of
-from .graph import ensure_nodes, fill_with_bsdf, is_constant, is_socket, live_link, material_output
+from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
+from .graph import (
+    MIX,
+    Factor,
+    Leaf,
+    SurfaceShaders,
+    bypass,
+    carry_into_group,
+    carry_out_of_group,
+    cut,
+    ensure_nodes,
+    fill_with_bsdf,
+    is_constant,
+    is_group,
+    is_socket,
+    live_link,
+    material_output,
+    mix_weights,
+    product,
+    shaders_behind,
+    total,
+)
 
 
 def write_aov(tree, name: str, value) -> None:
@@ -159,42 +179,69 @@ def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str
 
 
 def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes | None:
-    """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface."""
+    """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface.
 
-    def warn(message):
-        report.warn(material.name, message)
-
+    Its tree changes: transparency and volumes are cut, and what weights need is computed.
+    """
     tree = material.node_tree
-    output = material_output(tree)
-    if output is None:
-        output = tree.nodes.new("ShaderNodeOutputMaterial")
-    volume = live_link(output.inputs["Volume"])
-    if volume is not None:
-        tree.links.remove(volume)
-        warn("its volume is not shaded; left out of the Cycles reference as well")
-    for node in _tracing_nodes(tree):
-        warn(f"node {node.name!r} {TRACING_NODES[node.bl_idname]}")
-    leaves = bsdf_leaves(tree, output.inputs["Surface"], warn)
-    if not leaves:
+    output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
+    surface = output.inputs["Surface"]
+    shaders = shaders_behind(tree, surface, tree_of=_OwnTrees())
+    for line in notes_of_material(tree, output, shaders, emitter):
+        report.warn(material.name, line)
+    cut(tree, output.inputs["Volume"])
+    for found in shaders.cuts:
+        if found.node.bl_idname == MIX:
+            bypass(found.tree, found.node, live_link(found.other).from_socket)
+        else:
+            cut(found.tree, found.clear)
+    if not shaders.leaves:
         # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
         black = tree.nodes.new("ShaderNodeBsdfDiffuse")
         black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-        tree.links.new(black.outputs[0], output.inputs["Surface"])
-    elif all(leaf.node.bl_idname in TRANSPARENT_NODES for leaf in leaves):
+        tree.links.new(black.outputs[0], surface)
+    elif all(leaf.is_transparent for leaf in shaders.leaves):
         return None
-    if not emitter and any(emits(leaf.node) for leaf in leaves):
-        warn("emission is not shaded and lights nothing, in the Cycles reference neither")
-    pairs = []
-    for leaf in leaves:
-        if is_emission(leaf.node):
-            continue
-        cut_alpha(leaf.tree, leaf.node, warn)
-        values = lobe_of(leaf.node, warn)
-        if values:
-            share = {} if is_constant(leaf.weight, 1.0) else {"weight": leaf.weight}
-            pairs.append((leaf, {**values, **share}))
-    pairs = _largest(pairs, warn)
-    return MaterialLobes(material, tuple(leaf for leaf, _ in pairs), tuple(values for _, values in pairs))
+    for leaf in shaders.leaves:
+        if has_alpha(leaf.node):
+            cut(leaf.tree, leaf.node.inputs["Alpha"])
+            leaf.node.inputs["Alpha"].default_value = 1.0
+    shaded = shaded_leaves(shaders)[0]
+    weights = _Weights()
+    shares = [weights.of(leaf) for leaf in shaded]
+    values = (
+        {**lobe_values(leaf.node), **({} if is_constant(share, 1.0) else {"weight": share})}
+        for leaf, share in zip(shaded, shares, strict=True)
+    )
+    return MaterialLobes(material, tuple(shaded), tuple(values))
+
+
+def notes_of_material(tree, output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
+    """What of a material is not shaded as Cycles does; `emitter`: it is a light. Nothing is changed."""
+    notes = []
+    if live_link(output.inputs["Volume"]) is not None:
+        notes.append("its volume is not shaded; left out of the Cycles reference as well")
+    notes += [f"node {node.name!r} {TRACING_NODES[node.bl_idname]}" for node in _tracing_nodes(tree)]
+    for found in shaders.cuts:
+        notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
+    leaves = shaders.leaves
+    if all(leaf.is_transparent for leaf in leaves):
+        return notes
+    if not emitter and any(is_emission(leaf.node) or emits(leaf.node) for leaf in leaves):
+        notes.append("emission is not shaded and lights nothing, in the Cycles reference neither")
+    notes += [note for leaf in leaves if not is_emission(leaf.node) for note in notes_of(leaf.node)]
+    _, left_out = shaded_leaves(shaders)
+    if left_out:
+        names = ", ".join(repr(leaf.node.name) for leaf in left_out)
+        notes.append(f"it has {MAX_LOBES + len(left_out)} BSDF nodes, of which {MAX_LOBES} are shaded, not {names}")
+    return notes
+
+
+def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
+    """The MAX_LOBES leaves with a lobe that have the largest weights, as far as constants tell, and those beyond."""
+    leaves = [leaf for leaf in shaders.leaves if bsdf_of(leaf.node) is not None]
+    order = sorted(range(len(leaves)), key=lambda index: -leaves[index].bound)
+    return [leaves[index] for index in sorted(order[:MAX_LOBES])], [leaves[index] for index in order[MAX_LOBES:]]
 
 
 def _tracing_nodes(tree) -> list:
@@ -208,14 +255,54 @@ def _tracing_nodes(tree) -> list:
     return found
 
 
-def _largest(pairs: list, warn) -> list:
-    """The MAX_LOBES pairs (leaf, values) of largest weight, as far as constants tell, in their order."""
-    if len(pairs) <= MAX_LOBES:
-        return pairs
-    order = sorted(range(len(pairs)), key=lambda index: -pairs[index][0].bound)
-    dropped = ", ".join(repr(pairs[index][0].node.name) for index in order[MAX_LOBES:])
-    warn(f"it has {len(pairs)} BSDF nodes, of which {MAX_LOBES} are shaded, not {dropped}")
-    return [pairs[index] for index in sorted(order[:MAX_LOBES])]
+class _OwnTrees:
+    """Gives group nodes node trees without other users, each once."""
+
+    def __init__(self):
+        self._owned: set = set()
+
+    def __call__(self, group):
+        if group not in self._owned and group.node_tree is not None:
+            group.node_tree = group.node_tree.copy()
+            self._owned.add(group)
+        return group.node_tree
+
+
+class _Weights:
+    """Computes the weights of leaves by nodes; the trees of groups must have one user each."""
+
+    def __init__(self):
+        self._known: dict = {}
+        self._shares: dict = {}
+
+    def of(self, leaf: Leaf):
+        """The weight of the lobes of `leaf`: a number, or a socket of its tree."""
+        groups = leaf.source.groups
+        weight, *others = (self._product(term, groups) for term in leaf.lobe_terms)
+        for other in others:
+            weight = total(leaf.tree, weight, other)
+        return weight
+
+    def _product(self, factors: tuple[Factor, ...], groups: tuple):
+        """The product of `factors` in the tree that `groups` lead to."""
+        key = factors, groups
+        if key not in self._known:
+            self._known[key] = self._carried(factors, groups) if factors else 1.0
+        return self._known[key]
+
+    def _carried(self, factors, groups):
+        last = factors[-1]
+        if groups == last.groups:
+            return product(last.tree, self._product(factors[:-1], groups), self._share(last))
+        depth = len(groups)
+        if last.groups[:depth] == groups:
+            return carry_out_of_group(last.groups[depth][1], self._product(factors, last.groups[: depth + 1]))
+        return carry_into_group(*groups[-1], self._product(factors, groups[:-1]))
+
+    def _share(self, factor: Factor):
+        if factor.node not in self._shares:
+            self._shares[factor.node] = mix_weights(factor.tree, factor.node.inputs[0])
+        return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
 def _write_hit(material) -> None:

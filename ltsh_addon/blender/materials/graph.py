@@ -1,13 +1,20 @@
-"""The walk over node trees: sources behind sockets, through groups, reroutes and muted nodes."""
+"""Node trees: the one walk from a surface to its BSDF nodes, what feeds a socket, and edits of trees.
+
+All readers of materials use this walk: AOVs and bakes (`aovs`), the viewport (`looks`), the emission of lights, and
+the overview in the panels. It changes nothing.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import bpy
 
-GROUP_SOCKET_NAME = "ltsh weight"
+MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
+TRANSPARENT_NODES = ("ShaderNodeBsdfTransparent", "ShaderNodeHoldout")
+GROUP_SOCKET_NAME = "ltsh"
 
 
 def live_link(socket):
@@ -62,6 +69,193 @@ def socket_named(sockets, identifier: str):
 def passed_through(node, output):
     """The input socket that a muted `node` hands on to its `output`, or None."""
     return next((link.from_socket for link in node.internal_links if link.to_socket == output), None)
+
+
+def is_group(node) -> bool:
+    """True for nodes that hold a node tree, or could: groups of Blender and of add-ons."""
+    return node.bl_idname == "ShaderNodeGroup" or hasattr(node, "node_tree")
+
+
+@dataclass(frozen=True)
+class Source:
+    """An output of a node, or an unlinked input (`node` None) whose own value counts."""
+
+    tree: Any
+    socket: Any
+    node: Any
+    groups: tuple = ()  # (tree, group node) pairs that lead from the material to `tree`
+
+    def input(self, name) -> Source | None:
+        """What feeds the input `name` (or position) of the node."""
+        return source_of(self.tree, self.node.inputs[name], self.groups)
+
+
+def _own_tree(group):
+    return group.node_tree
+
+
+def source_of(tree, socket, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+    """What feeds the input `socket` of `tree`; None where a group has no inside or no outside."""
+    link = live_link(socket)
+    if link is None:
+        return Source(tree, socket, None, groups)
+    return source_behind(tree, link.from_socket, groups, tree_of)
+
+
+def source_behind(tree, output, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+    """What the `output` of a node in `tree` comes from, past groups, reroutes and muted nodes; None as in `source_of`.
+
+    `tree_of(group node)` is the node tree of a group that is entered.
+    """
+    node, entry = output.node, None
+    if node.mute:
+        entry = passed_through(node, output)
+    elif node.bl_idname == "NodeReroute":
+        entry = node.inputs[0]
+    elif is_group(node):
+        inner = tree_of(node)
+        end = group_output(inner) if inner is not None else None
+        if end is not None:
+            entry = socket_named(end.inputs, output.identifier)
+            tree, groups = inner, (*groups, (tree, node))
+    elif node.bl_idname == "NodeGroupInput":
+        if groups:
+            (tree, group), groups = groups[-1], groups[:-1]
+            entry = socket_named(group.inputs, output.identifier)
+    else:
+        return Source(tree, output, node, groups)
+    return None if entry is None else source_of(tree, entry, groups, tree_of)
+
+
+@dataclass(frozen=True)
+class Factor:
+    """What a Mix Shader node multiplies one of its shaders by: its factor, clamped to [0, 1], or 1 minus that."""
+
+    tree: Any
+    node: Any
+    groups: tuple
+    is_complement: bool
+    beside_transparency: bool  # the other shader is transparency, which is cut: only emission is less by this factor
+
+    @property
+    def source(self) -> Source | None:
+        """What feeds the factor of the node."""
+        return source_of(self.tree, self.node.inputs[0], self.groups)
+
+    @property
+    def constant(self) -> float | None:
+        """Its value, None where nodes compute it."""
+        value = value_of(self.node.inputs[0])
+        if is_socket(value):
+            return None
+        value = min(max(value, 0.0), 1.0)
+        return 1.0 - value if self.is_complement else value
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A shader node that is neither mix nor sum; its weight is the sum over `terms` of the products of factors."""
+
+    source: Source
+    terms: tuple[tuple[Factor, ...], ...]  # outermost factor first
+
+    @property
+    def node(self):
+        """The shader node."""
+        return self.source.node
+
+    @property
+    def tree(self):
+        """The node tree that the node lives in."""
+        return self.source.tree
+
+    @property
+    def is_transparent(self) -> bool:
+        """True for nodes that only let light through."""
+        return self.node.bl_idname in TRANSPARENT_NODES
+
+    @property
+    def lobe_terms(self) -> tuple[tuple[Factor, ...], ...]:
+        """The terms of its lobes, for which transparency is cut."""
+        return tuple(tuple(factor for factor in term if not factor.beside_transparency) for term in self.terms)
+
+    @property
+    def bound(self) -> float:
+        """No weight of its lobes is larger, as far as constants tell."""
+        found = 0.0
+        for term in self.lobe_terms:
+            product = 1.0
+            for factor in term:
+                product *= 1.0 if factor.constant is None else factor.constant
+            found += product
+        return found
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A mix or sum of which one shader is nothing but transparency; surfaces are opaque, so it is left out."""
+
+    tree: Any
+    node: Any
+    clear: Any  # the input socket of the transparency
+    other: Any  # the other one
+
+
+@dataclass
+class SurfaceShaders:
+    """The shader nodes behind a socket, in the order in which they are linked, and the transparency that is cut."""
+
+    leaves: list[Leaf] = field(default_factory=list)
+    cuts: list[Cut] = field(default_factory=list)
+    is_transparent: bool = False  # there is nothing but transparency
+
+    def _add(self, other: SurfaceShaders, *factors: Factor) -> None:
+        places = {(leaf.node, leaf.source.groups): place for place, leaf in enumerate(self.leaves)}
+        for leaf in other.leaves:
+            terms = tuple((*factors, *term) for term in leaf.terms)
+            place = places.get((leaf.node, leaf.source.groups))
+            if place is None:
+                self.leaves.append(Leaf(leaf.source, terms))
+            else:
+                self.leaves[place] = Leaf(leaf.source, self.leaves[place].terms + terms)
+        self.cuts += [cut for cut in other.cuts if cut not in self.cuts]
+
+
+def shaders_behind(tree, socket, groups: tuple = (), tree_of: Callable = _own_tree) -> SurfaceShaders:
+    """The shader nodes behind the input `socket` of `tree`, with their weights.
+
+    A node that is reached twice is one leaf. A mix by a constant 0 or 1 is the one shader, a sum with an open input the
+    other. Transparency beside another shader is cut. `tree_of` as in `source_behind`.
+    """
+    source = source_of(tree, socket, groups, tree_of)
+    if source is None or source.node is None:
+        return SurfaceShaders()
+    tree, node, groups = source.tree, source.node, source.groups
+    if node.bl_idname not in (MIX, ADD):
+        leaf = Leaf(source, ((),))
+        return SurfaceShaders([leaf], is_transparent=leaf.is_transparent)
+    sockets = [socket for socket in node.inputs if socket.type == "SHADER"]
+    if node.bl_idname == MIX:
+        share = Factor(tree, node, groups, False, False).constant
+        if share in (0.0, 1.0):
+            return shaders_behind(tree, sockets[int(share)], groups, tree_of)
+    else:
+        sockets = [socket for socket in sockets if live_link(socket) is not None]
+        if len(sockets) == 1:
+            return shaders_behind(tree, sockets[0], groups, tree_of)
+    parts = [shaders_behind(tree, socket, groups, tree_of) for socket in sockets]
+    found = SurfaceShaders(is_transparent=bool(parts) and all(part.is_transparent for part in parts))
+    if not found.is_transparent:
+        for index, part in enumerate(parts):
+            other = sockets[1 - index]
+            if part.is_transparent and live_link(other) is not None:
+                found.cuts.append(Cut(tree, node, sockets[index], other))
+    cuts_here = bool(found.cuts)
+    for index, part in enumerate(parts):
+        factors = (Factor(tree, node, groups, index == 0, cuts_here),) if node.bl_idname == MIX else ()
+        if not (cuts_here and part.is_transparent):
+            found._add(part, *factors)
+    return found
 
 
 def bypass(tree, node, source) -> None:
@@ -125,12 +319,16 @@ def carry_into_group(tree, group, value):
 
 
 def carry_out_of_group(group, value):
-    """The same number outside the node `group`, computed in its node tree, which has no other user."""
+    """The same value outside the node `group`, computed in its node tree, which has no other user."""
     if not is_socket(value):
         return value
-    inner = group.node_tree
-    item = inner.interface.new_socket(GROUP_SOCKET_NAME, in_out="OUTPUT", socket_type="NodeSocketFloat")
-    inner.links.new(value, socket_named(group_output(inner).inputs, item.identifier))
+    inner, end = group.node_tree, group_output(group.node_tree)
+    for socket in end.inputs:
+        if socket.name == GROUP_SOCKET_NAME and any(link.from_socket == value for link in socket.links):
+            return socket_named(group.outputs, socket.identifier)
+    kind = {"RGBA": "NodeSocketColor", "VECTOR": "NodeSocketVector"}.get(value.type, "NodeSocketFloat")
+    item = inner.interface.new_socket(GROUP_SOCKET_NAME, in_out="OUTPUT", socket_type=kind)
+    inner.links.new(value, socket_named(end.inputs, item.identifier))
     return socket_named(group.outputs, item.identifier)
 
 
@@ -150,44 +348,3 @@ def fill_with_bsdf(tree, node_type: str, color) -> None:
     bsdf.inputs[0].default_value = color
     output = tree.nodes.new("ShaderNodeOutputMaterial")
     tree.links.new(bsdf.outputs[0], output.inputs["Surface"])
-
-
-@dataclass(frozen=True)
-class Source:
-    """An output of a node, or an unlinked input (`node` None) whose own value counts."""
-
-    tree: Any
-    socket: Any
-    node: Any
-    groups: tuple  # (tree, group node) pairs that lead to `tree`
-
-    def input(self, name) -> Source | None:
-        """What feeds the input `name` (or position) of the node."""
-        return source_of(self.tree, self.node.inputs[name], self.groups)
-
-
-def source_of(tree, socket, groups: tuple = ()) -> Source | None:
-    """What feeds the input `socket` of `tree`; None where a group has no inside or no outside."""
-    link = live_link(socket)
-    return Source(tree, socket, None, groups) if link is None else source_behind(tree, link.from_socket, groups)
-
-
-def source_behind(tree, output, groups: tuple = ()) -> Source | None:
-    """What the `output` of a node in `tree` really comes from; None as in `source_of`."""
-    node, entry = output.node, None
-    if node.mute:
-        entry = passed_through(node, output)
-    elif node.bl_idname == "NodeReroute":
-        entry = node.inputs[0]
-    elif node.bl_idname == "ShaderNodeGroup":
-        end = group_output(node.node_tree) if node.node_tree is not None else None
-        if end is not None:
-            entry = socket_named(end.inputs, output.identifier)
-            tree, groups = node.node_tree, (*groups, (tree, node))
-    elif node.bl_idname == "NodeGroupInput":
-        if groups:
-            (tree, group), groups = groups[-1], groups[:-1]
-            entry = socket_named(group.inputs, output.identifier)
-    else:
-        return Source(tree, output, node, groups)
-    return None if entry is None else source_of(tree, entry, groups)

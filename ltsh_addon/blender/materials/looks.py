@@ -10,23 +10,21 @@ import numpy as np
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import (
-    LOBE_SOCKETS,
-    METALLIC,
-    METALLIC_SOCKETS,
-    MULTIPLE_SCATTERING_NODES,
-    NEAREST_ALPHA,
-    PRINCIPLED,
-    TRANSPARENT_NODES,
+    Bsdf,
+    bsdf_of,
+    emission_sockets,
     is_emission,
+    roughness_factor,
+    scatters,
 )
-from .graph import Source, material_output, source_of
+from .graph import Factor, Leaf, Source, SurfaceShaders, material_output, shaders_behind, source_of
 from .values import ImageUse, Value, constant, value_at
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
            "transmission": 0.0, "weight": 1.0}  # fmt: skip
-# The kind of a lobe that is the coat of another one; all others are those of `aovs.LOBE_KINDS`.
+# The kind of a lobe that is the coat of another one; all others are those of `cycles.lobes.LOBE_KINDS`.
 COAT = "coat"
 
 
@@ -68,7 +66,7 @@ class ViewFactor:
 class Look:
     """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
 
-    kind: str  # of `aovs.LOBE_KINDS`, or COAT
+    kind: str  # of `cycles.lobes.LOBE_KINDS`, or COAT
     values: dict[str, Value]  # by the names of NEUTRAL
     normal: Value | None = None  # of a tangent space normal map
     normal_strength: float = 1.0
@@ -80,6 +78,7 @@ class Look:
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
+    is_stand_in: bool = False  # of a node that is not shaded
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -119,7 +118,7 @@ def default_look() -> Look:
     return Look("principled", {"color": constant(0.8), "roughness": constant(0.5)})
 
 
-# Quantity of `aovs.LOBE_AOVS` -> viewport setting of the material that stands in for it.
+# Quantity of `cycles.lobes.LOBE_AOVS` -> viewport setting of the material that stands in for it.
 STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
 # Nodes whose value depends on the view; the outputs of the second have the names of kinds of `ViewFactor`.
 VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
@@ -137,9 +136,7 @@ def look_of(material) -> Look:
     output = material_output(tree) if tree is not None else None
     if output is None:
         return plain_look(0.0)
-    walk = _Leaves()
-    walk.follow(source_of(tree, output.inputs["Surface"]), Share())
-    return _Reader(material, walk).look()
+    return _Reader(material, shaders_behind(tree, output.inputs["Surface"])).look()
 
 
 def _is_same(first: Source | None, second: Source | None) -> bool:
@@ -154,7 +151,7 @@ class Share:
     constant: float = 1.0
     image: Value | None = None
     curve: ViewFactor | None = None
-    shining: float = 1.0  # times what emits, where transparency takes the rest
+    shining: float = 1.0  # about how much of what emits is seen: on average, less what transparency takes
 
     @property
     def estimate(self) -> float:
@@ -166,104 +163,89 @@ class Share:
         """What of it is a quantity of a `Look`."""
         return {} if self.image is None else {"weight": self.image}
 
-    def split(self, factor: Value | ViewFactor | None) -> tuple[Share, Share] | None:
-        """The shares of both sides of a mix with `factor`; None where that cannot be said."""
+    def times(self, factor: Value | ViewFactor | None) -> Share | None:
+        """This times a factor; None where that cannot be said."""
         if isinstance(factor, ViewFactor) and self.curve is None:
-            return replace(self, curve=factor.complement()), replace(self, curve=factor)
+            return replace(self, curve=factor, shining=0.5 * self.shining)
         if not isinstance(factor, Value):
             return None
         if factor.is_constant:
             part = float(np.clip(factor.offset[0], 0.0, 1.0))
-            return replace(self, constant=self.constant * (1.0 - part)), replace(self, constant=self.constant * part)
-        if self.image is None:
-            return replace(self, image=factor.mapped(-np.eye(3), 1.0)), replace(self, image=factor)
+            return replace(self, constant=self.constant * part, shining=self.shining * part)
+        return replace(self, image=factor, shining=0.5 * self.shining) if self.image is None else None
+
+
+def _value_of_factor(factor: Factor) -> Value | ViewFactor | None:
+    """The factor as a value; None: unknown."""
+    value = value_at(factor.tree, factor.node.inputs[0], factor.groups)
+    if value is None:
+        value = _view_factor(factor.source)
+    if value is None or not factor.is_complement:
+        return value
+    if isinstance(value, ViewFactor):
+        return value.complement()
+    return constant(1.0 - np.clip(value.offset, 0.0, 1.0)) if value.is_constant else value.mapped(-np.eye(3), 1.0)
+
+
+def _view_factor(source: Source | None) -> ViewFactor | None:
+    """What a Fresnel or Layer Weight node with a constant number and the smooth normal says."""
+    if source is None or source.node is None or source.node.bl_idname not in VIEW_FACTORS:
         return None
-
-
-class _Leaves:
-    """The shader nodes of a material with their shares; of unknown factors both sides get half."""
-
-    def __init__(self):
-        self.found: list[tuple[Source, Share]] = []
-        self.guessed: list[str] = []
-        self.is_transparent = False
-
-    def follow(self, source: Source | None, share: Share) -> None:
-        if source is None or source.node is None or share.estimate <= 0.0:
-            return
-        kind = source.node.bl_idname
-        if kind == "ShaderNodeMixShader":
-            self._follow_mix(source, share)
-        elif kind == "ShaderNodeAddShader":
-            self.follow(source.input(0), share)
-            self.follow(source.input(1), share)
-        elif kind in TRANSPARENT_NODES:
-            self.is_transparent = True
-        else:
-            self.found.append((source, share))
-
-    def _follow_mix(self, source: Source, share: Share) -> None:
-        first, second = source.input(1), source.input(2)
-        factor = _factor_of(source)
-        shares = share.split(factor)
-        if shares is None:
-            self.guessed.append(source.node.name)
-            shares = share.split(constant(0.5))
-        clear = [side is not None and _is_transparent(side) for side in (first, second)]
-        if any(clear):
-            # Surfaces are opaque here: the other side has the share of both.
-            shares = tuple(replace(share, shining=share.shining * part.estimate / share.estimate) for part in shares)
-        self.follow(first, shares[0])
-        self.follow(second, shares[1])
-
-
-def _is_transparent(source: Source) -> bool:
-    return source.node is not None and source.node.bl_idname in TRANSPARENT_NODES
-
-
-def _factor_of(source: Source) -> Value | ViewFactor | None:
-    """The factor of a Mix Shader node."""
-    factor = value_at(source.tree, source.node.inputs[0], source.groups)
-    if factor is not None:
-        return factor
-    behind = source.input(0)
-    if behind is None or behind.node is None or behind.node.bl_idname not in VIEW_FACTORS:
-        return None
-    normal = behind.input("Normal")
-    parameter = value_at(behind.tree, behind.node.inputs[0], behind.groups)
+    normal, parameter = source.input("Normal"), value_at(source.tree, source.node.inputs[0], source.groups)
     if normal is None or normal.node is not None or parameter is None or not parameter.is_constant:
         return None
-    is_blend = behind.node.bl_idname == "ShaderNodeLayerWeight"
-    kind = behind.socket.name.lower() if is_blend else "fresnel"
+    is_blend = source.node.bl_idname == "ShaderNodeLayerWeight"
+    kind = source.socket.name.lower() if is_blend else "fresnel"
     return ViewFactor.of(kind, float(parameter.offset[0]), is_blend)
 
 
 class _Reader:
     """From the leaves of a material to its look."""
 
-    def __init__(self, material, walk: _Leaves):
+    def __init__(self, material, shaders: SurfaceShaders):
         self.material, self.notes = material, []
-        self.emitters = [(source, share) for source, share in walk.found if is_emission(source.node)]
-        self.leaves = [(source, share) for source, share in walk.found if not is_emission(source.node)]
-        if walk.is_transparent and self.leaves:
+        found = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
+        guesses, self.notes = self.notes, []
+        self.emitters = [(leaf.source, share) for leaf, share in found if is_emission(leaf.node)]
+        self.leaves = [(leaf.source, share) for leaf, share in found if not is_emission(leaf.node)]
+        if self.leaves and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
             self.note("transparency is not shown")
-        for name in walk.guessed:
-            self.note(f"factor of {name!r} is not resolved")
+        self.notes += guesses
 
     def note(self, message: str) -> None:
         """Name something that the viewport does not show as it is."""
         self.notes.append(f"{self.material.name}: {message}")
 
+    def _shares(self, leaf: Leaf) -> list[Share]:
+        """The share of each of the terms of `leaf` that is not 0, constants in one; of unknown factors half."""
+        shares = []
+        for term in leaf.terms:
+            share = Share()
+            for factor in term:
+                share = self._with_factor(share, factor)
+            same = next((other for other in shares if other.image is share.image and other.curve == share.curve), None)
+            if same is not None:
+                shares.remove(same)
+                both = {"constant": same.constant + share.constant, "shining": same.shining + share.shining}
+                share = replace(share, **both)
+            shares.append(share)
+        return [share for share in shares if share.estimate > 0.0]
+
+    def _with_factor(self, share: Share, factor: Factor) -> Share:
+        whole = share.times(_value_of_factor(factor))
+        if whole is None:
+            self.note(f"factor of {factor.node.name!r} is not resolved")
+            whole = share.times(constant(0.5))
+        return replace(share, shining=whole.shining) if factor.beside_transparency else whole
+
     def look(self) -> Look:
         """The heaviest lobe with the others behind it."""
         emission = np.zeros(3)
         for source, share in self.emitters:
-            emission = emission + self._shining(share, self._emission(source, "Color", "Strength"))
+            emission = emission + self._shining(share, self._emission(source))
         lobes: list[Look] = []
         for source, share in sorted(self.leaves, key=lambda pair: -pair[1].estimate):
-            if source.node.bl_idname == PRINCIPLED:
-                glow = self._emission(source, "Emission Color", "Emission Strength")
-                emission = emission + self._shining(share, glow)
+            emission = emission + self._shining(share, self._emission(source))
             lobes += self._lobes_of(source, share)
         if not lobes:
             lobes = [plain_look(0.0)]
@@ -275,19 +257,16 @@ class _Reader:
     def _shining(self, share: Share, emission: np.ndarray) -> np.ndarray:
         if emission.any() and (share.image is not None or share.curve is not None):
             self.note("its emission varies: half of it is shown")
-        return share.shining * share.estimate * emission
+        return share.shining * emission
 
     def _lobes_of(self, source: Source, share: Share) -> list[Look]:
         """The lobes of one BSDF node."""
-        node = source.node
-        sockets = LOBE_SOCKETS.get(node.bl_idname)
-        if node.bl_idname == METALLIC:
-            sockets = METALLIC_SOCKETS[node.fresnel_type]
-        if sockets is None:
-            self.note(f"{node.bl_label} is not shown, its viewport color is")
+        bsdf = bsdf_of(source.node)
+        if bsdf is None:
+            self.note(f"{source.node.bl_label} is not shown, its viewport color is")
             values = {"color": constant(self.material.diffuse_color), **share.values}
-            return [Look("diffuse", values, weight=share.constant, view_factor=share.curve)]
-        look = self._lobe(source, *sockets, share)
+            return [Look("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
+        look = self._lobe(source, bsdf, share)
         coat = self._coat(source, look) if look.kind == "principled" else None
         if coat is None:
             return [look]
@@ -297,22 +276,22 @@ class _Reader:
         shine = replace(look, kind=COAT, values=values, scattered=True)
         return [look, shine if coat.follows_normal else replace(shine, normal=None)]
 
-    def _lobe(self, source: Source, kind: str, names: dict[str, str], share: Share) -> Look:
-        node = source.node
+    def _lobe(self, source: Source, bsdf: Bsdf, share: Share) -> Look:
+        node, names = source.node, bsdf.sockets
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
         values = self._on_one_uv_map({**values, **share.values})
-        distribution = getattr(node, "distribution", "")
-        if distribution in NEAREST_ALPHA:
-            values["roughness"] = values["roughness"].mapped(NEAREST_ALPHA[distribution] ** 0.5 * np.eye(3))
-            self.note(f"distribution {distribution} is shown as GGX")
-        if kind == "principled":
+        if roughness_factor(node) != 1.0:
+            values["roughness"] = values["roughness"].mapped(roughness_factor(node) * np.eye(3))
+            self.note(f"distribution {node.distribution} is shown as GGX")
+        if bsdf.kind == "sheen":
+            self.note(f"{node.bl_label} is shown as a Diffuse BSDF")
+        if bsdf.kind == "principled":
             weight = value_at(source.tree, node.inputs["Sheen Weight"], source.groups)
             if weight is None or not weight.is_constant or weight.offset[0] > 0.0:
                 self.note("sheen is not shown")
         normal, strength = self._normal(source, values)
-        scattered = distribution == "MULTI_GGX" and node.bl_idname in MULTIPLE_SCATTERING_NODES
         corrected = cycles_setting(self.material, "use_bump_map_correction")
-        look = Look(kind, values, normal, strength, scattered, corrected, share.constant, share.curve)
+        look = Look(bsdf.kind, values, normal, strength, scatters(node), corrected, share.constant, share.curve)
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look
@@ -372,13 +351,12 @@ class _Reader:
             return None, 1.0
         return color, float(strength.offset[0])
 
-    def _emission(self, source: Source, color_name: str, strength_name: str) -> np.ndarray:
-        if color_name not in source.node.inputs:
-            return np.zeros(3)
-        parts = [value_at(source.tree, source.node.inputs[name], source.groups) for name in (strength_name, color_name)]
+    def _emission(self, source: Source) -> np.ndarray:
+        parts = [value_at(source.tree, socket, source.groups) for socket in emission_sockets(source.node)]
         if all(part is not None and part.is_constant for part in parts):
-            return parts[0].offset * parts[1].offset
-        if parts[0] is None or not parts[0].is_constant or np.any(parts[0].offset):
+            return np.prod([part.offset for part in parts], axis=0) if parts else np.zeros(3)
+        color, strength = parts
+        if strength is None or not strength.is_constant or np.any(strength.offset):
             self.note("its emission varies and is not shown")
         return np.zeros(3)
 

@@ -20,20 +20,12 @@ from ..lights.area import (
     note_unsupported as note_unsupported_light,
 )
 from ..lights.emission import emission_behind
-from ..materials.bsdfs import (
-    LOBE_SOCKETS,
-    METALLIC,
-    NOT_SUPPORTED,
-    PRINCIPLED,
-    TRANSPARENT_NODES,
-    is_group,
-    note_unsupported,
-)
-from ..materials.graph import group_output, is_constant, live_link, material_output, value_of
+from ..materials.aovs import notes_of_material
+from ..materials.bsdfs import bsdf_of, is_emission
+from ..materials.graph import material_output, shaders_behind
 from .preflight import glows, materials_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
-MIXES = ("ShaderNodeMixShader", "ShaderNodeAddShader")
 
 
 @dataclass(frozen=True)
@@ -88,58 +80,20 @@ def _varies(light) -> bool:
 
 
 def _material(material) -> Entry:
-    notes: list[str] = []
     output = material_output(material.node_tree) if material.node_tree is not None else None
     if output is None:
         return Entry(material.name, "", EXACT)
-    if live_link(output.inputs["Volume"]) is not None:
-        notes.append("its volume is not shaded")
-    leaves = list(_shaders(material.node_tree, output.inputs["Surface"], set()))
-    for node in leaves:
-        if node.bl_idname in TRANSPARENT_NODES:
-            if len(leaves) > 1:
-                notes.append(f"node {node.name!r}: transparency is cut, the surface is shaded opaque")
-        elif node.bl_idname != "ShaderNodeEmission":
-            _note_bsdf(node, notes.append)
-    kind = "emissive" if glows(material) else ""
-    unique = tuple(dict.fromkeys(notes))
-    left_out = unique and all(note.endswith(NOT_SUPPORTED) for note in unique) and len(unique) == len(leaves)
-    return Entry(material.name, kind, LEFT_OUT if left_out else APPROXIMATED if unique else EXACT, unique)
-
-
-def _note_bsdf(node, note) -> None:
-    if node.bl_idname not in LOBE_SOCKETS and node.bl_idname != METALLIC:
-        note(f"node {node.name!r} {NOT_SUPPORTED}")
-        return
-    note_unsupported(node, note)
-    if node.bl_idname == PRINCIPLED and not is_constant(value_of(node.inputs["Alpha"]), 1.0):
-        note(f"Alpha of {node.name!r} is cut, the surface is shaded opaque")
-
-
-def _shaders(tree, socket, seen: set):
-    """Shader nodes behind an input that are neither mix nor sum nor group, each once; the tree stays as it is."""
-    link = live_link(socket)
-    if link is None:
-        return
-    node = link.from_node
-    key = tree.as_pointer(), node.name
-    if key in seen:
-        return
-    seen.add(key)
-    if node.bl_idname in MIXES or node.bl_idname == "NodeReroute" or node.mute:
-        for other in node.inputs:
-            if other.type == "SHADER":
-                yield from _shaders(tree, other, seen)
-    elif is_group(node):
-        end = group_output(node.node_tree) if node.node_tree is not None else None
-        for other in end.inputs if end is not None else ():
-            if other.type == "SHADER":
-                yield from _shaders(node.node_tree, other, seen)
-        for other in node.inputs:
-            if other.type == "SHADER":
-                yield from _shaders(tree, other, seen)
-    elif node.bl_idname != "NodeGroupInput":
-        yield node
+    shaders = shaders_behind(material.node_tree, output.inputs["Surface"])
+    # Whether it lights the scene is the kind of a material and no defect.
+    notes = tuple(dict.fromkeys(notes_of_material(material.node_tree, output, shaders, emitter=True)))
+    shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
+    state = APPROXIMATED if notes else EXACT
+    return Entry(
+        material.name,
+        "emissive" if glows(material) else "",
+        LEFT_OUT if shaders.leaves and not any(shown) else state,
+        notes,
+    )
 
 
 @bpy.app.handlers.persistent

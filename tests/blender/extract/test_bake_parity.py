@@ -7,11 +7,11 @@ of the centers of pixels. So nothing is interpolated, and each texel is held aga
 import numpy as np
 import pytest
 import scene_parts
+import sheen_measurement
 from bake_scenes import baked, save
 from scene_parts import bsdf_material, new_material, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.materials import sheen_measurement
 from ltsh_addon.cycles import closures
 from ltsh_addon.pipeline.picture import Options, make_picture
 

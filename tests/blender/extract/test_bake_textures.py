@@ -165,14 +165,14 @@ def altered(kind, folder):
     "kind", ["alpha", "mapping node", "cubic", "box", "own mapping", "no such map", "color space", "math"]
 )
 def test_anything_more_is_left_to_cycles(tmp_path, kind):
-    from ltsh_addon.blender.materials.bsdfs import lobe_of
+    from ltsh_addon.blender.materials.bsdfs import lobe_values
     from ltsh_addon.blender.materials.maps import MaterialPlan
     from ltsh_addon.blender.materials.values import SavedImages
 
     altered(kind, tmp_path)
     material = bpy.data.materials["More"]
-    lobe = lobe_of(material.node_tree.nodes["Principled BSDF"], print)
-    plan = MaterialPlan(material, (lobe,), (material.node_tree,), SavedImages(tmp_path), {"UVMap", "Tex"})
+    lobe = lobe_values(material.node_tree.nodes["Principled BSDF"])
+    plan = MaterialPlan(material, (lobe,), ((),), SavedImages(tmp_path), {"UVMap", "Tex"})
     assert plan.count == 1 and plan.textures == []
 
 

@@ -9,7 +9,7 @@ from scene_parts import add_plane, bsdf_material, new_material, principled
 
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.aovs import MaterialReport, inject_aovs
-from ltsh_addon.blender.materials.bsdfs import note_unsupported
+from ltsh_addon.blender.materials.bsdfs import notes_of
 from ltsh_addon.cycles import horizons, lobes
 
 # Texture coordinates and colors pass through float32 a few times.
@@ -275,9 +275,9 @@ def test_metals_that_cycles_clips_at_black_are_named(edge, base, named):
     for kind, tint in (("ShaderNodeBsdfMetallic", "Edge_Tint"), ("ShaderNodeBsdfPrincipled", "Specular_Tint")):
         _, node = bsdf_material(kind, Base_Color=(base, base, base, 1.0), **{tint: (edge, edge, edge, 1.0)})
         if "Metallic" in node.inputs:
-            note_unsupported(node, found.append)  # no metal yet
+            found += notes_of(node)  # no metal yet
             node.inputs["Metallic"].default_value = 1.0
-        note_unsupported(node, found.append)
+        found += notes_of(node)
     assert len(found) == (2 if named else 0) and all("Tint of '" in line for line in found)
 
 
@@ -299,7 +299,7 @@ def test_an_index_of_refraction_that_varies_is_named():
         material, node = bsdf_material(kind)
         value = material.node_tree.nodes.new("ShaderNodeTexCoord").outputs["UV"]
         material.node_tree.links.new(value, node.inputs["IOR"])
-        note_unsupported(node, found.append)
+        found += notes_of(node)
     assert sum("IOR of '" in line and "varies" in line for line in found) == 2
 
 

@@ -1,6 +1,6 @@
 """Makes sheen_albedos.npy: measures in Cycles what sheen reflects (half a minute, needs pip's bpy).
 
-python -m ltsh_addon.blender.materials.sheen_measurement
+From the repository's root: python -m tests.blender.sheen_measurement
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...cycles import closures
-from ...cycles.lobes import read_layer
-from ...imaging.exr import read_channels
-from .. import render_settings
+from ltsh_addon.blender import render_settings
+from ltsh_addon.cycles import closures
+from ltsh_addon.cycles.lobes import read_layer
+from ltsh_addon.imaging.exr import read_channels
 
 PIXELS = 512
 STRIPS = 20_000

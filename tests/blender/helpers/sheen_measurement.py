@@ -1,6 +1,6 @@
 """Makes sheen_albedos.npy: measures in Cycles what sheen reflects (half a minute, needs pip's bpy).
 
-From the repository's root: python -m tests.blender.sheen_measurement
+From the repository's root: python -m tests.blender.helpers.sheen_measurement
 """
 
 from __future__ import annotations

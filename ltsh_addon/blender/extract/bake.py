@@ -27,8 +27,7 @@ from ..materials.aovs import (
     objects_without_material,
 )
 from ..materials.graph import ensure_nodes
-from ..materials.maps import MaterialPlan
-from ..materials.values import SavedImages
+from ..materials.maps import MaterialPlan, SavedImages
 from ..process.blender_process import listed
 from ..render_settings import working_space
 from . import pixels

@@ -10,7 +10,7 @@ import numpy as np
 from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
 from ...scene import AreaLight
-from ..materials.values import BYTE_SPACES, FLOAT_SPACES, MOST_PIXELS, Value
+from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Studio
 
 # Lights of one data block, with the same texture, that are looked at one by one; the others get what the first has.
@@ -132,17 +132,11 @@ class ShownTextures:
 def _texture(use) -> ImageTexture | None:
     """The pixels of an image; None where only Cycles knows its colors."""
     image = use.image.original
-    spaces = FLOAT_SPACES if image.is_float else BYTE_SPACES
-    srgb = spaces.get(image.colorspace_settings.name)
-    width, height = image.size
-    if srgb is None or not 0 < width * height <= MOST_PIXELS:
+    srgb = is_srgb(image)
+    pixels = None if srgb is None else opaque_pixels(image)
+    if pixels is None:
         return None
-    pixels = np.empty(width * height * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels = pixels.reshape(height, width, 4)
-    if (pixels[..., 3] != 1.0).any():
-        return None
-    return ImageTexture(pixels[..., :3], use.extension, "Closest" if use.closest else "Linear", srgb)
+    return ImageTexture(pixels, use.extension, "Closest" if use.closest else "Linear", srgb)
 
 
 def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:

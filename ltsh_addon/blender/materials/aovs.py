@@ -300,8 +300,10 @@ class _Weights:
         return carry_into_group(*groups[-1], self._product(factors, groups[:-1]))
 
     def _share(self, factor: Factor):
+        if factor.constant is not None:
+            return factor.constant
         if factor.node not in self._shares:
-            self._shares[factor.node] = mix_weights(factor.tree, factor.node.inputs[0])
+            self._shares[factor.node] = mix_weights(factor.tree, factor.node)
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 

@@ -5,7 +5,7 @@ Whatever reads materials asks `bsdf_of` for the row of a node; a node without a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
@@ -19,7 +19,7 @@ PRINCIPLED, EMISSION = "ShaderNodeBsdfPrincipled", "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 NOT_SUPPORTED = "is not supported, it is not shaded"
-# Node -> the property that chooses among its rows. Every node may also have a distribution of DISTRIBUTIONS.
+# Node -> the property that chooses among its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}
 
 
@@ -32,34 +32,28 @@ class Bsdf:
     nearest: str = ""  # what is said of the node itself where its kind is not quite that
     # Socket -> (value at which it changes nothing, what is done); sockets absent in a version are skipped.
     not_shaded: dict[str, tuple[float, str]] = field(default_factory=dict)
+    # By the node's distribution.
+    roughness_factor: float = 1.0  # of the GGX lobe that comes nearest
+    is_scattered: bool = False  # multiple scattering adds to the lobe
 
 
-COLOR = {"color": "Color"}
-COLOR_AND_ROUGHNESS = {"color": "Color", "roughness": "Roughness"}
+COLOR, ROUGHNESS = {"color": "Color"}, {"roughness": "Roughness"}
+PRINCIPLED_SOCKETS = {
+    "color": "Base Color", "roughness": "Roughness", "metallic": "Metallic", "ior": "IOR", "tint": "Specular Tint",
+    "specular_level": "Specular IOR Level", "transmission": "Transmission Weight",
+    "sheen_weight": "Sheen Weight", "sheen_tint": "Sheen Tint", "sheen_roughness": "Sheen Roughness",
+    "coat_weight": "Coat Weight", "coat_roughness": "Coat Roughness", "coat_ior": "Coat IOR", "coat_tint": "Coat Tint",
+    "coat_normal": "Coat Normal",
+}  # fmt: skip
 CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
 AS_ZERO = (0.0, "is shaded as 0")
+AS_DIFFUSE = "is not supported, it is shaded as a Diffuse BSDF"
 OF_METALLIC = {"Anisotropy": AS_ZERO, "Thin Film Thickness": AS_ZERO}
 # (node, value of its property of VARIANTS) -> its row.
 BSDFS = {
     (PRINCIPLED, ""): Bsdf(
         "principled",
-        {
-            "color": "Base Color",
-            "roughness": "Roughness",
-            "metallic": "Metallic",
-            "ior": "IOR",
-            "specular_level": "Specular IOR Level",
-            "tint": "Specular Tint",
-            "transmission": "Transmission Weight",
-            "sheen_weight": "Sheen Weight",
-            "sheen_tint": "Sheen Tint",
-            "sheen_roughness": "Sheen Roughness",
-            "coat_weight": "Coat Weight",
-            "coat_roughness": "Coat Roughness",
-            "coat_ior": "Coat IOR",
-            "coat_tint": "Coat Tint",
-            "coat_normal": "Coat Normal",
-        },
+        PRINCIPLED_SOCKETS,
         not_shaded={
             "Diffuse Roughness": AS_ZERO,
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
@@ -70,31 +64,25 @@ BSDFS = {
             "Thin Film Thickness": AS_ZERO,
         },
     ),
-    ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", COLOR_AND_ROUGHNESS, not_shaded={"Anisotropy": AS_ZERO}),
-    ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", COLOR, not_shaded={"Roughness": AS_ZERO}),
+    ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", {**COLOR, **ROUGHNESS}, "", {"Anisotropy": AS_ZERO}),
+    ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", COLOR, "", {"Roughness": AS_ZERO}),
     ("ShaderNodeBsdfTranslucent", ""): Bsdf("translucent", COLOR),
     (GLASS, ""): Bsdf(
         "glass",
-        {**COLOR_AND_ROUGHNESS, "ior": "IOR"},
+        {**COLOR, **ROUGHNESS, "ior": "IOR"},
         "lets no light through, only its reflection is shaded, of back faces about",
         {"Thin Film Thickness": AS_ZERO},
     ),
-    (METALLIC, "F82"): Bsdf(
-        "metal", {"color": "Base Color", "tint": "Edge Tint", "roughness": "Roughness"}, not_shaded=OF_METALLIC
-    ),
+    (METALLIC, "F82"): Bsdf("metal", {**ROUGHNESS, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
     (METALLIC, "PHYSICAL_CONDUCTOR"): Bsdf(
-        CONDUCTOR, {"color": "IOR", "tint": "Extinction", "roughness": "Roughness"}, not_shaded=OF_METALLIC
+        CONDUCTOR, {**ROUGHNESS, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
-    (SHEEN, "MICROFIBER"): Bsdf(
-        "sheen", COLOR_AND_ROUGHNESS, "is not supported, it is shaded as a Diffuse BSDF of the same albedo"
-    ),
-    (SHEEN, "ASHIKHMIN"): Bsdf("diffuse", COLOR, "is not supported, it is shaded as a Diffuse BSDF of the same albedo"),
+    (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo"),
+    (SHEEN, "ASHIKHMIN"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
     # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
-    (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, "is not supported, it is shaded as a Diffuse BSDF of the same albedo"),
-    ("ShaderNodeSubsurfaceScattering", ""): Bsdf(
-        "diffuse", COLOR, "is not supported, it is shaded as a Diffuse BSDF"
-    ),
-}  # fmt: skip
+    (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
+    ("ShaderNodeSubsurfaceScattering", ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),
+}
 # Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
 NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
 # Metals that are darker than minus this are worth a warning.
@@ -102,19 +90,13 @@ NEGLIGIBLE_REFLECTANCE = -1e-3
 
 
 def bsdf_of(node) -> Bsdf | None:
-    """The row of a shader node, None where it is not shaded."""
-    kind = node.bl_idname
-    return BSDFS.get((kind, getattr(node, VARIANTS[kind]) if kind in VARIANTS else ""))
-
-
-def roughness_factor(node) -> float:
-    """What the roughness of a BSDF `node` is multiplied by for the GGX lobe that is nearest to its distribution."""
-    return NEAREST_ALPHA.get(getattr(node, "distribution", ""), 1.0) ** 0.5
-
-
-def scatters(node) -> bool:
-    """True where the lobe of a BSDF `node` is multiplied by what multiple scattering adds."""
-    return getattr(node, "distribution", "") == "MULTI_GGX"
+    """The row of a shader node, with what its distribution adds; None where it is not shaded."""
+    kind, distribution = node.bl_idname, getattr(node, "distribution", "")
+    row = BSDFS.get((kind, getattr(node, VARIANTS[kind]) if kind in VARIANTS else ""))
+    if row is None:
+        return None
+    factor = NEAREST_ALPHA.get(distribution, 1.0) ** 0.5
+    return replace(row, roughness_factor=factor, is_scattered=distribution == "MULTI_GGX")
 
 
 def lobe_values(node) -> dict:
@@ -127,14 +109,14 @@ def lobe_values(node) -> dict:
         return {}
     values = {"kind": LOBE_KINDS[bsdf.kind]}
     values.update({aov: value_of(node.inputs[name]) for aov, name in bsdf.sockets.items()})
-    if roughness_factor(node) != 1.0:
-        values["roughness"] = product(node.id_data, values["roughness"], roughness_factor(node))
+    if bsdf.roughness_factor != 1.0:
+        values["roughness"] = product(node.id_data, values["roughness"], bsdf.roughness_factor)
     normal = live_link(node.inputs["Normal"])
     if normal is not None:
         values["normal"] = normal.from_socket
     if bsdf.kind == "principled":
         _drop_absent_layers(node, values)
-    if scatters(node):
+    if bsdf.is_scattered:
         values["multiple_scattering"] = 1.0
     if bsdf.kind == "glass" or "transmission" in values:
         values["backfacing"] = node.id_data.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]

@@ -298,13 +298,9 @@ def total(tree, first, second):
     return _math(tree, "ADD", first, second)
 
 
-def mix_weights(tree, factor):
-    """Weights of both inputs of a Mix Shader node whose factor socket is `factor`; Cycles clamps the factor."""
-    value = value_of(factor)
-    if not is_socket(value):
-        value = min(max(value, 0.0), 1.0)
-        return 1.0 - value, value
-    clamped = _math(tree, "ADD", value, 0.0, clamp=True)
+def mix_weights(tree, node):
+    """Weights of both shaders of a Mix Shader `node` of `tree` whose factor nodes compute; Cycles clamps it."""
+    clamped = _math(tree, "ADD", value_of(node.inputs[0]), 0.0, clamp=True)
     return _math(tree, "SUBTRACT", 1.0, clamped), clamped
 
 

@@ -9,14 +9,7 @@ import numpy as np
 
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
-from .bsdfs import (
-    Bsdf,
-    bsdf_of,
-    emission_sockets,
-    is_emission,
-    roughness_factor,
-    scatters,
-)
+from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
 from .graph import Factor, Leaf, Source, SurfaceShaders, material_output, shaders_behind, source_of
 from .values import ImageUse, Value, constant, value_at
 
@@ -137,11 +130,6 @@ def look_of(material) -> Look:
     if output is None:
         return plain_look(0.0)
     return _Reader(material, shaders_behind(tree, output.inputs["Surface"])).look()
-
-
-def _is_same(first: Source | None, second: Source | None) -> bool:
-    """Do both sockets have the same node before them?"""
-    return first is not None and second is not None and first.node == second.node and first.groups == second.groups
 
 
 @dataclass(frozen=True)
@@ -280,8 +268,8 @@ class _Reader:
         node, names = source.node, bsdf.sockets
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
         values = self._on_one_uv_map({**values, **share.values})
-        if roughness_factor(node) != 1.0:
-            values["roughness"] = values["roughness"].mapped(roughness_factor(node) * np.eye(3))
+        if bsdf.roughness_factor != 1.0:
+            values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
         if bsdf.kind == "sheen":
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF")
@@ -291,7 +279,7 @@ class _Reader:
                 self.note("sheen is not shown")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
-        look = Look(bsdf.kind, values, normal, strength, scatters(node), corrected, share.constant, share.curve)
+        look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look
@@ -305,7 +293,8 @@ class _Reader:
         roughness, ior, tint = (self._value(source, "", name).offset for name in sockets)
         normal, follows = source.input("Coat Normal"), False
         if normal is not None and normal.node is not None:
-            follows = look.normal is not None and _is_same(normal, source.input("Normal"))
+            own = source.input("Normal")
+            follows = look.normal is not None and (own.node, own.groups) == (normal.node, normal.groups)
             if not follows:
                 self.note("Coat Normal is not resolved")
         roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)

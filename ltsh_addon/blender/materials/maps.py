@@ -5,11 +5,103 @@ A color or normal takes a map of its own, three numbers share one.
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from pathlib import Path
 
+import bpy
+import numpy as np
+
+from ...cycles.images import EXTENSIONS, INTERPOLATIONS
 from ...cycles.lobes import LOBE_AOVS
-from .graph import carry_out_of_group, cut, is_socket, live_link, material_output
-from .values import SavedImages, plain_texture
+from ...files import save_array
+from ..render_settings import working_space
+from .graph import carry_out_of_group, cut, is_socket, live_link, material_output, source_behind
+from .values import is_srgb, opaque_pixels
+
+# Of the entries of the matrix to Rec.709.
+SAME_SPACE = 1e-4
+
+
+class SavedImages:
+    """Pixels of images as .npy in a folder, row 0 below, each image once."""
+
+    def __init__(self, folder: Path):
+        self.folder, self._names = folder, {}
+
+    def file_of(self, image) -> str | None:
+        """File name of the pixels (H, W, 3) of `image`, uint8 or float32; None where it has an alpha."""
+        if image.name_full not in self._names:
+            self._names[image.name_full] = self._save(image)
+        return self._names[image.name_full]
+
+    def _save(self, image):
+        colors = opaque_pixels(image)
+        if colors is None:
+            return None
+        name = f"image_{len(self._names)}.npy"
+        save_array(self.folder / name, colors if image.is_float else np.rint(255.0 * colors).astype(np.uint8))
+        return name
+
+
+def plain_texture(output, groups):
+    """The image texture node that the `output` of a node comes from and nothing else, where it is looked up and which
+    part is taken of it; None for all that is more.
+
+    `groups` leads to the node (see `graph.Source`). The place is a dictionary as `cycles.texels.BakeMaterial` reads it,
+    the part "color", or a channel "0", "1" or "2".
+    """
+    found, part = source_behind(output.id_data, output, groups), "color"
+    if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
+        part = str(list(found.node.outputs).index(found.socket))
+        found = found.input(0)
+    if not _is_node(found, "ShaderNodeTexImage") or found.socket.name != "Color" or found.node.image is None:
+        return None
+    node = found.node
+    uv, srgb = _uv_map(found), _known_encoding(node.image)
+    if uv is None or srgb is None or not _is_plain(node):
+        return None
+    return node, {"uv": uv, "extension": node.extension, "interpolation": node.interpolation, "srgb": srgb}, part
+
+
+def _is_node(source, kind: str) -> bool:
+    return source is not None and source.node is not None and source.node.bl_idname == kind
+
+
+def _uv_map(texture) -> str | None:
+    """Name of the UV map that an image texture is looked up at, "" for the default, None for anything else."""
+    found = texture.input("Vector")
+    if found is None:
+        return None
+    if found.node is None:
+        # Only the texture's own open input means a UV map; that of a group is a constant.
+        return "" if found.socket == texture.node.inputs["Vector"] else None
+    if getattr(found.node, "from_instancer", False):
+        return None
+    if _is_node(found, "ShaderNodeUVMap"):
+        return found.node.uv_map
+    return "" if _is_node(found, "ShaderNodeTexCoord") and found.socket.name == "UV" else None
+
+
+def _is_plain(node) -> bool:
+    mapping = node.texture_mapping
+    return (
+        node.projection == "FLAT"
+        and node.extension in EXTENSIONS
+        and node.interpolation in INTERPOLATIONS
+        and not any((*mapping.translation, *mapping.rotation))
+        and tuple(mapping.scale) == (1.0, 1.0, 1.0)
+        and (mapping.mapping_x, mapping.mapping_y, mapping.mapping_z) == ("X", "Y", "Z")
+        and mapping.vector_type == "POINT"
+        and not (mapping.use_min or mapping.use_max)
+    )
+
+
+def _known_encoding(image) -> bool | None:
+    """Whether an image of one file has sRGB values; None where it cannot be told, or is of another kind."""
+    scene = bpy.context.scene
+    if image.source != "FILE" or (scene.render.use_simplify and scene.cycles.texture_limit_render != "OFF"):
+        return None
+    is_other_space = np.abs(np.array(working_space()["to_rec709"]) - np.eye(3)).max() > SAME_SPACE
+    return None if is_other_space else is_srgb(image)
 
 
 class MaterialPlan:
@@ -64,23 +156,20 @@ class MaterialPlan:
 
     def _looked_up(self, name, socket, groups):
         """The record of a socket behind which is nothing but an image, or None."""
-        found = plain_texture(socket.id_data, socket, groups)
-        if found is None or found.uv not in self._uv_names:
+        found = plain_texture(socket, groups)
+        if found is None or found[1]["uv"] not in self._uv_names:
             return None
+        node, place, part = found
         is_color = LOBE_AOVS[name][0] == "COLOR"
-        if is_color != (found.part == "color"):
-            if is_color:
-                return None
-            found = replace(found, part="gray")
-        file = self._images.file_of(found.image)
+        if is_color and part != "color":
+            return None
+        file = self._images.file_of(node.image)
         if file is None:
             return None
-        record = {"file": file, **asdict(found)}
-        part = record.pop("part")
-        del record["image"]
+        record = {"file": file, **place}
         if record not in self.textures:
             self.textures.append(record)
-        return {"texture": self.textures.index(record), "part": part}
+        return {"texture": self.textures.index(record), "part": "gray" if part == "color" and not is_color else part}
 
     def prepare(self) -> None:
         """Add the nodes."""

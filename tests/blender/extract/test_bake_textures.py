@@ -166,8 +166,7 @@ def altered(kind, folder):
 )
 def test_anything_more_is_left_to_cycles(tmp_path, kind):
     from ltsh_addon.blender.materials.bsdfs import lobe_values
-    from ltsh_addon.blender.materials.maps import MaterialPlan
-    from ltsh_addon.blender.materials.values import SavedImages
+    from ltsh_addon.blender.materials.maps import MaterialPlan, SavedImages
 
     altered(kind, tmp_path)
     material = bpy.data.materials["More"]

@@ -21,7 +21,6 @@ from ..lights.area import collect_lights, seen_lights
 from ..materials.aovs import (
     RECEIVER_PROPERTY,
     MaterialLobes,
-    MaterialReport,
     give_default_material,
     lobes_of,
     objects_without_material,
@@ -293,7 +292,7 @@ class BakeScene:
     names: list[str]
     meshes: dict[str, ReadMesh]
     problems: dict[str, str]
-    lobes: dict[str, tuple[MaterialLobes | None, list[str]]]  # with warnings, by full name of the material
+    lobes: dict[str, MaterialLobes]  # by full name of the material
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
@@ -302,11 +301,10 @@ class BakeScene:
         for slot in ob.material_slots:
             material = slot.material
             if material.name_full not in made:
-                lobes, lines = self.lobes[material.name_full]
-                values = lobes.values if lobes is not None else ()
-                paths = tuple(leaf.source.groups for leaf in lobes.leaves) if lobes is not None else ()
-                made[material.name_full] = MaterialPlan(material, values, paths, images, uv_names)
-                warnings += lines
+                lobes = self.lobes[material.name_full]
+                paths = tuple(leaf.source.groups for leaf in lobes.leaves)
+                made[material.name_full] = MaterialPlan(material, lobes.values, paths, images, uv_names)
+                warnings += lobes.warnings
         return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))
 
 
@@ -421,15 +419,13 @@ def _saved(mesh, uv_name, uv_maps, folder, number) -> ReadMesh:
     return ReadMesh(path, uv_name, tuple(uv_maps), maps)
 
 
-def _lobes(objects, emitting) -> dict[str, tuple[MaterialLobes | None, list[str]]]:
-    """Lobes of the materials of objects, and warnings, by full name of the material."""
+def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
+    """Lobes of the materials of objects, by full name of the material."""
     found = {}
     for material in (slot.material for ob in objects for slot in ob.material_slots):
         if material.name_full not in found:
-            report = MaterialReport()
             ensure_nodes(material)
-            lobes = lobes_of(material, material.name_full in emitting, report)
-            found[material.name_full] = lobes, report.lines()
+            found[material.name_full] = lobes_of(material, material.name_full in emitting)
     return found
 
 

@@ -14,7 +14,6 @@ from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..materials.aovs import (
-    MaterialReport,
     declare_aovs,
     give_default_material,
     inject_aovs,
@@ -191,14 +190,13 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     default = give_default_material(bare)
-    report = MaterialReport()
-    inject_aovs(materials + ([default] if default else []), report, inventory.emitting_materials)
+    of_materials = inject_aovs(materials + ([default] if default else []), inventory.emitting_materials)
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
     if not inventory.lights:
         raise no_light(scene, inventory.warnings)
-    warnings.extend(report.lines())
+    warnings.extend(of_materials)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     return inventory
 

@@ -1,8 +1,13 @@
-"""AOVs of materials, by which Cycles tells what shading needs."""
+"""Materials as Cycles is made to tell what shading needs of them (in the child).
+
+Their trees are changed: groups get trees of their own, transparency and volumes are cut, and nodes compute the weights
+of lobes. Pictures write all quantities into AOVs, bakes show them as `maps`.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import itertools
+from dataclasses import dataclass
 
 import bpy
 
@@ -30,56 +35,6 @@ from .graph import (
     total,
 )
 
-
-def write_aov(tree, name: str, value) -> None:
-    """A node in `tree` that writes `value`, a socket of it, a number or a color, into the AOV `name`."""
-    node = tree.nodes.new("ShaderNodeOutputAOV")
-    node.aov_name = AOV_PREFIX + name
-    target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
-    if is_socket(value):
-        tree.links.new(value, target)
-    elif isinstance(value, tuple):
-        target.default_value = (*value[:3], 1.0)
-    else:
-        target.default_value = float(value)
-
-
-def write_lobe(tree, slot: int, values: dict, names) -> None:
-    """Write the AOVs `names` of one lobe: of `values` (see `bsdf_lobes.lobe_of`), or what changes nothing."""
-    for name in names:
-        neutral = LOBE_AOVS[name][1]
-        write_aov(tree, lobe_aov(name, slot), values.get(name, 0.0 if neutral is None else neutral))
-
-
-def declare_aovs(view_layer) -> None:
-    """Add a pass to `view_layer` for every AOV that some material writes, and all that belong to a hit."""
-    trees = [material.node_tree for material in bpy.data.materials if material.node_tree] + list(bpy.data.node_groups)
-    written = {
-        node.aov_name.removeprefix(AOV_PREFIX)
-        for tree in trees
-        if tree.bl_idname == "ShaderNodeTree"
-        for node in tree.nodes
-        if node.bl_idname == "ShaderNodeOutputAOV" and node.aov_name.startswith(AOV_PREFIX)
-    }
-    for name in sorted(written | set(HIT_AOVS)):
-        aov = view_layer.aovs.add()
-        aov.name, aov.type = AOV_PREFIX + name, aov_kind(name)
-
-
-def remove_aovs(view_layer) -> None:
-    """Take the passes of `declare_aovs` out again."""
-    for aov in [aov for aov in view_layer.aovs if aov.name.startswith(AOV_PREFIX)]:
-        view_layer.aovs.remove(aov)
-
-
-def bends_normals(tree):
-    """A socket of `tree` that is 1, and 0 on hair, where Cycles never bends specular normals."""
-    flipped = tree.nodes.new("ShaderNodeMath")
-    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
-    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
-    return flipped.outputs[0]
-
-
 # Nodes that send rays from where they are evaluated, and what is said of them.
 TRACING_NODES = {
     "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
@@ -89,106 +44,24 @@ TRACING_NODES = {
 RECEIVER_PROPERTY = "ltsh_receiver"
 
 
-@dataclass
-class MaterialReport:
-    """Warnings about materials."""
-
-    warnings: list[str] = field(default_factory=list)
-
-    def warn(self, material_name: str, message: str) -> None:
-        """Note `message` about a material once."""
-        line = f"material {material_name!r}: {message}"
-        if line not in self.warnings:
-            self.warnings.append(line)
-
-    def lines(self) -> list[str]:
-        """All warnings."""
-        return list(self.warnings)
-
-
-def materials_in_use(surfaces: list, override=None) -> list:
-    """Original materials of the evaluated objects `surfaces`, each once; only `override` where one is set."""
-    if override is not None:
-        return [override.original]
-    found = {}
-    for ob in surfaces:
-        for slot in ob.material_slots:
-            if slot.material is not None:
-                found[slot.material.original.name_full] = slot.material.original
-    return list(found.values())
-
-
-def objects_without_material(surfaces: list) -> list:
-    """Original objects of `surfaces` with no material slot or an empty one."""
-    found = {}
-    for ob in surfaces:
-        slots = ob.material_slots
-        if len(slots) == 0 or any(slot.material is None for slot in slots):
-            found[ob.original.name_full] = ob.original
-    return list(found.values())
-
-
-def give_default_material(objects: list):
-    """Put a material that looks like Cycles' default surface where none is assigned; the material, or None."""
-    if not objects:
-        return None
-    material = bpy.data.materials.new("Default surface")
-    ensure_nodes(material)
-    # Measured: a gray Diffuse BSDF in 4.5.15, a Principled BSDF with all its defaults in 5.2.3.
-    default = "ShaderNodeBsdfDiffuse" if bpy.app.version < (5, 0, 0) else "ShaderNodeBsdfPrincipled"
-    fill_with_bsdf(material.node_tree, default, (0.8, 0.8, 0.8, 1.0))
-    for ob in objects:
-        if len(ob.material_slots) == 0:
-            ob.data.materials.append(material)
-        for slot in ob.material_slots:
-            if slot.material is None:
-                slot.material = material
-    return material
-
-
 @dataclass(frozen=True)
 class MaterialLobes:
-    """The lobes of one material: those of its leaves that have one, and what each writes."""
+    """The lobes of one material: the leaves that have one, what each writes, and what is not as in Cycles."""
 
-    material: object
     leaves: tuple[Leaf, ...]
-    values: tuple[dict, ...]
+    values: tuple[dict, ...]  # of `bsdfs.lobe_values`, and the weight
+    warnings: tuple[str, ...]
+    is_transparent: bool = False  # rays pass through it and meet the next surface
 
 
-def inject_aovs(materials: list, report: MaterialReport, emitters: frozenset[str] = frozenset()) -> None:
-    """Make every material write the quantities of `aovs`; cut transparency and volumes.
-
-    Materials light nothing, but for those with a full name in `emitters`, of whose emission nothing is said either.
-    """
-    found = []
-    for material in materials:
-        ensure_nodes(material)
-        emitter = material.name_full in emitters
-        if not emitter:
-            material.cycles.emission_sampling = "NONE"
-        lobes = lobes_of(material, emitter, report)
-        if lobes is not None:
-            found.append(lobes)
-            _write_hit(material)
-    # A slot has the same AOVs in all materials.
-    for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
-        users = [lobes for lobes in found if len(lobes.leaves) > slot]
-        names = sorted({name for lobes in users for name in lobes.values[slot]})
-        for lobes in users:
-            write_lobe(lobes.leaves[slot].tree, slot, lobes.values[slot], names)
-
-
-def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes | None:
-    """The lobes of `material`, at most MAX_LOBES; None where rays pass through it and meet the next surface.
-
-    Its tree changes: transparency and volumes are cut, and what weights need is computed.
-    """
+def lobes_of(material, emitter: bool) -> MaterialLobes:
+    """The lobes of `material`, at most MAX_LOBES; of the emission of an `emitter` nothing is said."""
     tree = material.node_tree
     output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
     surface = output.inputs["Surface"]
     shaders = shaders_behind(tree, surface, tree_of=_OwnTrees())
-    for line in notes_of_material(tree, output, shaders, emitter):
-        report.warn(material.name, line)
+    notes = notes_of_material(tree, output, shaders, emitter)
+    warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
     cut(tree, output.inputs["Volume"])
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
@@ -201,19 +74,18 @@ def lobes_of(material, emitter: bool, report: MaterialReport) -> MaterialLobes |
         black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
         tree.links.new(black.outputs[0], surface)
     elif all(leaf.is_transparent for leaf in shaders.leaves):
-        return None
+        return MaterialLobes((), (), warnings, is_transparent=True)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             cut(leaf.tree, leaf.node.inputs["Alpha"])
             leaf.node.inputs["Alpha"].default_value = 1.0
-    shaded = shaded_leaves(shaders)[0]
-    weights = _Weights()
-    shares = [weights.of(leaf) for leaf in shaded]
-    values = (
-        {**lobe_values(leaf.node), **({} if is_constant(share, 1.0) else {"weight": share})}
-        for leaf, share in zip(shaded, shares, strict=True)
-    )
-    return MaterialLobes(material, tuple(shaded), tuple(values))
+    leaves, _ = shaded_leaves(shaders)
+    weight_of = _Weights().of
+    # Every weight before any value: sockets of groups that values come from stay where they are.
+    weights = [weight_of(leaf) for leaf in leaves]
+    shares = [{} if is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
+    values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
+    return MaterialLobes(tuple(leaves), values, warnings)
 
 
 def notes_of_material(tree, output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
@@ -307,6 +179,33 @@ class _Weights:
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
+def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list[str]:
+    """Make every material write its lobes into AOVs; warnings.
+
+    Materials light nothing, but for those with a full name in `emitters`.
+    """
+    found, warnings = [], []
+    for material in materials:
+        ensure_nodes(material)
+        emitter = material.name_full in emitters
+        if not emitter:
+            material.cycles.emission_sampling = "NONE"
+        lobes = lobes_of(material, emitter)
+        warnings += lobes.warnings
+        if not lobes.is_transparent:
+            found.append(lobes)
+            _write_hit(material)
+    # A slot has the same AOVs in all materials.
+    for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
+        users = [lobes for lobes in found if len(lobes.leaves) > slot]
+        names = sorted({name for lobes in users for name in lobes.values[slot]})
+        for lobes, name in itertools.product(users, names):
+            neutral = LOBE_AOVS[name][1]
+            value = lobes.values[slot].get(name, 0.0 if neutral is None else neutral)
+            _write_aov(lobes.leaves[slot].tree, lobe_aov(name, slot), value)
+    return list(dict.fromkeys(warnings))
+
+
 def _write_hit(material) -> None:
     """AOVs of what a hit has once, however many lobes."""
     tree = material.node_tree
@@ -314,10 +213,92 @@ def _write_hit(material) -> None:
     receiver = tree.nodes.new("ShaderNodeAttribute")
     # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
     receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
-    write_aov(tree, "hit", 1.0)
-    write_aov(tree, "receiver", receiver.outputs["Fac"])
-    write_aov(tree, "correct_normal", bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
-    write_aov(tree, "position", geometry.outputs["Position"])
-    write_aov(tree, "incoming", geometry.outputs["Incoming"])
-    write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
-    write_aov(tree, "true_normal", geometry.outputs["True Normal"])
+    _write_aov(tree, "hit", 1.0)
+    _write_aov(tree, "receiver", receiver.outputs["Fac"])
+    _write_aov(tree, "correct_normal", _bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
+    _write_aov(tree, "position", geometry.outputs["Position"])
+    _write_aov(tree, "incoming", geometry.outputs["Incoming"])
+    _write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
+    _write_aov(tree, "true_normal", geometry.outputs["True Normal"])
+
+
+def _bends_normals(tree):
+    """A socket of `tree` that is 1, and 0 on hair, where Cycles never bends specular normals."""
+    flipped = tree.nodes.new("ShaderNodeMath")
+    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
+    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
+    return flipped.outputs[0]
+
+
+def _write_aov(tree, name: str, value) -> None:
+    """A node in `tree` that writes `value`, a socket of it, a number or a color, into the AOV `name`."""
+    node = tree.nodes.new("ShaderNodeOutputAOV")
+    node.aov_name = AOV_PREFIX + name
+    target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
+    if is_socket(value):
+        tree.links.new(value, target)
+    elif isinstance(value, tuple):
+        target.default_value = (*value[:3], 1.0)
+    else:
+        target.default_value = float(value)
+
+
+def declare_aovs(view_layer) -> None:
+    """Add a pass to `view_layer` for every AOV that some material writes, and all that belong to a hit."""
+    trees = [material.node_tree for material in bpy.data.materials if material.node_tree] + list(bpy.data.node_groups)
+    written = {
+        node.aov_name.removeprefix(AOV_PREFIX)
+        for tree in trees
+        if tree.bl_idname == "ShaderNodeTree"
+        for node in tree.nodes
+        if node.bl_idname == "ShaderNodeOutputAOV" and node.aov_name.startswith(AOV_PREFIX)
+    }
+    for name in sorted(written | set(HIT_AOVS)):
+        aov = view_layer.aovs.add()
+        aov.name, aov.type = AOV_PREFIX + name, aov_kind(name)
+
+
+def remove_aovs(view_layer) -> None:
+    """Take the passes of `declare_aovs` out again."""
+    for aov in [aov for aov in view_layer.aovs if aov.name.startswith(AOV_PREFIX)]:
+        view_layer.aovs.remove(aov)
+
+
+def materials_in_use(surfaces: list, override=None) -> list:
+    """Original materials of the evaluated objects `surfaces`, each once; only `override` where one is set."""
+    if override is not None:
+        return [override.original]
+    found = {}
+    for ob in surfaces:
+        for slot in ob.material_slots:
+            if slot.material is not None:
+                found[slot.material.original.name_full] = slot.material.original
+    return list(found.values())
+
+
+def objects_without_material(surfaces: list) -> list:
+    """Original objects of `surfaces` with no material slot or an empty one."""
+    found = {}
+    for ob in surfaces:
+        slots = ob.material_slots
+        if len(slots) == 0 or any(slot.material is None for slot in slots):
+            found[ob.original.name_full] = ob.original
+    return list(found.values())
+
+
+def give_default_material(objects: list):
+    """Put a material that looks like Cycles' default surface where none is assigned; the material, or None."""
+    if not objects:
+        return None
+    material = bpy.data.materials.new("Default surface")
+    ensure_nodes(material)
+    # Measured: a gray Diffuse BSDF in 4.5.15, a Principled BSDF with all its defaults in 5.2.3.
+    default = "ShaderNodeBsdfDiffuse" if bpy.app.version < (5, 0, 0) else "ShaderNodeBsdfPrincipled"
+    fill_with_bsdf(material.node_tree, default, (0.8, 0.8, 0.8, 1.0))
+    for ob in objects:
+        if len(ob.material_slots) == 0:
+            ob.data.materials.append(material)
+        for slot in ob.material_slots:
+            if slot.material is None:
+                slot.material = material
+    return material

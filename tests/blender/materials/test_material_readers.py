@@ -10,7 +10,7 @@ import pytest
 import scene_parts
 
 from ltsh_addon.blender.lights.emission import emission_behind
-from ltsh_addon.blender.materials.aovs import MaterialReport, inject_aovs
+from ltsh_addon.blender.materials.aovs import inject_aovs
 from ltsh_addon.blender.materials.looks import COAT, look_of
 from ltsh_addon.blender.ui import overview
 from ltsh_addon.cycles.lobes import LOBE_KINDS, MAX_LOBES, SMALLEST_WEIGHT
@@ -88,8 +88,8 @@ def written_aovs(tree, path=()):
 
 def lobes_of_aovs(material):
     """(lobes, notes) of a copy of the material into which AOVs were written: (kind, weight, red, roughness) each."""
-    copy, report = material.copy(), MaterialReport()
-    inject_aovs([copy], report, frozenset({copy.name_full}))
+    copy = material.copy()
+    warnings = inject_aovs([copy], frozenset({copy.name_full}))
     aovs = written_aovs(copy.node_tree)
     lobes = []
     for slot in range(MAX_LOBES):
@@ -97,7 +97,7 @@ def lobes_of_aovs(material):
             kind = KIND_NAMES[round(aovs[f"ltsh_kind_{slot}"])]
             weight, color = aovs.get(f"ltsh_weight_{slot}", 1.0), aovs[f"ltsh_color_{slot}"]
             lobes.append((kind, weight, color[0], aovs.get(f"ltsh_roughness_{slot}", 0.0)))
-    return visible(lobes), {line.partition(": ")[2] for line in report.lines()}
+    return visible(lobes), {line.partition(": ")[2] for line in warnings}
 
 
 def lobes_of_look(material):

@@ -8,7 +8,7 @@ import scene_parts
 from scene_parts import add_plane, bsdf_material, new_material, principled
 
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.materials.aovs import MaterialReport, inject_aovs
+from ltsh_addon.blender.materials.aovs import inject_aovs
 from ltsh_addon.blender.materials.bsdfs import notes_of
 from ltsh_addon.cycles import horizons, lobes
 
@@ -287,10 +287,9 @@ def test_nodes_that_send_rays_are_named(kind):
     tree = material.node_tree
     unused, used = (tree.nodes.new(f"ShaderNode{kind}") for _ in range(2))
     tree.links.new(used.outputs[0], node.inputs["Base Color"])
-    report = MaterialReport()
-    inject_aovs([material], report)
-    assert len(report.lines()) == 1 and repr(used.name) in report.lines()[0]
-    assert report.lines()[0].startswith(f"material {material.name!r}: ") and unused.name != used.name
+    warnings = inject_aovs([material])
+    assert len(warnings) == 1 and repr(used.name) in warnings[0]
+    assert warnings[0].startswith(f"material {material.name!r}: ") and unused.name != used.name
 
 
 def test_an_index_of_refraction_that_varies_is_named():
@@ -322,7 +321,6 @@ def test_other_shaders_are_named_and_shaded_as_the_nearest(tmp_path, plane_scene
 
 def test_materials_that_shine_into_the_scene_keep_their_emission():
     quiet, shining = (principled(name, **{"Emission Strength": 2.0})[0] for name in ("Quiet", "Shining"))
-    report = MaterialReport()
-    inject_aovs([quiet, shining], report, frozenset({"Shining"}))
+    warnings = inject_aovs([quiet, shining], frozenset({"Shining"}))
     assert quiet.cycles.emission_sampling == "NONE" and shining.cycles.emission_sampling != "NONE"
-    assert len(report.lines()) == 1 and "'Quiet'" in report.lines()[0] and "emission" in report.lines()[0]
+    assert len(warnings) == 1 and "'Quiet'" in warnings[0] and "emission" in warnings[0]

@@ -91,6 +91,6 @@ def _show(ob, group) -> None:
         node = tree.nodes.new("ShaderNodeGroup")
         node.node_tree, node.label, node.width = group, group.name, 220.0
         node.location = (output.location.x - 260.0, output.location.y + 220.0)
-        cut(tree, output.inputs["Surface"])
+        cut(output.inputs["Surface"])
         tree.links.new(node.outputs["Emission"], output.inputs["Surface"])
         slot.material = material

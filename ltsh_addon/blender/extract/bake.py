@@ -302,7 +302,7 @@ class BakeScene:
             material = slot.material
             if material.name_full not in made:
                 lobes = self.lobes[material.name_full]
-                paths = tuple(leaf.source.groups for leaf in lobes.leaves)
+                paths = tuple(leaf.groups for leaf in lobes.leaves)
                 made[material.name_full] = MaterialPlan(material, lobes.values, paths, images, uv_names)
                 warnings += lobes.warnings
         return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))

@@ -15,8 +15,9 @@ import numpy as np
 
 from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
+from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
-from .emission import Emission, emission_behind, open_studio
+from .emission import emission_of, open_studio
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
 from .textures import UnseenLight, look_at_area_lights
@@ -191,11 +192,9 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
 def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
     """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
     light = ob.data
-    tree = light.node_tree
-    if tree is None or (bpy.app.version < (5, 0, 0) and not light.use_nodes):
+    if tree_in_use(light) is None:
         return None
-    output = tree.get_output_node("CYCLES") or tree.get_output_node("ALL")
-    emission = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
+    emission = emission_of(light)
     if emission.plain:
         return None
     if emission.directional:

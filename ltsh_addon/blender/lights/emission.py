@@ -12,7 +12,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
-from ..materials.graph import Source, is_socket, shaders_behind, source_of, value_of
+from ..materials.graph import Source, is_socket, shaders_behind, source_of, surface_of, value_of
 from ..render_settings import enable_passes
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
@@ -39,7 +39,7 @@ DIRECTIONAL = {
 
 @dataclass
 class Emission:
-    """What was found behind a shader socket."""
+    """What the nodes of a material or light emit."""
 
     emits: bool = False
     plain: bool = False  # one Emission node, white, of strength 1
@@ -47,10 +47,10 @@ class Emission:
     directional: set[str] = field(default_factory=set)  # labels of nodes
 
 
-def emission_behind(tree, socket, groups: tuple = ()) -> Emission:
-    """What emits behind the shader input `socket` of `tree`; `groups` leads there, as (tree, group node) pairs."""
-    found, seen = Emission(), set()
-    leaves = shaders_behind(tree, socket, groups).leaves
+def emission_of(data) -> Emission:
+    """What the nodes of a material or light emit."""
+    found, seen, surface = Emission(), set(), surface_of(data)
+    leaves = [] if surface is None else shaders_behind(surface).leaves
     found.plain = len(leaves) == 1 and leaves[0].terms == ((),) and _is_neutral(leaves[0].node)
     for leaf in leaves:
         if not emits(leaf.node):
@@ -58,7 +58,7 @@ def emission_behind(tree, socket, groups: tuple = ()) -> Emission:
         found.emits = True
         alpha = (leaf.node.inputs["Alpha"],) if "Alpha" in leaf.node.inputs else ()
         for value in (*emission_sockets(leaf.node), *alpha):
-            _note_value(source_of(leaf.tree, value, leaf.source.groups), found, seen)
+            _note_value(source_of(value, leaf.groups), found, seen)
         for factor in {factor for term in leaf.terms for factor in term}:
             _note_value(factor.source, found, seen)
     return found
@@ -85,7 +85,7 @@ def _note_value(source: Source | None, found: Emission, seen: set) -> None:
         found.directional.add(source.node.bl_label)
     found.varies |= kind not in CONSTANT_NODES
     for entry in source.node.inputs:
-        _note_value(source_of(source.tree, entry, source.groups), found, seen)
+        _note_value(source_of(entry, source.groups), found, seen)
 
 
 PIXELS = 256

@@ -13,8 +13,8 @@ from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import AreaLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, read_values, surface_instancer
-from ..materials.graph import ensure_nodes, live_link, material_output
-from .emission import PIXELS, Emission, Studio, emission_behind
+from ..materials.graph import computed, ensure_nodes, live_link, material_output
+from .emission import PIXELS, Emission, Studio, emission_of
 from .linking import Receivers
 
 
@@ -113,9 +113,7 @@ def _emission_of(material, known: dict[str, Emission]) -> Emission:
     if material is None:
         return Emission()
     if material.name_full not in known:
-        tree = material.node_tree if bpy.app.version >= (5, 0, 0) or material.use_nodes else None
-        output = material_output(tree) if tree else None
-        known[material.name_full] = emission_behind(tree, output.inputs["Surface"]) if output else Emission()
+        known[material.name_full] = emission_of(material)
     return known[material.name_full]
 
 
@@ -467,16 +465,5 @@ def _is_dark_side(tree):
     side = tree.nodes.new("ShaderNodeAttribute")
     side.attribute_type, side.attribute_name = "OBJECT", SIDE_PROPERTY
     back = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]
-    signed = _math(tree, "MULTIPLY_ADD", back, 2.0, -1.0)
-    return _math(tree, "GREATER_THAN", _math(tree, "MULTIPLY", signed, side.outputs["Fac"]), 0.0)
-
-
-def _math(tree, operation: str, *values):
-    node = tree.nodes.new("ShaderNodeMath")
-    node.operation = operation
-    for value, target in zip(values, node.inputs, strict=False):
-        if isinstance(value, float):
-            target.default_value = value
-        else:
-            tree.links.new(value, target)
-    return node.outputs[0]
+    signed = computed("MULTIPLY_ADD", back, 2.0, -1.0)
+    return computed("GREATER_THAN", computed("MULTIPLY", signed, side.outputs["Fac"]), 0.0)

@@ -6,6 +6,7 @@ of lobes. Pictures write all quantities into AOVs, bakes show them as `maps`.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from .graph import (
     bypass,
     carry_into_group,
     carry_out_of_group,
+    computed,
     cut,
     ensure_nodes,
     fill_with_bsdf,
@@ -59,15 +61,15 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     tree = material.node_tree
     output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
     surface = output.inputs["Surface"]
-    shaders = shaders_behind(tree, surface, tree_of=_OwnTrees())
-    notes = notes_of_material(tree, output, shaders, emitter)
+    shaders = shaders_behind(surface, tree_of=_OwnTrees())
+    notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    cut(tree, output.inputs["Volume"])
+    cut(output.inputs["Volume"])
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
-            bypass(found.tree, found.node, live_link(found.other).from_socket)
+            bypass(found.node, live_link(found.other).from_socket)
         else:
-            cut(found.tree, found.clear)
+            cut(found.clear)
     if not shaders.leaves:
         # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
         black = tree.nodes.new("ShaderNodeBsdfDiffuse")
@@ -77,7 +79,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         return MaterialLobes((), (), warnings, is_transparent=True)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
-            cut(leaf.tree, leaf.node.inputs["Alpha"])
+            cut(leaf.node.inputs["Alpha"])
             leaf.node.inputs["Alpha"].default_value = 1.0
     leaves, _ = shaded_leaves(shaders)
     weight_of = _Weights().of
@@ -88,12 +90,12 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     return MaterialLobes(tuple(leaves), values, warnings)
 
 
-def notes_of_material(tree, output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
+def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
     """What of a material is not shaded as Cycles does; `emitter`: it is a light. Nothing is changed."""
     notes = []
     if live_link(output.inputs["Volume"]) is not None:
         notes.append("its volume is not shaded; left out of the Cycles reference as well")
-    notes += [f"node {node.name!r} {TRACING_NODES[node.bl_idname]}" for node in _tracing_nodes(tree)]
+    notes += [f"node {node.name!r} {TRACING_NODES[node.bl_idname]}" for node in _tracing_nodes(output.id_data)]
     for found in shaders.cuts:
         notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
     leaves = shaders.leaves
@@ -149,11 +151,7 @@ class _Weights:
 
     def of(self, leaf: Leaf):
         """The weight of the lobes of `leaf`: a number, or a socket of its tree."""
-        groups = leaf.source.groups
-        weight, *others = (self._product(term, groups) for term in leaf.lobe_terms)
-        for other in others:
-            weight = total(leaf.tree, weight, other)
-        return weight
+        return functools.reduce(total, (self._product(term, leaf.groups) for term in leaf.lobe_terms))
 
     def _product(self, factors: tuple[Factor, ...], groups: tuple):
         """The product of `factors` in the tree that `groups` lead to."""
@@ -165,17 +163,17 @@ class _Weights:
     def _carried(self, factors, groups):
         last = factors[-1]
         if groups == last.groups:
-            return product(last.tree, self._product(factors[:-1], groups), self._share(last))
+            return product(self._product(factors[:-1], groups), self._share(last))
         depth = len(groups)
         if last.groups[:depth] == groups:
-            return carry_out_of_group(last.groups[depth][1], self._product(factors, last.groups[: depth + 1]))
-        return carry_into_group(*groups[-1], self._product(factors, groups[:-1]))
+            return carry_out_of_group(last.groups[depth], self._product(factors, last.groups[: depth + 1]))
+        return carry_into_group(groups[-1], self._product(factors, groups[:-1]))
 
     def _share(self, factor: Factor):
         if factor.constant is not None:
             return factor.constant
         if factor.node not in self._shares:
-            self._shares[factor.node] = mix_weights(factor.tree, factor.node)
+            self._shares[factor.node] = mix_weights(factor.node)
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
@@ -202,7 +200,7 @@ def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list
         for lobes, name in itertools.product(users, names):
             neutral = LOBE_AOVS[name][1]
             value = lobes.values[slot].get(name, 0.0 if neutral is None else neutral)
-            _write_aov(lobes.leaves[slot].tree, lobe_aov(name, slot), value)
+            _write_aov(lobes.leaves[slot].node.id_data, lobe_aov(name, slot), value)
     return list(dict.fromkeys(warnings))
 
 
@@ -224,10 +222,7 @@ def _write_hit(material) -> None:
 
 def _bends_normals(tree):
     """A socket of `tree` that is 1, and 0 on hair, where Cycles never bends specular normals."""
-    flipped = tree.nodes.new("ShaderNodeMath")
-    flipped.operation, flipped.inputs[0].default_value = "SUBTRACT", 1.0
-    tree.links.new(tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"], flipped.inputs[1])
-    return flipped.outputs[0]
+    return computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
 
 
 def _write_aov(tree, name: str, value) -> None:

@@ -110,7 +110,7 @@ def lobe_values(node) -> dict:
     values = {"kind": LOBE_KINDS[bsdf.kind]}
     values.update({aov: value_of(node.inputs[name]) for aov, name in bsdf.sockets.items()})
     if bsdf.roughness_factor != 1.0:
-        values["roughness"] = product(node.id_data, values["roughness"], bsdf.roughness_factor)
+        values["roughness"] = product(values["roughness"], bsdf.roughness_factor)
     normal = live_link(node.inputs["Normal"])
     if normal is not None:
         values["normal"] = normal.from_socket

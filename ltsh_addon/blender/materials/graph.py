@@ -49,8 +49,20 @@ def is_constant(value, expected) -> bool:
 
 
 def material_output(tree):
-    """The Material Output that Cycles uses, or None."""
+    """The Material Output, World Output or Light Output that Cycles uses, or None."""
     return tree.get_output_node("CYCLES") or tree.get_output_node("ALL")
+
+
+def tree_in_use(data):
+    """The node tree of a material, world or light, None where its own settings count."""
+    return data.node_tree if bpy.app.version >= (5, 0, 0) or data.use_nodes else None
+
+
+def surface_of(data):
+    """The input Surface of the output of a material, world or light, None without nodes or output."""
+    tree = tree_in_use(data)
+    output = material_output(tree) if tree is not None else None
+    return None if output is None else output.inputs["Surface"]
 
 
 def group_output(tree):
@@ -80,30 +92,27 @@ def is_group(node) -> bool:
 class Source:
     """An output of a node, or an unlinked input (`node` None) whose own value counts."""
 
-    tree: Any
     socket: Any
     node: Any
-    groups: tuple = ()  # (tree, group node) pairs that lead from the material to `tree`
+    groups: tuple = ()  # the group nodes that it is in, from the material inwards
 
     def input(self, name) -> Source | None:
         """What feeds the input `name` (or position) of the node."""
-        return source_of(self.tree, self.node.inputs[name], self.groups)
+        return source_of(self.node.inputs[name], self.groups)
 
 
 def _own_tree(group):
     return group.node_tree
 
 
-def source_of(tree, socket, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
-    """What feeds the input `socket` of `tree`; None where a group has no inside or no outside."""
+def source_of(socket, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+    """What feeds the input `socket` inside of `groups`; None where a group has no inside or no outside."""
     link = live_link(socket)
-    if link is None:
-        return Source(tree, socket, None, groups)
-    return source_behind(tree, link.from_socket, groups, tree_of)
+    return Source(socket, None, groups) if link is None else source_behind(link.from_socket, groups, tree_of)
 
 
-def source_behind(tree, output, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
-    """What the `output` of a node in `tree` comes from, past groups, reroutes and muted nodes; None as in `source_of`.
+def source_behind(output, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+    """What the `output` of a node comes from, past groups, reroutes and muted nodes; None as in `source_of`.
 
     `tree_of(group node)` is the node tree of a group that is entered.
     """
@@ -117,21 +126,20 @@ def source_behind(tree, output, groups: tuple = (), tree_of: Callable = _own_tre
         end = group_output(inner) if inner is not None else None
         if end is not None:
             entry = socket_named(end.inputs, output.identifier)
-            tree, groups = inner, (*groups, (tree, node))
+            groups = (*groups, node)
     elif node.bl_idname == "NodeGroupInput":
         if groups:
-            (tree, group), groups = groups[-1], groups[:-1]
-            entry = socket_named(group.inputs, output.identifier)
+            entry = socket_named(groups[-1].inputs, output.identifier)
+            groups = groups[:-1]
     else:
-        return Source(tree, output, node, groups)
-    return None if entry is None else source_of(tree, entry, groups, tree_of)
+        return Source(output, node, groups)
+    return None if entry is None else source_of(entry, groups, tree_of)
 
 
 @dataclass(frozen=True)
 class Factor:
     """What a Mix Shader node multiplies one of its shaders by: its factor, clamped to [0, 1], or 1 minus that."""
 
-    tree: Any
     node: Any
     groups: tuple
     is_complement: bool
@@ -140,7 +148,7 @@ class Factor:
     @property
     def source(self) -> Source | None:
         """What feeds the factor of the node."""
-        return source_of(self.tree, self.node.inputs[0], self.groups)
+        return source_of(self.node.inputs[0], self.groups)
 
     @property
     def constant(self) -> float | None:
@@ -165,9 +173,9 @@ class Leaf:
         return self.source.node
 
     @property
-    def tree(self):
-        """The node tree that the node lives in."""
-        return self.source.tree
+    def groups(self) -> tuple:
+        """The group nodes that it is in."""
+        return self.source.groups
 
     @property
     def is_transparent(self) -> bool:
@@ -195,7 +203,6 @@ class Leaf:
 class Cut:
     """A mix or sum of which one shader is nothing but transparency; surfaces are opaque, so it is left out."""
 
-    tree: Any
     node: Any
     clear: Any  # the input socket of the transparency
     other: Any  # the other one
@@ -210,10 +217,10 @@ class SurfaceShaders:
     is_transparent: bool = False  # there is nothing but transparency
 
     def _add(self, other: SurfaceShaders, *factors: Factor) -> None:
-        places = {(leaf.node, leaf.source.groups): place for place, leaf in enumerate(self.leaves)}
+        places = {(leaf.node, leaf.groups): place for place, leaf in enumerate(self.leaves)}
         for leaf in other.leaves:
             terms = tuple((*factors, *term) for term in leaf.terms)
-            place = places.get((leaf.node, leaf.source.groups))
+            place = places.get((leaf.node, leaf.groups))
             if place is None:
                 self.leaves.append(Leaf(leaf.source, terms))
             else:
@@ -221,59 +228,61 @@ class SurfaceShaders:
         self.cuts += [cut for cut in other.cuts if cut not in self.cuts]
 
 
-def shaders_behind(tree, socket, groups: tuple = (), tree_of: Callable = _own_tree) -> SurfaceShaders:
-    """The shader nodes behind the input `socket` of `tree`, with their weights.
+def shaders_behind(socket, groups: tuple = (), tree_of: Callable = _own_tree) -> SurfaceShaders:
+    """The shader nodes behind the input `socket`, with their weights.
 
     A node that is reached twice is one leaf. A mix by a constant 0 or 1 is the one shader, a sum with an open input the
     other. Transparency beside another shader is cut. `tree_of` as in `source_behind`.
     """
-    source = source_of(tree, socket, groups, tree_of)
+    source = source_of(socket, groups, tree_of)
     if source is None or source.node is None:
         return SurfaceShaders()
-    tree, node, groups = source.tree, source.node, source.groups
+    node, groups = source.node, source.groups
     if node.bl_idname not in (MIX, ADD):
         leaf = Leaf(source, ((),))
         return SurfaceShaders([leaf], is_transparent=leaf.is_transparent)
     sockets = [socket for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == MIX:
-        share = Factor(tree, node, groups, False, False).constant
+        share = Factor(node, groups, False, False).constant
         if share in (0.0, 1.0):
-            return shaders_behind(tree, sockets[int(share)], groups, tree_of)
+            return shaders_behind(sockets[int(share)], groups, tree_of)
     else:
         sockets = [socket for socket in sockets if live_link(socket) is not None]
         if len(sockets) == 1:
-            return shaders_behind(tree, sockets[0], groups, tree_of)
-    parts = [shaders_behind(tree, socket, groups, tree_of) for socket in sockets]
+            return shaders_behind(sockets[0], groups, tree_of)
+    parts = [shaders_behind(socket, groups, tree_of) for socket in sockets]
     found = SurfaceShaders(is_transparent=bool(parts) and all(part.is_transparent for part in parts))
     if not found.is_transparent:
         for index, part in enumerate(parts):
             other = sockets[1 - index]
             if part.is_transparent and live_link(other) is not None:
-                found.cuts.append(Cut(tree, node, sockets[index], other))
+                found.cuts.append(Cut(node, sockets[index], other))
     cuts_here = bool(found.cuts)
     for index, part in enumerate(parts):
-        factors = (Factor(tree, node, groups, index == 0, cuts_here),) if node.bl_idname == MIX else ()
+        factors = (Factor(node, groups, index == 0, cuts_here),) if node.bl_idname == MIX else ()
         if not (cuts_here and part.is_transparent):
             found._add(part, *factors)
     return found
 
 
-def bypass(tree, node, source) -> None:
+def bypass(node, source) -> None:
     """Feed everything that `node` feeds from the socket `source` instead."""
     for target in [link.to_socket for link in node.outputs[0].links]:
-        tree.links.new(source, target)
+        node.id_data.links.new(source, target)
 
 
-def cut(tree, socket) -> None:
+def cut(socket) -> None:
     """Take away what feeds the input `socket`."""
     for link in list(socket.links):
-        tree.links.remove(link)
+        socket.id_data.links.remove(link)
 
 
-def _math(tree, operation: str, first, second, clamp: bool = False):
+def computed(operation: str, *values, clamp: bool = False):
+    """The result of a new Math node for numbers and sockets, at least one, of the same tree."""
+    tree = next(value for value in values if is_socket(value)).id_data
     node = tree.nodes.new("ShaderNodeMath")
     node.operation, node.use_clamp = operation, clamp
-    for value, socket in zip((first, second), node.inputs, strict=False):
+    for value, socket in zip(values, node.inputs, strict=False):
         if is_socket(value):
             tree.links.new(value, socket)
         else:
@@ -281,36 +290,36 @@ def _math(tree, operation: str, first, second, clamp: bool = False):
     return node.outputs[0]
 
 
-def product(tree, first, second):
-    """first * second."""
+def product(first, second):
+    """first * second, of numbers and sockets of the same tree."""
     if not is_socket(first) and not is_socket(second):
         return first * second
     for constant, other in ((first, second), (second, first)):
         if not is_socket(constant) and constant in (0.0, 1.0):
             return other if constant else 0.0
-    return _math(tree, "MULTIPLY", first, second)
+    return computed("MULTIPLY", first, second)
 
 
-def total(tree, first, second):
-    """first + second."""
+def total(first, second):
+    """first + second, of numbers and sockets of the same tree."""
     if not is_socket(first) and not is_socket(second):
         return first + second
-    return _math(tree, "ADD", first, second)
+    return computed("ADD", first, second)
 
 
-def mix_weights(tree, node):
-    """Weights of both shaders of a Mix Shader `node` of `tree` whose factor nodes compute; Cycles clamps it."""
-    clamped = _math(tree, "ADD", value_of(node.inputs[0]), 0.0, clamp=True)
-    return _math(tree, "SUBTRACT", 1.0, clamped), clamped
+def mix_weights(node):
+    """Weights of both shaders of a Mix Shader `node` whose factor nodes compute; Cycles clamps it."""
+    clamped = computed("ADD", value_of(node.inputs[0]), 0.0, clamp=True)
+    return computed("SUBTRACT", 1.0, clamped), clamped
 
 
-def carry_into_group(tree, group, value):
-    """The same number inside the node `group` of `tree`, whose node tree has no other user."""
+def carry_into_group(group, value):
+    """The same number inside the node `group`, whose node tree has no other user."""
     if not is_socket(value):
         return value
     inner = group.node_tree
     item = inner.interface.new_socket(GROUP_SOCKET_NAME, in_out="INPUT", socket_type="NodeSocketFloat")
-    tree.links.new(value, socket_named(group.inputs, item.identifier))
+    group.id_data.links.new(value, socket_named(group.inputs, item.identifier))
     return socket_named(inner.nodes.new("NodeGroupInput").outputs, item.identifier)
 
 

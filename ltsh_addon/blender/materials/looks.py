@@ -10,8 +10,8 @@ import numpy as np
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
-from .graph import Factor, Leaf, Source, SurfaceShaders, material_output, shaders_behind, source_of
-from .values import ImageUse, Value, constant, value_at
+from .graph import Factor, Leaf, Source, SurfaceShaders, shaders_behind, source_of, surface_of, tree_in_use
+from .values import ImageUse, Value, constant, input_value, value_at
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
@@ -125,11 +125,8 @@ def look_of(material) -> Look:
         return default_look()
     if bpy.app.version < (5, 0, 0) and not material.use_nodes:
         return plain_look(material.diffuse_color)
-    tree = material.node_tree
-    output = material_output(tree) if tree is not None else None
-    if output is None:
-        return plain_look(0.0)
-    return _Reader(material, shaders_behind(tree, output.inputs["Surface"])).look()
+    surface = surface_of(material)
+    return plain_look(0.0) if surface is None else _Reader(material, shaders_behind(surface)).look()
 
 
 @dataclass(frozen=True)
@@ -165,7 +162,7 @@ class Share:
 
 def _value_of_factor(factor: Factor) -> Value | ViewFactor | None:
     """The factor as a value; None: unknown."""
-    value = value_at(factor.tree, factor.node.inputs[0], factor.groups)
+    value = value_at(factor.node.inputs[0], factor.groups)
     if value is None:
         value = _view_factor(factor.source)
     if value is None or not factor.is_complement:
@@ -179,7 +176,7 @@ def _view_factor(source: Source | None) -> ViewFactor | None:
     """What a Fresnel or Layer Weight node with a constant number and the smooth normal says."""
     if source is None or source.node is None or source.node.bl_idname not in VIEW_FACTORS:
         return None
-    normal, parameter = source.input("Normal"), value_at(source.tree, source.node.inputs[0], source.groups)
+    normal, parameter = source.input("Normal"), input_value(source, 0)
     if normal is None or normal.node is not None or parameter is None or not parameter.is_constant:
         return None
     is_blend = source.node.bl_idname == "ShaderNodeLayerWeight"
@@ -274,7 +271,7 @@ class _Reader:
         if bsdf.kind == "sheen":
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF")
         if bsdf.kind == "principled":
-            weight = value_at(source.tree, node.inputs["Sheen Weight"], source.groups)
+            weight = input_value(source, "Sheen Weight")
             if weight is None or not weight.is_constant or weight.offset[0] > 0.0:
                 self.note("sheen is not shown")
         normal, strength = self._normal(source, values)
@@ -301,7 +298,7 @@ class _Reader:
         return Coat(weight, roughness, ior, np.maximum(tint, 0.0) * np.ones(3), follows)
 
     def _value(self, source: Source, name: str, socket_name: str) -> Value:
-        value = value_at(source.tree, source.node.inputs[socket_name], source.groups)
+        value = input_value(source, socket_name)
         if value is not None and (value.is_constant or name in IMAGE_SLOTS):
             return value
         self.note(f"{socket_name} is not resolved")
@@ -331,7 +328,7 @@ class _Reader:
         if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
             self.note(f"normals from {node.name!r} are not resolved")
             return None, 1.0
-        color, strength = (value_at(normal.tree, node.inputs[name], normal.groups) for name in ("Color", "Strength"))
+        color, strength = (input_value(normal, name) for name in ("Color", "Strength"))
         maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
         if color is None or strength is None or not strength.is_constant or len(maps - {""}) > 1:
             self.note(f"normals from {node.name!r} are not resolved")
@@ -341,7 +338,7 @@ class _Reader:
         return color, float(strength.offset[0])
 
     def _emission(self, source: Source) -> np.ndarray:
-        parts = [value_at(source.tree, socket, source.groups) for socket in emission_sockets(source.node)]
+        parts = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
         if all(part is not None and part.is_constant for part in parts):
             return np.prod([part.offset for part in parts], axis=0) if parts else np.zeros(3)
         color, strength = parts
@@ -357,15 +354,14 @@ def world_radiance(world) -> tuple[np.ndarray, bool]:
     """
     if world is None:
         return np.zeros(3), True
-    tree = world.node_tree if bpy.app.version >= (5, 0, 0) or world.use_nodes else None
-    if tree is None:
+    if tree_in_use(world) is None:
         return np.array(world.color, np.float64), True
-    output = material_output(tree)
-    source = source_of(tree, output.inputs["Surface"]) if output is not None else None
+    surface = surface_of(world)
+    source = source_of(surface) if surface is not None else None
     if source is None or source.node is None:
         return np.zeros(3), True
     if source.node.bl_idname == "ShaderNodeBackground":
-        parts = [value_at(source.tree, source.node.inputs[name], source.groups) for name in ("Color", "Strength")]
+        parts = [input_value(source, name) for name in ("Color", "Strength")]
         if all(part is not None and part.is_constant for part in parts):
             return parts[0].offset * parts[1].offset, True
     return np.array(world.color, np.float64), False

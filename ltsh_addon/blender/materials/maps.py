@@ -49,7 +49,7 @@ def plain_texture(output, groups):
     `groups` leads to the node (see `graph.Source`). The place is a dictionary as `cycles.texels.BakeMaterial` reads it,
     the part "color", or a channel "0", "1" or "2".
     """
-    found, part = source_behind(output.id_data, output, groups), "color"
+    found, part = source_behind(output, groups), "color"
     if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
         part = str(list(found.node.outputs).index(found.socket))
         found = found.input(0)
@@ -142,7 +142,7 @@ class MaterialPlan:
         if texture is not None:
             return texture
         socket = value
-        for _, group in reversed(groups):
+        for group in reversed(groups):
             socket = carry_out_of_group(group, socket)
         if LOBE_AOVS[name][0] == "COLOR":
             self._colors.add(len(self._maps))
@@ -196,7 +196,7 @@ class MaterialPlan:
     def show(self, number: int | None) -> None:
         """Make the material emit map `number` (black where there is none), or look as it does (None)."""
         surface = self._output.inputs["Surface"]
-        cut(self.tree, surface)
+        cut(surface)
         if number is None:
             if self._surface is not None:
                 self.tree.links.new(self._surface, surface)

@@ -83,9 +83,9 @@ def product(first: Value | None, second: Value | None) -> Value | None:
     return second.mapped(np.diag(first.offset)) if first.is_constant else None
 
 
-def value_at(tree, socket, groups: tuple = ()) -> Value | None:
-    """The value at the input `socket` of `tree`, as the kind of value that it takes; None: unknown."""
-    value = value_of_source(source_of(tree, socket, groups))
+def value_at(socket, groups: tuple = ()) -> Value | None:
+    """The value at the input `socket` inside of `groups`, as the kind of value that it takes; None: unknown."""
+    value = value_of_source(source_of(socket, groups))
     if value is not None and socket.type == "VALUE":
         return value if is_gray(value) else value.as_number()
     return value
@@ -101,8 +101,9 @@ def value_of_source(source: Source | None) -> Value | None:
     return None if reader is None else reader(source)
 
 
-def _input(source: Source, name) -> Value | None:
-    return value_at(source.tree, source.node.inputs[name], source.groups)
+def input_value(source: Source, name) -> Value | None:
+    """The value at the input `name` (or position) of the node of `source`."""
+    return value_at(source.node.inputs[name], source.groups)
 
 
 def _own_value(source: Source) -> Value:
@@ -146,7 +147,7 @@ def coordinates(source: Source | None):
     if node.bl_idname != "ShaderNodeMapping" or node.vector_type not in ("POINT", "TEXTURE"):
         return None
     inner = coordinates(source.input("Vector"))
-    parts = [value_at(source.tree, node.inputs[name], source.groups) for name in ("Location", "Rotation", "Scale")]
+    parts = [input_value(source, name) for name in ("Location", "Rotation", "Scale")]
     if inner is None or any(part is None or not part.is_constant for part in parts):
         return None
     return inner[0], _mapping(node.vector_type, *(part.offset for part in parts), inner[1])
@@ -168,7 +169,7 @@ def _mapping(kind: str, location, rotation, scale, inner):
 def _separate(source: Source) -> Value | None:
     if getattr(source.node, "mode", "RGB") != "RGB":
         return None
-    value = _input(source, 0)
+    value = input_value(source, 0)
     channel = next(index for index, socket in enumerate(source.node.outputs) if socket == source.socket)
     pick = np.zeros((3, 3))
     pick[:, channel] = 1.0
@@ -178,14 +179,14 @@ def _separate(source: Source) -> Value | None:
 def _combine(source: Source) -> Value | None:
     if getattr(source.node, "mode", "RGB") != "RGB":
         return None
-    parts = [_input(source, index) for index in range(3)]
+    parts = [input_value(source, index) for index in range(3)]
     if any(part is None or not part.is_constant for part in parts):
         return None
     return constant([part.offset[0] for part in parts])
 
 
 def _to_number(source: Source) -> Value | None:
-    value = _input(source, 0)
+    value = input_value(source, 0)
     return None if value is None else value.as_number()
 
 
@@ -202,9 +203,9 @@ MATH: dict[str, Callable] = {
 
 
 def _math(source: Source) -> Value | None:
-    node, first, second = source.node, _input(source, 0), _input(source, 1)
+    node, first, second = source.node, input_value(source, 0), input_value(source, 1)
     if node.operation == "MULTIPLY_ADD":
-        result = combined(product(first, second), _input(source, 2), 1.0, 1.0)
+        result = combined(product(first, second), input_value(source, 2), 1.0, 1.0)
     else:
         result = _math_of(node.operation, first, second)
     return _clamped(result) if node.use_clamp else result
@@ -238,7 +239,7 @@ def _mix(source: Source) -> Value | None:
         else:
             return None
     blend = node.blend_type if getattr(node, "data_type", "RGBA") == "RGBA" else "MIX"
-    share, first, second = _input(source, factor), _input(source, first), _input(source, second)
+    share, first, second = input_value(source, factor), input_value(source, first), input_value(source, second)
     if share is None or not share.is_constant:
         return None
     share = float(share.offset[0])
@@ -254,7 +255,7 @@ def _mix(source: Source) -> Value | None:
 
 
 def _invert(source: Source) -> Value | None:
-    share, value = _input(source, 0), _input(source, 1)
+    share, value = input_value(source, 0), input_value(source, 1)
     if share is None or value is None or not share.is_constant:
         return None
     factor = float(share.offset[0])
@@ -262,14 +263,14 @@ def _invert(source: Source) -> Value | None:
 
 
 def _gamma(source: Source) -> Value | None:
-    color, power = _input(source, 0), _input(source, 1)
+    color, power = input_value(source, 0), input_value(source, 1)
     if color is None or power is None or not (color.is_constant and power.is_constant):
         return color if power is not None and power.is_constant and np.all(power.offset == 1.0) else None
     return constant(np.power(np.maximum(color.offset, 0.0), power.offset))
 
 
 def _ramp(source: Source) -> Value | None:
-    factor = _input(source, 0)
+    factor = input_value(source, 0)
     if factor is None or not factor.is_constant:
         return None
     color = source.node.color_ramp.evaluate(float(factor.offset[0]))
@@ -277,7 +278,7 @@ def _ramp(source: Source) -> Value | None:
 
 
 def _clamp(source: Source) -> Value | None:
-    value, low, high = (_input(source, index) for index in range(3))
+    value, low, high = (input_value(source, index) for index in range(3))
     if any(part is None or not part.is_constant for part in (value, low, high)):
         return None
     return replace(value, offset=np.clip(value.offset, low.offset, high.offset))

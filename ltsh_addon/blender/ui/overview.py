@@ -19,10 +19,9 @@ from ..lights.area import (
 from ..lights.area import (
     note_unsupported as note_unsupported_light,
 )
-from ..lights.emission import emission_behind
 from ..materials.aovs import notes_of_material
 from ..materials.bsdfs import bsdf_of, is_emission
-from ..materials.graph import material_output, shaders_behind
+from ..materials.graph import shaders_behind, surface_of
 from .preflight import glows, materials_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
@@ -69,23 +68,18 @@ def _light(ob) -> Entry:
     unseen = unseen_light(ob, matrix, inventory)
     note_unsupported_light(ob, matrix, inventory)
     notes = [note.partition(": ")[2] for note in inventory.warnings]
-    if unseen is not None and _varies(ob.data):
+    if unseen is not None and unseen.varies:
         notes.append("its emission varies, shaded as patches of constant radiance")
     return Entry(ob.name, kind, APPROXIMATED if notes else EXACT, tuple(notes))
 
 
-def _varies(light) -> bool:
-    output = light.node_tree.get_output_node("CYCLES") or light.node_tree.get_output_node("ALL")
-    return output is not None and emission_behind(light.node_tree, output.inputs["Surface"]).varies
-
-
 def _material(material) -> Entry:
-    output = material_output(material.node_tree) if material.node_tree is not None else None
-    if output is None:
+    surface = surface_of(material)
+    if surface is None:
         return Entry(material.name, "", EXACT)
-    shaders = shaders_behind(material.node_tree, output.inputs["Surface"])
+    shaders = shaders_behind(surface)
     # Whether it lights the scene is the kind of a material and no defect.
-    notes = tuple(dict.fromkeys(notes_of_material(material.node_tree, output, shaders, emitter=True)))
+    notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = APPROXIMATED if notes else EXACT
     return Entry(

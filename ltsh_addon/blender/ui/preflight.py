@@ -14,8 +14,7 @@ from bpy.props import StringProperty
 
 from ...scene import error_line
 from ..extract.bake import ObjectError, check_object
-from ..lights.emission import emission_behind
-from ..materials.graph import material_output
+from ..lights.emission import emission_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 
 
@@ -163,8 +162,7 @@ def materials_of(scene) -> list:
 
 def glows(material) -> bool:
     """True where the surface of the material may emit light."""
-    output = material_output(material.node_tree) if material.node_tree is not None else None
-    return output is not None and emission_behind(material.node_tree, output.inputs["Surface"]).emits
+    return emission_of(material).emits
 
 
 def _files(settings) -> list[Problem]:

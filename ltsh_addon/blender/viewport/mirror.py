@@ -23,13 +23,13 @@ from ..evaluated import (
     visibility,
 )
 from ..lights.area import area_light, note_unsupported, reason_to_leave_out
-from ..lights.emission import Emission, emission_behind
+from ..lights.emission import emission_of
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import ShownTextures
-from ..materials.graph import material_output, source_of
+from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
-from ..materials.values import product, value_at
+from ..materials.values import input_value, product
 from .meshes import MeshBatches, mesh_batches
 from .textures import look_values, uniform_buffer
 
@@ -101,19 +101,14 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
 
 def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str]) -> list[AreaLight]:
     """`light` with what constants and images in its node tree make of it."""
-    tree = data.node_tree if bpy.app.version >= (5, 0, 0) or data.use_nodes else None
-    if tree is None:
+    if tree_in_use(data) is None or emission_of(data).plain:
         return [light]
-    output = material_output(tree)
-    emission = emission_behind(tree, output.inputs["Surface"]) if output is not None else Emission()
-    if emission.plain:
-        return [light]
-    source = source_of(tree, output.inputs["Surface"]) if output is not None else None
+    surface = surface_of(data)
+    source = source_of(surface) if surface is not None else None
     if source is None or source.node is None:
         return []
     if source.node.bl_idname == "ShaderNodeEmission":
-        inputs = (source.node.inputs[name] for name in ("Color", "Strength"))
-        factor = product(*(value_at(source.tree, socket, source.groups) for socket in inputs))
+        factor = product(input_value(source, "Color"), input_value(source, "Strength"))
         if factor is not None and factor.is_constant:
             return [replace(light, radiance=light.radiance * factor.offset)]
         patches = None if factor is None else textures.split(light, factor, notes)

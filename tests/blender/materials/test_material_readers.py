@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.blender.lights.emission import emission_behind
+from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.materials.aovs import inject_aovs
 from ltsh_addon.blender.materials.looks import COAT, look_of
 from ltsh_addon.blender.ui import overview
@@ -361,7 +361,7 @@ def test_lights_and_the_viewport_see_the_same_emission_in_groups(kind):
 
     (both,) = build.group(fill, [build.leaf(0.1)], kind)
     build.link(both, build.output.inputs["Surface"])
-    found = emission_behind(build.tree, build.output.inputs["Surface"])
+    found = emission_of(build.material)
     assert found.emits and not (found.plain or found.varies or found.directional)
     # Transparency takes half of what shines and nothing of what is lit.
     np.testing.assert_allclose(look_of(build.material).emission, np.array([1.0, 0.5, 0.5]) * 0.125, rtol=1e-6)
@@ -378,5 +378,5 @@ def test_no_reader_but_aovs_changes_a_material():
     before, count = state(), len(bpy.data.node_groups)
     look_of(build.material)
     overview._material(build.material)
-    emission_behind(build.tree, build.output.inputs["Surface"])
+    emission_of(build.material)
     assert state() == before and len(bpy.data.node_groups) == count

@@ -11,7 +11,7 @@ from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
 from .graph import Factor, Leaf, Source, SurfaceShaders, shaders_behind, source_of, surface_of, tree_in_use
-from .values import ImageUse, Value, constant, input_value, value_at
+from .values import ImageUse, Value, constant, constant_inputs, input_value, value_at
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
@@ -176,12 +176,12 @@ def _view_factor(source: Source | None) -> ViewFactor | None:
     """What a Fresnel or Layer Weight node with a constant number and the smooth normal says."""
     if source is None or source.node is None or source.node.bl_idname not in VIEW_FACTORS:
         return None
-    normal, parameter = source.input("Normal"), input_value(source, 0)
-    if normal is None or normal.node is not None or parameter is None or not parameter.is_constant:
+    normal, parameter = source.input("Normal"), constant_inputs(source, 0)
+    if normal is None or normal.node is not None or parameter is None:
         return None
     is_blend = source.node.bl_idname == "ShaderNodeLayerWeight"
     kind = source.socket.name.lower() if is_blend else "fresnel"
-    return ViewFactor.of(kind, float(parameter.offset[0]), is_blend)
+    return ViewFactor.of(kind, float(parameter[0][0]), is_blend)
 
 
 class _Reader:
@@ -271,8 +271,8 @@ class _Reader:
         if bsdf.kind == "sheen":
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF")
         if bsdf.kind == "principled":
-            weight = input_value(source, "Sheen Weight")
-            if weight is None or not weight.is_constant or weight.offset[0] > 0.0:
+            weight = constant_inputs(source, "Sheen Weight")
+            if weight is None or weight[0][0] > 0.0:
                 self.note("sheen is not shown")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
@@ -328,14 +328,14 @@ class _Reader:
         if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
             self.note(f"normals from {node.name!r} are not resolved")
             return None, 1.0
-        color, strength = (input_value(normal, name) for name in ("Color", "Strength"))
+        color, strength = input_value(normal, "Color"), constant_inputs(normal, "Strength")
         maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
-        if color is None or strength is None or not strength.is_constant or len(maps - {""}) > 1:
+        if color is None or strength is None or len(maps - {""}) > 1:
             self.note(f"normals from {node.name!r} are not resolved")
             return None, 1.0
         if color.image is None:
             return None, 1.0
-        return color, float(strength.offset[0])
+        return color, float(strength[0][0])
 
     def _emission(self, source: Source) -> np.ndarray:
         parts = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
@@ -361,7 +361,7 @@ def world_radiance(world) -> tuple[np.ndarray, bool]:
     if source is None or source.node is None:
         return np.zeros(3), True
     if source.node.bl_idname == "ShaderNodeBackground":
-        parts = [input_value(source, name) for name in ("Color", "Strength")]
-        if all(part is not None and part.is_constant for part in parts):
-            return parts[0].offset * parts[1].offset, True
+        parts = constant_inputs(source, "Color", "Strength")
+        if parts is not None:
+            return parts[0] * parts[1], True
     return np.array(world.color, np.float64), False

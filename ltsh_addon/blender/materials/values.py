@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -106,6 +106,12 @@ def input_value(source: Source, name) -> Value | None:
     return value_at(source.node.inputs[name], source.groups)
 
 
+def constant_inputs(source: Source, *names) -> list[np.ndarray] | None:
+    """The constants (3,) at inputs of the node of `source`; None where one of them is no constant."""
+    values = [input_value(source, name) for name in names]
+    return [value.offset for value in values] if all(value and value.is_constant for value in values) else None
+
+
 def _own_value(source: Source) -> Value:
     return constant(source.node.outputs[0].default_value)
 
@@ -147,16 +153,14 @@ def coordinates(source: Source | None):
     if node.bl_idname != "ShaderNodeMapping" or node.vector_type not in ("POINT", "TEXTURE"):
         return None
     inner = coordinates(source.input("Vector"))
-    parts = [input_value(source, name) for name in ("Location", "Rotation", "Scale")]
-    if inner is None or any(part is None or not part.is_constant for part in parts):
+    parts = constant_inputs(source, "Location", "Rotation", "Scale")
+    if inner is None or parts is None or np.any(parts[1][:2] != 0.0):
         return None
-    return inner[0], _mapping(node.vector_type, *(part.offset for part in parts), inner[1])
+    return inner[0], _mapping(node.vector_type, *parts, inner[1])
 
 
 def _mapping(kind: str, location, rotation, scale, inner):
-    """The affine map (2, 3) of a Mapping node after `inner`; None where it turns out of the plane."""
-    if rotation[0] != 0.0 or rotation[1] != 0.0:
-        return inner
+    """The affine map (2, 3) of a Mapping node that stays in the plane, after `inner`."""
     cosine, sine = math.cos(rotation[2]), math.sin(rotation[2])
     turned = [[cosine * scale[0], -sine * scale[1]], [sine * scale[0], cosine * scale[1]]]
     own = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
@@ -179,10 +183,8 @@ def _separate(source: Source) -> Value | None:
 def _combine(source: Source) -> Value | None:
     if getattr(source.node, "mode", "RGB") != "RGB":
         return None
-    parts = [input_value(source, index) for index in range(3)]
-    if any(part is None or not part.is_constant for part in parts):
-        return None
-    return constant([part.offset[0] for part in parts])
+    parts = constant_inputs(source, 0, 1, 2)
+    return None if parts is None else constant([part[0] for part in parts])
 
 
 def _to_number(source: Source) -> Value | None:
@@ -239,10 +241,10 @@ def _mix(source: Source) -> Value | None:
         else:
             return None
     blend = node.blend_type if getattr(node, "data_type", "RGBA") == "RGBA" else "MIX"
-    share, first, second = input_value(source, factor), input_value(source, first), input_value(source, second)
-    if share is None or not share.is_constant:
+    shares, first, second = constant_inputs(source, factor), input_value(source, first), input_value(source, second)
+    if shares is None:
         return None
-    share = float(share.offset[0])
+    share = float(shares[0][0])
     if getattr(node, "clamp_factor", True):
         share = min(max(share, 0.0), 1.0)
     if blend == "MIX":
@@ -255,33 +257,31 @@ def _mix(source: Source) -> Value | None:
 
 
 def _invert(source: Source) -> Value | None:
-    share, value = input_value(source, 0), input_value(source, 1)
-    if share is None or value is None or not share.is_constant:
+    shares, value = constant_inputs(source, 0), input_value(source, 1)
+    if shares is None or value is None:
         return None
-    factor = float(share.offset[0])
+    factor = float(shares[0][0])
     return value.mapped((1.0 - 2.0 * factor) * np.eye(3), factor)
 
 
 def _gamma(source: Source) -> Value | None:
-    color, power = input_value(source, 0), input_value(source, 1)
-    if color is None or power is None or not (color.is_constant and power.is_constant):
-        return color if power is not None and power.is_constant and np.all(power.offset == 1.0) else None
-    return constant(np.power(np.maximum(color.offset, 0.0), power.offset))
+    power, both = constant_inputs(source, 1), constant_inputs(source, 0, 1)
+    if both is None:
+        return input_value(source, 0) if power is not None and np.all(power[0] == 1.0) else None
+    return constant(np.power(np.maximum(both[0], 0.0), both[1]))
 
 
 def _ramp(source: Source) -> Value | None:
-    factor = input_value(source, 0)
-    if factor is None or not factor.is_constant:
+    factor = constant_inputs(source, 0)
+    if factor is None:
         return None
-    color = source.node.color_ramp.evaluate(float(factor.offset[0]))
+    color = source.node.color_ramp.evaluate(float(factor[0][0]))
     return constant(color[3]) if source.socket.name == "Alpha" else constant(color)
 
 
 def _clamp(source: Source) -> Value | None:
-    value, low, high = (input_value(source, index) for index in range(3))
-    if any(part is None or not part.is_constant for part in (value, low, high)):
-        return None
-    return replace(value, offset=np.clip(value.offset, low.offset, high.offset))
+    parts = constant_inputs(source, 0, 1, 2)
+    return None if parts is None else constant(np.clip(*parts))
 
 
 READERS: dict[str, Callable[[Source], Value | None]] = {

@@ -155,6 +155,15 @@ def test_what_is_not_resolved_has_the_viewport_color_and_is_named():
     assert look.notes == ("Marble: Base Color is not resolved",)
 
 
+def test_an_image_that_is_turned_out_of_its_plane_is_not_resolved():
+    parts.empty_scene()
+    material = clipped_and_mapped()
+    assert look_of(material).notes == ()
+    (mapping,) = (node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeMapping")
+    mapping.inputs["Rotation"].default_value = (0.5, 0.0, 0.0)
+    assert look_of(material).notes == (f"{material.name}: Base Color is not resolved",)
+
+
 @pytest.mark.parametrize(
     ("node_type", "said"),
     [("ShaderNodeBsdfHair", "Hair"), ("ShaderNodeBsdfRefraction", "Refraction")],

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
+from ...cycles.closures import sheen_albedo
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
@@ -72,6 +73,7 @@ class Look:
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_stand_in: bool = False  # of a node that is not shaded
+    albedo: float = 1.0  # of sheen: the mean over all views, by which its color is shown
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -102,6 +104,12 @@ def is_missing(image) -> bool:
 def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
     """A diffuse surface."""
     return Look("diffuse", {"color": constant(color)}, notes=notes)
+
+
+def mean_sheen_albedo(roughness: float) -> float:
+    """Share of uniform light that sheen of `roughness` reflects."""
+    cosine = (np.arange(64) + 0.5) / 64.0
+    return float(np.average(sheen_albedo(cosine, np.full(64, roughness)), weights=cosine))
 
 
 def default_look() -> Look:
@@ -268,8 +276,6 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
-        if bsdf.kind == "sheen":
-            self.note(f"{node.bl_label} is shown as a Diffuse BSDF")
         if bsdf.kind == "principled":
             weight = constant_inputs(source, "Sheen Weight")
             if weight is None or weight[0][0] > 0.0:
@@ -277,6 +283,10 @@ class _Reader:
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
+        if bsdf.kind == "sheen":
+            self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
+            roughness = values["roughness"]
+            look = replace(look, albedo=mean_sheen_albedo(roughness.offset[0] if roughness.is_constant else 0.5))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look

@@ -298,7 +298,7 @@ def look_values(look: Look) -> np.ndarray:
         if value is not None:
             start = FIRST_SLOT + SLOT_SIZE * position
             data[start : start + SLOT_SIZE] = _slot_values(value)
-    data[LAYERS, 0] = look.weight
+    data[LAYERS, 0] = look.weight * look.albedo
     if look.view_factor is not None:
         factor = look.view_factor
         data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement

@@ -9,6 +9,7 @@ from view_pictures import image, normal_map, patches_too_far
 from ltsh_addon import shading
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.materials.looks import look_of
+from ltsh_addon.cycles.closures import sheen_albedo
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 
@@ -170,6 +171,19 @@ def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter
     look = look_of(material)
     np.testing.assert_allclose(look.emission, 0.5, rtol=1e-6)
     assert look.weight == 1.0
+
+
+def test_microfiber_sheen_reflects_what_it_does_on_average_and_is_named():
+    parts.empty_scene()
+    material, node = parts.bsdf_material("ShaderNodeBsdfSheen", "Velvet", Roughness=0.4)
+    node.distribution = "MICROFIBER"
+    look = look_of(material)
+    # Views that are as frequent as uniform light makes them: their cosine is the root of a uniform number.
+    cosine = np.sqrt(np.random.default_rng(1).random(100_000))
+    wanted = sheen_albedo(cosine, np.full(len(cosine), 0.4))
+    assert look.kind == "sheen" and look.weight == 1.0
+    assert look.albedo == pytest.approx(wanted.mean(), abs=5.0 * wanted.std() / len(wanted) ** 0.5)
+    assert look.notes == ("Velvet: Sheen BSDF is shown as a Diffuse BSDF of its mean albedo",)
 
 
 def test_mixed_shaders_are_lobes_with_their_shares():

@@ -61,7 +61,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     tree = material.node_tree
     output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
     surface = output.inputs["Surface"]
-    shaders = shaders_behind(surface, tree_of=_OwnTrees())
+    shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
     cut(output.inputs["Volume"])
@@ -129,17 +129,11 @@ def _tracing_nodes(tree) -> list:
     return found
 
 
-class _OwnTrees:
-    """Gives group nodes node trees without other users, each once."""
-
-    def __init__(self):
-        self._owned: set = set()
-
-    def __call__(self, group):
-        if group not in self._owned and group.node_tree is not None:
-            group.node_tree = group.node_tree.copy()
-            self._owned.add(group)
-        return group.node_tree
+def _own_tree(group):
+    """The node tree of a group node, which gets one without other users."""
+    if group.node_tree is not None:
+        group.node_tree = group.node_tree.copy()
+    return group.node_tree
 
 
 class _Weights:

@@ -146,15 +146,13 @@ def emission_sockets(node) -> tuple:
     return () if prefix is None else (node.inputs[f"{prefix}Color"], node.inputs[f"{prefix}Strength"])
 
 
-def is_dark(node) -> bool:
-    """True where a node of `emission_sockets` certainly emits nothing."""
-    color, strength = (value_of(socket) for socket in emission_sockets(node))
-    return (not is_socket(strength) and strength == 0.0) or (not is_socket(color) and not any(color[:3]))
-
-
 def emits(node) -> bool:
-    """True for nodes that shine into the scene."""
-    return bool(emission_sockets(node)) and not is_dark(node)
+    """True for nodes that may shine into the scene."""
+    sockets = emission_sockets(node)
+    if not sockets:
+        return False
+    color, strength = (value_of(socket) for socket in sockets)
+    return (is_socket(color) or any(color[:3])) and (is_socket(strength) or strength != 0.0)
 
 
 def is_emission(node) -> bool:

@@ -6,6 +6,7 @@ the overview in the panels. It changes nothing.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -101,17 +102,16 @@ class Source:
         return source_of(self.node.inputs[name], self.groups)
 
 
-def _own_tree(group):
-    return group.node_tree
+NODE_TREE = operator.attrgetter("node_tree")
 
 
-def source_of(socket, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+def source_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> Source | None:
     """What feeds the input `socket` inside of `groups`; None where a group has no inside or no outside."""
     link = live_link(socket)
     return Source(socket, None, groups) if link is None else source_behind(link.from_socket, groups, tree_of)
 
 
-def source_behind(output, groups: tuple = (), tree_of: Callable = _own_tree) -> Source | None:
+def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> Source | None:
     """What the `output` of a node comes from, past groups, reroutes and muted nodes; None as in `source_of`.
 
     `tree_of(group node)` is the node tree of a group that is entered.
@@ -228,7 +228,7 @@ class SurfaceShaders:
         self.cuts += [cut for cut in other.cuts if cut not in self.cuts]
 
 
-def shaders_behind(socket, groups: tuple = (), tree_of: Callable = _own_tree) -> SurfaceShaders:
+def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> SurfaceShaders:
     """The shader nodes behind the input `socket`, with their weights.
 
     A node that is reached twice is one leaf. A mix by a constant 0 or 1 is the one shader, a sum with an open input the

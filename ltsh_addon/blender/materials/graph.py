@@ -6,6 +6,7 @@ the overview in the panels. It changes nothing.
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -190,13 +191,8 @@ class Leaf:
     @property
     def bound(self) -> float:
         """No weight of its lobes is larger, as far as constants tell."""
-        found = 0.0
-        for term in self.lobe_terms:
-            product = 1.0
-            for factor in term:
-                product *= 1.0 if factor.constant is None else factor.constant
-            found += product
-        return found
+        terms = ([factor.constant for factor in term] for term in self.lobe_terms)
+        return sum(math.prod(value for value in term if value is not None) for term in terms)
 
 
 @dataclass(frozen=True)
@@ -251,16 +247,16 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
         if len(sockets) == 1:
             return shaders_behind(sockets[0], groups, tree_of)
     parts = [shaders_behind(socket, groups, tree_of) for socket in sockets]
-    found = SurfaceShaders(is_transparent=bool(parts) and all(part.is_transparent for part in parts))
-    if not found.is_transparent:
-        for index, part in enumerate(parts):
-            other = sockets[1 - index]
-            if part.is_transparent and live_link(other) is not None:
-                found.cuts.append(Cut(node, sockets[index], other))
-    cuts_here = bool(found.cuts)
+    clear = [part.is_transparent for part in parts]
+    found = SurfaceShaders(is_transparent=bool(parts) and all(clear))
+    if any(clear) and not all(clear):
+        first, second = sockets if clear[0] else reversed(sockets)
+        if live_link(second) is not None:
+            found.cuts.append(Cut(node, first, second))
+    is_cut = bool(found.cuts)
     for index, part in enumerate(parts):
-        factors = (Factor(node, groups, index == 0, cuts_here),) if node.bl_idname == MIX else ()
-        if not (cuts_here and part.is_transparent):
+        factors = (Factor(node, groups, index == 0, is_cut),) if node.bl_idname == MIX else ()
+        if not (is_cut and part.is_transparent):
             found._add(part, *factors)
     return found
 

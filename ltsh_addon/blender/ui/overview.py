@@ -81,13 +81,8 @@ def _material(material) -> Entry:
     # Whether it lights the scene is the kind of a material and no defect.
     notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
-    state = APPROXIMATED if notes else EXACT
-    return Entry(
-        material.name,
-        "emissive" if glows(material) else "",
-        LEFT_OUT if shaders.leaves and not any(shown) else state,
-        notes,
-    )
+    state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT
+    return Entry(material.name, "emissive" if glows(material) else "", state, notes)
 
 
 @bpy.app.handlers.persistent

@@ -15,6 +15,8 @@ GLASS_NODES = 16
 NORMALS_PER_AXIS = 24
 SMALLEST_COSINE = 1e-4
 MAX_F0 = 0.99
+# Constant and slope of the fit in `dielectric_average`.
+DIELECTRIC_AVERAGE = 4.08567, 1.00071
 
 
 @dataclass(frozen=True)
@@ -159,8 +161,9 @@ def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
     """Integral of 2 c F(c) of a dielectric, by the fit of Kulla and Conty 2017 ("Revisiting physically based shading at
     Imageworks"), which Cycles uses; good to 0.006 for an `ior` of 1 to 3."""
+    start, slope = DIELECTRIC_AVERAGE
     below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607))
-    return np.where(ior < 1.0, below, (ior - 1.0) / (4.08567 + 1.00071 * ior))
+    return np.where(ior < 1.0, below, (ior - 1.0) / (start + slope * ior))
 
 
 def dielectric_blend_average(f0: np.ndarray, ior: np.ndarray) -> np.ndarray:

@@ -21,6 +21,8 @@ import numpy as np
 # Half angle in rad below which Cycles takes the series of tan h - h.
 _SERIES = 0.05
 WIDTH_RANGE = (1e-4, 1e3)
+# A round light is a polygon of the same area, whose corners stand out a little.
+ROUND_MARGIN = 1.02
 
 
 def cone(spread: float) -> tuple[float, float]:
@@ -79,8 +81,7 @@ def _place_in_cone(light, position):
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
     beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
-    # A round light is a polygon of the same area, whose corners stand out a little.
-    extent = 1.02 * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
+    extent = ROUND_MARGIN * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
     return extent, cone(light.spread)[0] * distance, beside
 
 

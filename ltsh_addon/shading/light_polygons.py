@@ -19,7 +19,7 @@ MOSTLY_WHOLE = 0.6
 # 32 corners are within 0.1 % of an ellipse, and so on.
 ROUND_CORNERS = (32, 64, 128, 256)
 ROUND_LIMITS = (8.0, 40.0, 300.0)
-_FOCUSED_ROUND_CORNERS = (32, 64)
+FOCUSED_ROUND_CORNERS = (32, 64)
 
 
 def light_levels(light, corners, position, width):
@@ -31,7 +31,7 @@ def light_levels(light, corners, position, width):
     if light.is_focused:
         for effort, chosen in light_cone.efforts(light, position, width):
             if light.is_round:
-                corners = light.polygon(_FOCUSED_ROUND_CORNERS[effort.chords > 2])
+                corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
                 effort = replace(effort, chords=2)
             yield corners, effort, chosen
     elif light.is_round:

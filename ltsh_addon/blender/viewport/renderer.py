@@ -6,69 +6,26 @@ from dataclasses import dataclass, replace
 
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 
+from ...shading.header import definitions
 from ..materials.values import Value
 from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
+from .shaders import glsl, pixel_shader
 from .surfaces import SurfacePass, View, has_bent_lobes
 from .textures import GBufferTextures, UploadedLights, upload_lights
 
 MODES = ("single", "split", "difference")
-_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
-_VERTEX = """
-void main()
-{
-  gl_Position = vec4(corner, 0.0, 1.0);
-}
-"""
-# Red is brighter, blue darker, white equal, as in `imaging.false_color`.
-_FRAGMENT = """
-vec4 over_background(vec4 lit)
-{
-  float alpha = mix(lit.a, 1.0, background.a);
-  return vec4(lit.rgb * scales.x + background.rgb * (1.0 - lit.a), alpha);
-}
-
-void main()
-{
-  ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
-  vec4 first = texelFetch(first_picture, texel, 0);
-  vec4 second = texelFetch(second_picture, texel, 0);
-  second.a = min(first.a, second.a);
-  color = over_background(first);
-  if (place.z == 1) {
-    float beyond = float(texel.x) + 0.5 - scales.z;
-    color = beyond > 0.0 ? over_background(second) : color;
-    color = abs(beyond) <= scales.w ? vec4(vec3(0.8), 1.0) : color;
-  }
-  else if (place.z == 2) {
-    float difference = dot(first.rgb - second.rgb, vec3(1.0 / 3.0)) * scales.x / scales.y;
-    float strength = clamp(abs(difference), 0.0, 1.0);
-    vec3 side = difference > 0.0 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 0.0, 1.0);
-    color = vec4((second.a > 0.0 ? mix(vec3(1.0), side, strength) : vec3(0.2)) * white, 1.0);
-  }
-}
-"""
 
 
 class PicturePass:
     """Draws one or two pictures into what is bound; needs an active GPU context."""
 
     def __init__(self):
-        info = gpu.types.GPUShaderCreateInfo()
-        info.vertex_in(0, "VEC2", "corner")
-        info.fragment_out(0, "VEC4", "color")
-        info.push_constant("IVEC4", "place")
-        info.push_constant("VEC4", "scales")
-        info.push_constant("VEC4", "background")
-        info.push_constant("FLOAT", "white")
-        info.sampler(0, "FLOAT_2D", "first_picture")
-        info.sampler(1, "FLOAT_2D", "second_picture")
-        info.vertex_source(_VERTEX)
-        info.fragment_source(_FRAGMENT)
-        self._shader = gpu.shader.create_from_info(info)
-        self._batch = batch_for_shader(self._shader, "TRIS", {"corner": _TRIANGLE})
+        constants = {"place": "IVEC4", "scales": "VEC4", "background": "VEC4", "white": "FLOAT"}
+        modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
+        source = modes + glsl("picture")
+        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture"), constants)
 
     def draw(
         self,
@@ -115,7 +72,7 @@ class ShownPicture:
 
     technique: str
     passes: str  # combined, specular or diffuse
-    mode: str  # of `picture_pass.MODES`
+    mode: str  # of MODES
     second_technique: str
     split: float
     difference_scale: float

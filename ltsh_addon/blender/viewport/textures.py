@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import gpu
 import numpy as np
 
-from ...cycles import closures
+from ...cycles import closures, horizons
 from ...cycles.lobes import LOBE_KINDS
 from ...scene import AreaLight, SurfaceSamples
 from ...shading import light_cone, moments32
@@ -275,8 +275,18 @@ VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
     **{name.upper(): str(int(number)) for name, number in KINDS.items()},
-    **{"FIRST_SLOT": str(FIRST_SLOT), "SLOT_SIZE": str(SLOT_SIZE), "FIRST_TERM": str(FIRST_TERM)},
+    **{f"{name.upper()}_SLOT": str(position) for position, name in enumerate(IMAGE_SLOTS)},
+    **{f"EXTENSION_{name}": str(position) for position, name in enumerate(EXTENSIONS)},
+    "EXTENSIONS": str(len(EXTENSIONS)),
+    "FIRST_SLOT": str(FIRST_SLOT),
+    "SLOT_SIZE": str(SLOT_SIZE),
+    "FIRST_TERM": str(FIRST_TERM),
     "LAYERS": str(LAYERS),
+    "MAX_F0": str(closures.MAX_F0),
+    "AVERAGE_START": str(closures.DIELECTRIC_AVERAGE[0]),
+    "AVERAGE_SLOPE": str(closures.DIELECTRIC_AVERAGE[1]),
+    "ELEVATION_SHARE": str(horizons.ELEVATION_SHARE),
+    "MINIMUM_REFLECTION_ELEVATION": str(horizons.MINIMUM_REFLECTION_ELEVATION),
 }
 
 
@@ -321,7 +331,7 @@ def _slot_values(value: Value) -> np.ndarray:
         rows[:3], rows[3, 3] = value.matrix, 1.0
         rows[4:6, :3] = use.mapping
         rows[4, 3] = use.closest
-        rows[5, 3] = EXTENSIONS.index(use.extension) + 4 * is_encoded(use.image)
+        rows[5, 3] = EXTENSIONS.index(use.extension) + len(EXTENSIONS) * is_encoded(use.image)
     return rows
 
 

@@ -11,10 +11,9 @@ import numpy as np
 from ..scene import PASSES, REFERENCE, AreaLight, SurfaceSamples
 from . import float32, float64, light_cone, moments32, parallel
 from .light_polygons import fitting_patches
+from .lobes import FLOAT64_CHUNK
 from .lookup_table import LookupTable, load_table
 
-# Double precision arrays of this many samples stay in the cache.
-DOUBLE_CHUNK = 4096
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
 # In single precision for degree 0, and that for every degree more.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
@@ -91,8 +90,8 @@ class Task:
             if "specular" in radiance:
                 float32.shade_specular(samples, prepared, self.table, radiance["specular"], scratch)
             return
-        for start in range(0, len(samples), DOUBLE_CHUNK):
-            chunk = slice(start, start + DOUBLE_CHUNK)
+        for start in range(0, len(samples), FLOAT64_CHUNK):
+            chunk = slice(start, start + FLOAT64_CHUNK)
             part = samples.take(chunk)
             views = {name: values[:, chunk] for name, values in radiance.items()}
             if "diffuse" in views:

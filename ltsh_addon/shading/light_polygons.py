@@ -89,7 +89,7 @@ def _along(rows, vector, out, scratch):
 
 
 def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
-    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of fragile points.
+    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of points that need float64.
 
     A point sees the part of its polygon where all coordinates `clip_rows` are positive, if it is `facing` (P,) it.
     `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
@@ -105,18 +105,18 @@ def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count:
     for row in clip_rows:
         partly = partly & (np.maximum.reduce(corners[row], axis=0) > 0.0)
     cut = np.nonzero(partly & ~whole)[0]
-    values, fragile = np.zeros((count, points), np.float32), np.zeros(points, bool)
+    values, needs_float64 = np.zeros((count, points), np.float32), np.zeros(points, bool)
     if seen_whole > MOSTLY_WHOLE * points:
         found, mask = integrate(corners, None)
         np.multiply(found, whole, out=values)
-        np.logical_and(mask, whole, out=fragile)
+        np.logical_and(mask, whole, out=needs_float64)
     elif seen_whole:
         index = np.nonzero(whole)[0]
-        values[:, index], fragile[index] = integrate(np.take(corners, index, axis=2), index)
+        values[:, index], needs_float64[index] = integrate(np.take(corners, index, axis=2), index)
     if len(cut):
         for index, polygons in _clipped(np.take(corners, cut, axis=2), clip_rows):
-            values[:, cut[index]], fragile[cut[index]] = integrate(polygons, cut[index])
-    return values, fragile
+            values[:, cut[index]], needs_float64[cut[index]] = integrate(polygons, cut[index])
+    return values, needs_float64
 
 
 def _clipped(corners, clip_rows):

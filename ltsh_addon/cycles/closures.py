@@ -250,7 +250,7 @@ def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, c
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """E (Q,) and its average (Q,) over the directions, as Cycles interpolates them."""
-    directional, average = _albedo_tables()
+    directional, average = albedo_tables()
     return _interpolate(directional, roughness, cosine), _interpolate(average, roughness)
 
 
@@ -261,7 +261,8 @@ def dielectric_albedo(f0: np.ndarray, ior: np.ndarray, roughness: np.ndarray, co
 
 
 @cache
-def _albedo_tables():
+def albedo_tables() -> tuple[np.ndarray, np.ndarray]:
+    """E (N, N) by roughness and cosine, and its average (N,) by roughness, at uniform nodes over [0, 1]."""
     table = shading.load_table("ltsh4")
     nodes = np.clip(np.linspace(0.0, 1.0, ALBEDO_NODES), SMALLEST_COSINE, 1.0)
     roughness, cosine = np.meshgrid(nodes, nodes, indexing="ij")

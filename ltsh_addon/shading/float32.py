@@ -1,7 +1,8 @@
-"""Shading in float32, which hands pairs of sample and light that it may get wrong to float64.
+"""The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
 
-Per block of samples: the axes of their lobes and what weights them, the corners of every light along those axes, the
-integrals over what is above the horizons, the sum of the lights.
+The warp and, for "ltc", the tilt of the lobe are multiplied into the local frame of a sample once, for all lights: a
+light's corners come out of one product. What single precision cannot do is left to `float64`, per block: points so
+close to a light's plane that an edge spans half a circle, tiny lights, sharp lobes.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Shading in double precision: exact polygons, any degree, and the reference quadrature.
 
-`single_precision` is the fast path; the points for which that is not accurate come here.
+`float32` is the fast path; the points for which that is not accurate come here.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from .reference import reference_integrals
 
 # Of the roughness by which the effort for a lobe is chosen.
 LEAST_ROUGHNESS = 1e-3
+
 
 @dataclass(frozen=True)
 class LightOfEachSample:

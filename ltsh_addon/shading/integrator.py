@@ -1,4 +1,7 @@
-"""`shade`: samples and lights in, radiance per light group out, block by block."""
+"""`shade`: samples and lights in, radiance per light group out, block by block.
+
+A block is shaded by a `Task`, which is the same in this process and in a worker process.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,10 @@ from .light_polygons import fitting_patches
 from .lobes import FLOAT64_CHUNK
 from .lookup_table import LookupTable, load_table
 
+# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
+# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
+BLOCK_LIMITS = (24592, 49184)
+REFERENCE_BLOCK_LIMITS = (256, 2048)
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
 # In single precision for degree 0, and that for every degree more.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
@@ -108,12 +115,6 @@ def _corners_integrated(light, is_reference):
         effort = light_cone.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
-
-
-# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
-# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
-BLOCK_LIMITS = (24592, 49184)
-REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from functools import cache
 
 import numpy as np
 
+from .polygon import dot
+
 # Half angle in rad below which Cycles takes the series of tan h - h.
 _SERIES = 0.05
 WIDTH_RANGE = (1e-4, 1e3)
@@ -100,8 +102,8 @@ class LightView:
     def of(cls, light, offset, along) -> LightView:
         """From the offsets (3, P) of the light's center, and along(vector (3,)) -> (C, P), its coordinates."""
         axes = plane_axes(light)
-        distance = -_scaled(offset, light.direction)
-        center = np.stack([_scaled(offset, axis) for axis in axes])
+        distance = -dot(offset, light.direction.astype(offset.dtype))
+        center = np.stack([dot(offset, axis) for axis in axes.astype(offset.dtype)])
         extent = tuple(float(np.sqrt((half**2).sum())) for half in (light.half_u, light.half_v))
         foot = -distance * along(light.direction)
         return cls(distance, center, extent, foot, along(axes[0]), along(axes[1]))
@@ -276,9 +278,3 @@ def _dot(a, b):
 
 def _cross(a, b):
     return a[0] * b[1] - a[1] * b[0]
-
-
-def _scaled(vectors, direction):
-    """Products (P,) of vectors (3, P) with one vector (3,), in the type of the first."""
-    x, y, z = direction.astype(vectors.dtype)
-    return vectors[0] * x + vectors[1] * y + vectors[2] * z

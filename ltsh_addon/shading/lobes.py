@@ -1,4 +1,8 @@
-"""The lobe of a table: its value in a direction, its integral over a polygon."""
+"""Linearly transformed lobes: their values, and their integrals over polygons in closed form.
+
+LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and Peters 2021: both integrate the
+original distribution over the transformed polygon, which is clipped at the horizon first.
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,9 @@
-"""The hot path in float32: moments of polygons, and tables that weight them. Equation numbers are the paper's.
+"""The hot path in float32: moments of polygons, and the tables that weight them.
 
-Where single precision fails, functions report it: the mask `needs_float64` tells points that `float64` has to compute.
-Arrays that are needed for a moment come from a `Scratch` and are overwritten by the next call.
+The moments are those of `edge_integrals`, as coefficients of forms, from the cosines of the edges instead of the sums
+of their ends, and without any branch. Where that is not accurate the mask `needs_float64` tells so: the caller computes
+these points again in double precision. Arrays that are needed for a moment come from a `Scratch`, whose next user
+overwrites them.
 """
 
 from __future__ import annotations
@@ -319,9 +321,12 @@ def weighted_moments(
 
 @dataclass(frozen=True)
 class RidgeTable:
-    """One table; `fetch` interpolates chosen vectors of its weights.
+    """One table, ready for the hot path; `fetch` interpolates chosen vectors of its weights.
 
-    A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each sample's own IOR.
+    Coefficients of spherical harmonics become weights of the moments once, at the nodes of the table: both steps are
+    linear, so they may change places with the interpolation. Only those Fresnel curves are fetched that a batch of
+    points needs. A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each
+    sample's own IOR.
     """
 
     source: LookupTable

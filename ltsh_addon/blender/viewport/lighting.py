@@ -1,4 +1,7 @@
-"""The second pass: light of all samples, and what horizons leave of lobes."""
+"""The second pass: reflected radiance of a G-buffer under area lights, and before it which horizons end its lobes.
+
+Same lights, tables and integrals as `shading.shade`, in float32 throughout.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,10 @@ _RESULTS = {BRIGHTNESS: "brightnesses", EXCESS: "excesses", CHOICE: "horizons"}
 
 
 class HorizonPass:
-    """The choice for one view; needs an active GPU context."""
+    """Chooses per pixel which horizon ends the specular lobe, as `cycles.horizons` does for samples.
+
+    Needs an active GPU context.
+    """
 
     def __init__(self):
         self._shaders = {step: horizon_shader(step) for step in _RESULTS}

@@ -1,4 +1,4 @@
-"""A picture of the mirrored scene: surfaces, light, then what the view shows of it."""
+"""One frame of a view: G-buffer, lighting, picture. What has not changed is not drawn again."""
 
 from __future__ import annotations
 

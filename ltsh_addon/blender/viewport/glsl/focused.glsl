@@ -1,3 +1,7 @@
+/* The integral of a lobe over a light with a spread, as in `shading.light_cone`, node by node.
+
+   The part of the light above all horizons is kept as a list of corners, since every disk around the foot of the point
+   cuts it anew. What lies outside a disk is drawn to its circle along radii, edge by edge, and arcs become chords. */
 vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, float width, bool used)
 {
     vec4 cone = ltsh_light_texel(header + 5);

@@ -1,3 +1,9 @@
+/* Which horizon ends the specular lobe of a pixel, as `cycles.horizons` decides for samples.
+
+   Three steps, of which the first two add up over draw calls so that lights may be many: how bright the lights are from
+   the pixel, what only one of both horizons lets through of the directions that the lobe and the lights choose, and
+   which normal that gives. */
+
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
 struct seen_light {

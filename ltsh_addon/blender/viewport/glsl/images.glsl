@@ -1,3 +1,6 @@
+/* Quantities of a look, from constants and images. The uniform buffer `look` is an array of vec4, see
+   `textures.look_values`. Images are read by texelFetch: Blender 4.5 has no say in a texture's filter and extension. */
+
 int wrapped(int texel, int size, int extension)
 {
   if (extension == EXTENSION_REPEAT) {

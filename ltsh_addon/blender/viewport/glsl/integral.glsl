@@ -1,3 +1,15 @@
+/* The integral of a lobe over the part of a light above some horizons.
+
+   No polygon is stored: edges are integrated as they come. A light that is above all horizons takes the short loop. In
+   the long one every edge is cut to its part above all of them, and what closes the polygon comes from crossings: on
+   each horizon the region's boundary is an arc, of which the part inside the light adds up from where edges cross it,
+
+       sum over crossings of +- the integral along the arc from a fixed point to the crossing, moved into the arc.
+
+   Any fixed point serves, since crossings come in pairs; the first one found is taken, which for one horizon gives the
+   closing edges of Sutherland and Hodgman (1974). A crossing beyond another horizon moves to where both horizons meet,
+   of the two such directions the one from which the light can be seen. Polygons need not be convex. */
+
 /* The triangle of `center` and an edge given from there, by quadrature exact for polynomials of degree 2. */
 @name@_sum @name@_with_triangle(@name@_sum sum, vec3 center, vec3 start, vec3 end)
 {

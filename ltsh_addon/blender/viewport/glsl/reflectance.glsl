@@ -1,3 +1,5 @@
+/* The lobe that a look has, with the weights that Cycles gives it: what `cycles.closures` does for samples. */
+
 float table_at(sampler2D table, int row, float column)
 {
   int last = textureSize(table, 0).x - 1;

@@ -1,3 +1,5 @@
+/* Parts of lights in their planes, and what disks leave of them: `DiskParts` of `shading.light_cone`. */
+
 /* A part of a light in coordinates of its plane with the foot of the point as the origin, and what disks need of it.
    Its corners are a variable of their own: compilers take minutes over structures that hold arrays. */
 vec2 ltsh_corners[LTSH_MOST_CORNERS];

@@ -1,3 +1,5 @@
+/* Surfaces into the G-buffer, lobe by lobe: what `cycles.lobes` does for samples. */
+
 #if defined(IS_FURTHER) || defined(DRAWS_EMISSION)
 /* What is drawn later is drawn where it is the surface of the G-buffer. */
 bool is_seen()

@@ -6,11 +6,12 @@ Same lights, tables and integrals as `shading.shade`, in float32 throughout.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 
 import gpu
 
 from ...cycles import horizons
-from ...scene import AreaLight
+from ...scene import PASSES, AreaLight
 from ...shading import load_table
 from ...shading.lookup_table import LookupTable
 from .shaders import (
@@ -35,6 +36,7 @@ from .textures import (
 )
 
 _RESULTS = {BRIGHTNESS: "brightnesses", EXCESS: "excesses", CHOICE: "horizons"}
+_SHOWN_PASSES = (*PASSES, "combined")
 
 
 class HorizonPass:
@@ -94,9 +96,6 @@ class HorizonPass:
                 gpu.state.blend_set("NONE")
 
 
-PASSES = ("specular", "diffuse", "combined")
-
-
 class LightingPass:
     """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
 
@@ -147,12 +146,13 @@ class LightingPass:
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is one of `PASSES`. Give the camera's place, or for orthographic cameras the unit direction toward
-        it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in `target` (None: what
-        is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of the same surfaces.
+        `passes` is "specular", "diffuse" or "combined". Give the camera's place, or for orthographic cameras the unit
+        direction toward it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in
+        `target` (None: what is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of
+        the same surfaces.
         """
-        if passes not in PASSES:
-            raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(PASSES)}")
+        if passes not in _SHOWN_PASSES:
+            raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
         if (view_position is None) == (view_direction is None):
             raise ValueError("lighting pass: give either view_position or view_direction")
         x, y, width, height = rect or (0, 0, *gbuffer.size)
@@ -165,33 +165,26 @@ class LightingPass:
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
         )
-        if target is None:
-            self._draw(features, gbuffer, view, (x, y, width, height), add)
-            return
-        with target.bind():
-            self._draw(features, gbuffer, view, (x, y, width, height), add)
-
-    def _draw(self, features, gbuffer, view, rect, add):
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
         shader, batch = self._shaders[features]
-        x, y, width, height = rect
-        previous = gpu.state.viewport_get(), gpu.state.blend_get()
-        gpu.state.viewport_set(x, y, width, height)
-        gpu.state.blend_set("ADDITIVE" if add else "NONE")
-        try:
-            shader.bind()
-            for name in features.samplers:
-                shader.uniform_sampler(name, self._texture(name, gbuffer))
-            if features.specular:
-                shader.uniform_float("view", view)
-            for first, end in self._shares:
-                shader.uniform_int("place", (x, y, first, end))
-                batch.draw(shader)
-                gpu.state.blend_set("ADDITIVE")
-        finally:
-            gpu.state.viewport_set(*previous[0])
-            gpu.state.blend_set(previous[1])
+        with nullcontext() if target is None else target.bind():
+            previous = gpu.state.viewport_get(), gpu.state.blend_get()
+            gpu.state.viewport_set(x, y, width, height)
+            gpu.state.blend_set("ADDITIVE" if add else "NONE")
+            try:
+                shader.bind()
+                for name in features.samplers:
+                    shader.uniform_sampler(name, self._texture(name, gbuffer))
+                if features.specular:
+                    shader.uniform_float("view", view)
+                for first, end in self._shares:
+                    shader.uniform_int("place", (x, y, first, end))
+                    batch.draw(shader)
+                    gpu.state.blend_set("ADDITIVE")
+            finally:
+                gpu.state.viewport_set(*previous[0])
+                gpu.state.blend_set(previous[1])
 
     def _texture(self, name, gbuffer):
         own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}

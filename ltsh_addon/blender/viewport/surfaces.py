@@ -1,4 +1,4 @@
-"""The first pass: surfaces of the scene into a G-buffer."""
+"""The first pass: draws the surfaces of a mirrored scene into a G-buffer, lobe by lobe."""
 
 from __future__ import annotations
 
@@ -28,6 +28,8 @@ from .textures import (
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
 EMISSION = ("emission",)
+# What a corner of a mesh has, and its type.
+_CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
 # Before, Cycles left interpolated normals as long as they are.
 NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
 # That of images which are not found, as in Cycles.
@@ -49,6 +51,11 @@ class View:
         eye = to_world.col[2].xyz.normalized() if is_parallel else to_world.translation
         return cls(np.array(window_matrix @ view_matrix, np.float64), np.array(eye), is_parallel)
 
+    @property
+    def homogeneous_eye(self) -> tuple[float, ...]:
+        """The eye's place and 1, or the way to it and 0."""
+        return (*self.eye, 0.0 if self.is_parallel else 1.0)
+
 
 class SurfacePass:
     """Shaders and textures of one view's G-buffer; needs an active GPU context."""
@@ -58,19 +65,18 @@ class SurfacePass:
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
-        self._size, self._textures, self._buffers = None, {}, {}
-        self._lobe_textures: dict = {}
+        self._size = self._depth = None
+        self._targets: dict = {}
 
     def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
         """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call.
 
         Normals of their own are there where a surface is smooth or bent.
         """
-        self._resize(size)
-        textures = dict(self._draw_into(SURFACES, instances, view, size))
-        if has_normals(instances):
-            textures.update(self._draw_into(NORMALS, instances, view, size))
-        return GBufferTextures(**textures)
+        if size != self._size:
+            self._size, self._targets = size, {}
+            self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+        return self._gbuffer(0, instances, view)
 
     def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
         """The G-buffer of the lobes `number`, from 1 on, of what `draw` drew last; valid until the next call.
@@ -78,15 +84,7 @@ class SurfacePass:
         There is no surface where a material has fewer lobes.
         """
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
-        textures = dict(self._draw_into(SURFACES, having, view, self._size, number))
-        if has_normals(having):
-            textures.update(self._draw_into(NORMALS, having, view, self._size, number))
-        return GBufferTextures(**textures)
-
-    @property
-    def depth(self) -> gpu.types.GPUTexture:
-        """The depth of what was drawn last."""
-        return self._depth
+        return self._gbuffer(number, having, view)
 
     def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
         """Add what the surfaces drawn last emit to `frame_buffer`."""
@@ -104,52 +102,40 @@ class SurfacePass:
 
     def free(self) -> None:
         """Let go of everything."""
-        self._size, self._textures, self._buffers, self._tables, self._shaders = None, {}, {}, {}, {}
-        self._lobe_textures = {}
-        self._nothing = self._missing = self._depth = None
+        self._targets, self._tables, self._shaders = {}, {}, {}
+        self._size = self._nothing = self._missing = self._depth = None
 
-    def _resize(self, size) -> None:
-        if size == self._size:
-            return
-        self._textures = {name: gpu.types.GPUTexture(size, format="RGBA32F") for name in (*SURFACES, *NORMALS)}
-        self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
-        self._buffers = {
-            outputs: gpu.types.GPUFrameBuffer(
-                depth_slot=self._depth, color_slots=[self._textures[name] for name in outputs]
-            )
-            for outputs in (SURFACES, NORMALS)
-        }
-        self._lobe_textures = {}
-        self._size = size
+    def _gbuffer(self, number, instances, view) -> GBufferTextures:
+        textures = self._draw_into(SURFACES, instances, view, number)
+        if has_normals(instances):
+            textures = textures | self._draw_into(NORMALS, instances, view, number)
+        return GBufferTextures(**textures)
 
     def _target(self, outputs, is_further: bool):
         """Textures by name and the frame buffer that `outputs` are drawn into; those of further lobes have no depth."""
-        if not is_further:
-            return {name: self._textures[name] for name in outputs}, self._buffers[outputs]
-        if outputs not in self._lobe_textures:
+        if (outputs, is_further) not in self._targets:
             textures = {name: gpu.types.GPUTexture(self._size, format="RGBA32F") for name in outputs}
-            buffer = gpu.types.GPUFrameBuffer(color_slots=list(textures.values()))
-            self._lobe_textures[outputs] = textures, buffer
-        return self._lobe_textures[outputs]
+            depth = {} if is_further else {"depth_slot": self._depth}
+            buffer = gpu.types.GPUFrameBuffer(color_slots=list(textures.values()), **depth)
+            self._targets[outputs, is_further] = textures, buffer
+        return self._targets[outputs, is_further]
 
-    def _draw_into(self, outputs, instances, view: View, size, number: int = 0) -> dict:
+    def _draw_into(self, outputs, instances, view: View, number: int) -> dict:
         """Draw the lobes `number`; the textures by name."""
-        textures, buffer = self._target(outputs, number > 0)
-        if (outputs, number > 0) not in self._shaders:
+        is_further = number > 0
+        textures, buffer = self._target(outputs, is_further)
+        if (outputs, is_further) not in self._shaders:
             self._shaders[outputs, True] = _shader(outputs, is_further=True)
         with buffer.bind():
-            gpu.state.viewport_set(0, 0, *size)
+            gpu.state.viewport_set(0, 0, *self._size)
             # Only the position tells where there is a surface, but no number may be left that is not one.
-            if number > 0:
-                buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
-            else:
-                buffer.clear(color=(0.0, 0.0, 0.0, 0.0), depth=1.0)
+            buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further else {"depth": 1.0}))
             gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE" if number > 0 else "LESS_EQUAL")
-            gpu.state.depth_mask_set(number == 0)
+            gpu.state.depth_test_set("NONE" if is_further else "LESS_EQUAL")
+            gpu.state.depth_mask_set(not is_further)
             gpu.state.face_culling_set("NONE")
             try:
-                self._draw_instances(self._shaders[outputs, number > 0], instances, view, number)
+                self._draw_instances(self._shaders[outputs, is_further], instances, view, number)
             finally:
                 gpu.state.depth_test_set("NONE")
                 gpu.state.depth_mask_set(False)
@@ -158,8 +144,8 @@ class SurfacePass:
     def _draw_instances(self, shader, instances, view: View, number: int = 0, is_emission: bool = False) -> None:
         shader.bind()
         if number > 0 or is_emission:
-            shader.uniform_sampler("positions", self._textures["position"])
-        values = np.vstack([view.projection.T, [*view.eye, 0.0 if view.is_parallel else 1.0]])
+            shader.uniform_sampler("positions", self._target(SURFACES, False)[0]["position"])
+        values = np.vstack([view.projection.T, view.homogeneous_eye])
         # Kept until all is drawn: the card reads it then.
         self._view_values = uniform_buffer(values)
         shader.uniform_block("view", self._view_values)
@@ -221,21 +207,19 @@ def _shader(outputs, is_further: bool = False):
         info.push_constant("VEC4", "placement")
     info.define("UNIT_NORMALS", "true" if NORMAL_MAPS_BEND_UNIT_NORMALS else "false")
     info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
-    images = (*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table")
-    needs_seen = is_further or outputs == EMISSION
-    for slot, name in enumerate((*(images if outputs != EMISSION else ()), *(("positions",) if needs_seen else ()))):
+    samplers = []
+    if outputs != EMISSION:
+        samplers += [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table"]
+    if is_further or outputs == EMISSION:
+        samplers.append("positions")
+    for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D", name)
-    info.vertex_in(0, "VEC3", "position")
-    info.vertex_in(1, "VEC3", "normal")
-    info.vertex_in(2, "VEC2", "uv")
-    # Meshes without normal maps have none: they get (0, 0, 0, 1).
-    info.vertex_in(3, "VEC4", "tangent")
+    # Meshes without normal maps have no tangent: they get (0, 0, 0, 1).
+    for slot, (name, kind) in enumerate(_CORNER.items()):
+        info.vertex_in(slot, kind, name)
     passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}_{int(is_further)}")
-    passed.smooth("VEC3", "v_position")
-    passed.smooth("VEC3", "v_normal")
-    passed.smooth("VEC3", "v_object_normal")
-    passed.smooth("VEC2", "v_uv")
-    passed.smooth("VEC4", "v_tangent")
+    for name, kind in {**_CORNER, "object_normal": "VEC3"}.items():
+        passed.smooth(kind, f"v_{name}")
     info.vertex_out(passed)
     for slot, name in enumerate(outputs):
         info.fragment_out(slot, "VEC4", f"out_{name}")

@@ -15,6 +15,8 @@ GLASS_NODES = 16
 NORMALS_PER_AXIS = 24
 SMALLEST_COSINE = 1e-4
 MAX_F0 = 0.99
+# Constant and slope of the fit in `dielectric_average`.
+DIELECTRIC_AVERAGE = 4.08567, 1.00071
 
 
 @dataclass(frozen=True)
@@ -159,8 +161,9 @@ def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
     """Integral of 2 c F(c) of a dielectric, by the fit of Kulla and Conty 2017 ("Revisiting physically based shading at
     Imageworks"), which Cycles uses; good to 0.006 for an `ior` of 1 to 3."""
+    start, slope = DIELECTRIC_AVERAGE
     below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607))
-    return np.where(ior < 1.0, below, (ior - 1.0) / (4.08567 + 1.00071 * ior))
+    return np.where(ior < 1.0, below, (ior - 1.0) / (start + slope * ior))
 
 
 def dielectric_blend_average(f0: np.ndarray, ior: np.ndarray) -> np.ndarray:
@@ -247,7 +250,7 @@ def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, c
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """E (Q,) and its average (Q,) over the directions, as Cycles interpolates them."""
-    directional, average = _albedo_tables()
+    directional, average = albedo_tables()
     return _interpolate(directional, roughness, cosine), _interpolate(average, roughness)
 
 
@@ -258,7 +261,8 @@ def dielectric_albedo(f0: np.ndarray, ior: np.ndarray, roughness: np.ndarray, co
 
 
 @cache
-def _albedo_tables():
+def albedo_tables() -> tuple[np.ndarray, np.ndarray]:
+    """E (N, N) by roughness and cosine, and its average (N,) by roughness, at uniform nodes over [0, 1]."""
     table = shading.load_table("ltsh4")
     nodes = np.clip(np.linspace(0.0, 1.0, ALBEDO_NODES), SMALLEST_COSINE, 1.0)
     roughness, cosine = np.meshgrid(nodes, nodes, indexing="ij")

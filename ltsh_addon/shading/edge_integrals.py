@@ -26,21 +26,30 @@ MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
 _ARC_QUADRATURE = np.polynomial.legendre.leggauss(18)
 
 
-@cache
-def _psi_coefficients(degree: int) -> np.ndarray:
-    """Coefficients, highest power first, in kappa of kappa * psi, psi = (phi - 1) / (1 - cos theta)."""
+# Degrees of the polynomial for psi that suffice in single and in double precision.
+SINGLE_PSI_DEGREE, _DOUBLE_PSI_DEGREE = 9, 22
 
-    def psi(kappa):
+
+@cache
+def arc_polynomial(factor: str, degree: int, longest: float = 1.0) -> np.ndarray:
+    """Coefficients (degree + 1,), highest power first, in v = `longest` cos(theta / 2) of v phi or v psi of an edge.
+
+    `factor` is "phi" or "psi", as in `arc_factors`. Interpolated at Chebyshev points.
+    """
+
+    def values(v):
         # phi = 2F1(1, 1; 3/2; w), w = sin^2(theta/2); psi = (phi - 1) / (2 w), as a series where w is small
+        kappa = v / longest
         w = (1.0 - kappa) * (1.0 + kappa)
         closed = (np.arccos(kappa) / (kappa * np.sqrt(w)) - 1.0) / (2.0 * w)
         term, series = np.full_like(w, 1.0 / 3.0), np.zeros_like(w)
         for n in range(1, 60):
             series += term
             term = term * w * (n + 1.0) / (n + 1.5)
-        return kappa * np.where(w < 0.3, series, closed)
+        psi = np.where(w < 0.3, series, closed)
+        return v * (psi if factor == "psi" else 1.0 + 2.0 * w * psi)
 
-    chebyshev = np.polynomial.chebyshev.Chebyshev.interpolate(psi, degree, domain=[0.0, 1.0])
+    chebyshev = np.polynomial.chebyshev.Chebyshev.interpolate(values, degree, domain=[0.0, longest])
     return chebyshev.convert(kind=np.polynomial.Polynomial).coef[::-1].copy()
 
 
@@ -53,7 +62,8 @@ def arc_factors(one_plus_cosine: np.ndarray):
     dtype = one_plus_cosine.dtype
     shifted = np.maximum(one_plus_cosine, np.finfo(dtype).eps ** 2)
     kappa = np.sqrt(np.minimum(0.5 * shifted, 1.0))
-    coefficients = _psi_coefficients(9 if dtype == np.float32 else 22).astype(dtype)
+    coefficients = arc_polynomial("psi", SINGLE_PSI_DEGREE if dtype == np.float32 else _DOUBLE_PSI_DEGREE)
+    coefficients = coefficients.astype(dtype)
     psi = np.full_like(kappa, coefficients[0])
     for coefficient in coefficients[1:]:
         psi = psi * kappa + coefficient

@@ -1,51 +1,212 @@
-"""Shading in float32, which hands pairs of sample and light that it may get wrong to float64."""
+"""The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
+
+The warp and, for "ltc", the tilt of the lobe are multiplied into the local frame of a sample once, for all lights: a
+light's corners come out of one product. What single precision cannot do is left to `float64`, per block: points so
+close to a light's plane that an edge spans half a circle, tiny lights, sharp lobes.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from . import float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
+from .lobes import FLOAT64_CHUNK
 from .polygon import dot
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
+# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
+# multiple of a page long, where the cache would hold few of them.
+CHUNK = 24592
+CORNERS = 4 * CHUNK
+# The light of narrower cones, in rad, is too bright for the absolute error of single precision.
+NARROW_SPREAD = 0.35
 
 
-def any_component(vectors):
-    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
-    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
+def shade_diffuse(samples, lights, radiance, scratch):
+    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+    lights = [item for item in lights if item[0].affects_diffuse]
+    lit = np.nonzero(_any_component(samples.diffuse_albedo))[0]
+    bumped = np.zeros(len(lit), bool)
+    if samples.diffuse_normal is not samples.smooth_normal:
+        bumped = _any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
+    lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
+    for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
+        for index in _chunks(members):
+            rows = _normal_frame(_columns(samples.diffuse_normal, index))
+            clip_rows, integrate = (2,), FormFactor(scratch)
+            if is_bumped:
+                smooth = _columns(samples.smooth_normal, index)
+                rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
+                integrate = ShadowedFormFactor(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
+            colors = _columns(samples.diffuse_albedo, index)[None]
+            lighting.add(Lobes(index, rows, clip_rows, integrate, colors, 1.0))
+    lighting.finish()
 
 
-def columns(vectors, index):
-    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
-    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
+def shade_specular(samples, lights, table, radiance, scratch):
+    """As `shade_diffuse` for the specular lobes of `table`."""
+    lights = [item for item in lights if item[0].affects_specular]
+    ridges = moments32.prepare(table)
+    terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
+    reflective = np.logical_or.reduce([_any_component(term) for term in terms])
+    lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
+    sharp = lit & (samples.roughness < moments32.SHARP_ROUGHNESS)
+
+    def in_float64(part, items, target):
+        float64.shade_specular(part, items, table, target)
+
+    lighting = _Lighting(samples, lights, radiance, scratch, in_float64)
+    for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
+        for index in _chunks(members):
+            rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
+            integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
+            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width))
+    lighting.add_in_float64(np.nonzero(sharp)[0], lights)
+    lighting.finish()
+
+
+def _chunks(members):
+    return (members[part] for part in moments32.pieces(len(members), CHUNK))
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """The lobes of Q samples; integrate(columns, corners, index, smallest) gives (F, Q') integrals and a mask."""
+
+    index: np.ndarray  # (Q,) of the samples
+    rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` wants
+    clip_rows: tuple[int, ...]  # the coordinates that are positive above the horizons
+    integrate: Callable
+    colors: np.ndarray  # (F, 3, Q) reflectances of the integrals
+    width: np.ndarray | float  # as for `light_levels`
+
+
+class _Lighting:
+    """Adds the light of `lights` at `samples` to radiance (G, P, 3); shade_in_float64(samples, lights, radiance) is
+    what points that need it are left to."""
+
+    def __init__(self, samples, lights, radiance, scratch, shade_in_float64):
+        self.samples, self.lights, self.radiance, self.scratch = samples, lights, radiance, scratch
+        self.shade_in_float64 = shade_in_float64
+        self.needs_float64 = [[] for _ in lights]  # indices of samples, per light
+
+    def add(self, lobes: Lobes) -> None:
+        """Add the light that `lobes` reflect."""
+        samples, index, colors = self.samples, lobes.index, lobes.colors
+        position = np.ascontiguousarray(samples.position[index].T)
+        sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
+        for (light, group, corners), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
+            allowed = light.receives(samples.receiver, index)
+            if light.is_focused:
+                near = light_cone.may_reach(light, position)
+                allowed = near if allowed is None else allowed & near
+            if light.spread < NARROW_SPREAD:
+                needs_float64.append(index[allowed])
+                continue
+            for part, outline, effort in _batches(light, corners, position, lobes.width):
+                offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
+                facing = dot(offset, light.direction.astype(np.float32)) < 0.0
+                if allowed is not None:
+                    facing &= allowed[part]
+                axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
+                if light.is_focused:
+                    integrate = FocusedIntegral(light, effort, offset, axes, integrate, len(colors))
+                    axes = integrate.rows
+                polygons = local_corners(light, outline, offset, axes, self.scratch)
+                found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
+                if redo.any():
+                    found[:, redo] = 0.0
+                    needs_float64.append(index[part][redo])
+                total = sums[group]
+                for channel in range(3):
+                    total[:, channel, part] += found * np.float32(light.radiance[channel])
+        signed = (colors < 0.0).any()
+        for group, total in sums.items():
+            reflected = (colors * total).sum(axis=0)
+            if signed and all((light.radiance >= 0.0).all() for light, its, _ in self.lights if its == group):
+                # Terms that cancel in the Fresnel factor may leave a rest below zero.
+                np.maximum(reflected, np.float32(0.0), out=reflected)
+            self.radiance[group, index] += reflected.T
+
+    def add_in_float64(self, members, lights) -> None:
+        """Add the light of `lights` at the samples `members` (Q,)."""
+        for start in range(0, len(members), FLOAT64_CHUNK):
+            index = members[start : start + FLOAT64_CHUNK]
+            target = np.zeros((len(self.radiance), len(index), 3))
+            self.shade_in_float64(self.samples.take(index), lights, target)
+            self.radiance[:, index] += target.astype(np.float32)
+
+    def finish(self) -> None:
+        """Add what was left to float64: all plain lights with equally many corners in one batch, for there are few
+        such samples."""
+        plain: dict[int, list] = {}
+        for item, parts in zip(self.lights, self.needs_float64, strict=True):
+            if parts and (item[0].is_focused or item[0].is_round):
+                self.add_in_float64(np.concatenate(parts), [item])
+            elif parts:
+                plain.setdefault(len(item[2]), []).append((item, np.concatenate(parts)))
+        for _, chosen in sorted(plain.items()):
+            self._add_light_of_each(chosen)
+
+    def _add_light_of_each(self, chosen) -> None:
+        """Add the light of (light, group, corners) at the samples with it, lights with equally many corners."""
+        members = np.concatenate([index for _, index in chosen])
+        number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
+        group = np.array([item[1] for item, _ in chosen])[number]
+        corners = np.stack([item[2] for item, _ in chosen])
+        fields = {
+            name: np.stack([getattr(item[0], name) for item, _ in chosen])
+            for name in ("center", "direction", "radiance")
+        }
+        for start in range(0, len(members), FLOAT64_CHUNK):
+            part = slice(start, start + FLOAT64_CHUNK)
+            of = number[part]
+            light = float64.LightOfEachSample(**{name: values[of] for name, values in fields.items()})
+            target = np.zeros((1, len(of), 3))
+            own = [(light, 0, corners[of].transpose(1, 0, 2))]
+            self.shade_in_float64(self.samples.take(members[part]), own, target)
+            # A sample may be there for several lights.
+            np.add.at(self.radiance, (group[part], members[part]), target[0].astype(np.float32))
+
+
+def _batches(light, corners, position, width):
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
+    for outline, effort, chosen in light_levels(light, corners, position, width):
+        count = position.shape[1] if chosen is None else len(chosen)
+        step = max(CORNERS // len(outline), 512)
+        for start in range(0, count, step):
+            part = slice(start, start + step)
+            yield part if chosen is None else chosen[part], outline, effort
 
 
 def fresnel_kinds(samples, members):
-    """Yield (vectors, members, colors): what part of the Fresnel terms the samples `members` need.
+    """Yield (vectors, members, colors): which Fresnel terms the samples `members` need.
 
-    `vectors` as in `ridge_table.RidgeTable`, colors(index) (F, 3, Q) their reflectances.
+    `vectors` as in `RidgeTable`, colors(index) (F, 3, Q) their reflectances.
     """
-    dipped = any_component(samples.specular_dip)[members]
-    metal = (any_component(samples.specular_f90) | any_component(samples.specular_f0))[members] | dipped
-    flat = ~any_component(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
-    dielectric = any_component(samples.dielectric)[members]
+    dipped = _any_component(samples.specular_dip)[members]
+    metal = (_any_component(samples.specular_f90) | _any_component(samples.specular_f0))[members] | dipped
+    flat = ~_any_component(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
+    dielectric = _any_component(samples.dielectric)[members]
 
     def white(index):
-        return columns(samples.specular_f0, index)[None]
+        return _columns(samples.specular_f0, index)[None]
 
     def schlick(index):
-        f0 = columns(samples.specular_f0, index)
-        return np.stack([f0, columns(samples.specular_f90, index) - f0])
+        f0 = _columns(samples.specular_f0, index)
+        return np.stack([f0, _columns(samples.specular_f90, index) - f0])
 
     def f82(index):
-        return np.concatenate([schlick(index), -columns(samples.specular_dip, index)[None]])
+        return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
 
     def coat(index):
-        return columns(samples.dielectric, index)[None]
+        return _columns(samples.dielectric, index)[None]
 
     yield (0,), members[~dielectric & flat], white
     yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
@@ -74,246 +235,6 @@ def _by_ior(ior, members):
         yield ("dielectric", float(value)), members[number == position]
 
 
-# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
-# multiple of a page long, where the cache would hold few of them.
-CHUNK = 24592
-CORNERS = 4 * CHUNK
-
-
-def _selected(values, part, index):
-    """Columns `index` (None: all) of the columns `part`, a slice, of values (..., Q)."""
-    values = values[..., part]
-    return values if index is None else np.take(values, index, axis=-1)
-
-
-class Focused:
-    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
-
-    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
-    """
-
-    def __init__(self, light, effort, offset, axes, integrate, count):
-        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
-        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
-        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
-        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
-
-    def __call__(self, corners, index):
-        index = np.arange(corners.shape[2]) if index is None else index
-        values, fragile = np.zeros((self.count, len(index)), np.float32), np.zeros(len(index), bool)
-        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
-        for start in range(0, len(index), step):
-            part = slice(start, start + step)
-            flat, view = corners[-2:, :, part], self.view.take(index[part])
-            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
-            for number, (near, weights, polygons) in enumerate(layers):
-                # The small disks count little, so that the rounding of their edges is lost in the sum.
-                smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
-                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
-                values[:, start + near] += weights * found
-                fragile[start + near] |= redo
-        return values, fragile
-
-
-def _along_rows(axes, vector):
-    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
-    x, y, z = vector.astype(np.float32)
-    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]
-
-
-class Cosine:
-    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
-
-    def __init__(self, scratch):
-        self.scratch = scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        integral, fragile = moments32.cosine_integral(corners, self.scratch, smallest)
-        integral *= np.float32(-1.0 / np.pi)
-        return np.maximum(integral, np.float32(0.0))[None], fragile
-
-
-class ShadowedCosine:
-    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
-
-    def __init__(self, rows, bump_alpha2, scratch):
-        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
-        self.bump_alpha2, self.scratch = bump_alpha2, scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, fragile = moments32.vector_irradiance(corners, self.scratch, smallest)
-        direction = np.negative(integrals, out=integrals)
-        along = np.maximum(dot(direction, smooth), np.float32(1e-15))
-        tangent2 = np.maximum(dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
-        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
-        return values[None], fragile
-
-
-class LobeIntegral:
-    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `Cosine`."""
-
-    def __init__(self, ridges, weights, scratch):
-        self.ridges, self.weights, self.scratch = ridges, weights, scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        weights = _selected(self.weights, part, index)
-        if self.ridges.source.family == "ltc":
-            integral, fragile = moments32.cosine_integral(corners, self.scratch, smallest)
-            values = weights[:, 0] * integral
-            values *= np.float32(-1.0 / np.pi)
-        else:
-            degree = self.ridges.degree
-            values, _, fragile = moments32.weighted_moments(corners, weights, degree, self.scratch, smallest)
-            np.negative(values, out=values)
-        return np.maximum(values, np.float32(0.0), out=values), fragile
-
-
-DOUBLE_CHUNK = 4096
-# The light of narrower cones, in rad, is too bright for the absolute error of single precision.
-NARROW_SPREAD = 0.35
-
-
-def shade_diffuse(samples, lights, radiance, scratch):
-    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
-    lights = [item for item in lights if item[0].affects_diffuse]
-    lit = np.nonzero(any_component(samples.diffuse_albedo))[0]
-    bumped = np.zeros(len(lit), bool)
-    if samples.diffuse_normal is not samples.smooth_normal:
-        bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
-    fragile = [[] for _ in lights]
-    for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
-        for index in _chunks(members):
-            rows = _normal_frame(columns(samples.diffuse_normal, index))
-            clip_rows, integrate = (2,), None
-            if is_bumped:
-                smooth = columns(samples.smooth_normal, index)
-                rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
-                integrate = ShadowedCosine(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
-            colors = columns(samples.diffuse_albedo, index)[None]
-            integrate = integrate or Cosine(scratch)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, 1.0, radiance, fragile, scratch)
-    _add_fragile(samples, lights, fragile, radiance, float64.shade_diffuse)
-
-
-def shade_specular(samples, lights, table, radiance, scratch):
-    """As `shade_diffuse` for the specular lobes of `table`."""
-    lights = [item for item in lights if item[0].affects_specular]
-    ridges = moments32.prepare(table)
-    terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
-    reflective = np.logical_or.reduce([any_component(term) for term in terms])
-    lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
-    sharp = lit & (samples.roughness < moments32.SHARP_ROUGHNESS)
-    fragile = [[] for _ in lights]
-    for vectors, members, color_rows in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
-        for index in _chunks(members):
-            rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
-            integrate = LobeIntegral(ridges, weights, scratch)
-            colors, width = color_rows(index), float64.lobe_width(samples, index)
-            _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch)
-
-    def in_double(part, items, target):
-        float64.shade_specular(part, items, table, target)
-
-    _add_double(samples, np.nonzero(sharp)[0], lights, radiance, in_double)
-    _add_fragile(samples, lights, fragile, radiance, in_double)
-
-
-def _chunks(members):
-    return (members[part] for part in moments32.pieces(len(members), CHUNK))
-
-
-def _add_double(samples, members, lights, radiance, shade):
-    """Add the light of `lights` at the samples `members` (Q,) by a function of `double_precision`."""
-    for start in range(0, len(members), DOUBLE_CHUNK):
-        index = members[start : start + DOUBLE_CHUNK]
-        target = np.zeros((len(radiance), len(index), 3))
-        shade(samples.take(index), lights, target)
-        radiance[:, index] += target.astype(np.float32)
-
-
-def _add_fragile(samples, lights, fragile, radiance, shade):
-    """Add each of `lights` at the samples of its entry of `fragile`, lists of index arrays: all plain lights with
-    equally many corners in one batch, for there are few such samples."""
-    found = [(item, np.concatenate(parts)) for item, parts in zip(lights, fragile, strict=True) if parts]
-    for item, index in found:
-        if item[0].is_focused or item[0].is_round:
-            _add_double(samples, index, [item], radiance, shade)
-    found = [(item, index) for item, index in found if not (item[0].is_focused or item[0].is_round)]
-    for count in sorted({len(item[2]) for item, _ in found}):
-        chosen = [(item, index) for item, index in found if len(item[2]) == count]
-        members = np.concatenate([index for _, index in chosen])
-        number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
-        group = np.array([item[1] for item, _ in chosen])[number]
-        corners = np.stack([item[2] for item, _ in chosen])
-        fields = {
-            name: np.stack([getattr(item[0], name) for item, _ in chosen])
-            for name in ("center", "direction", "radiance")
-        }
-        for start in range(0, len(members), DOUBLE_CHUNK):
-            part = slice(start, start + DOUBLE_CHUNK)
-            of = number[part]
-            light = float64.LightOfEachSample(**{name: values[of] for name, values in fields.items()})
-            target = np.zeros((1, len(of), 3))
-            shade(samples.take(members[part]), [(light, 0, corners[of].transpose(1, 0, 2))], target)
-            # A sample may be there for several lights.
-            np.add.at(radiance, (group[part], members[part]), target[0].astype(np.float32))
-
-
-def _add_lights(samples, index, lights, rows, clip_rows, integrate, colors, width, radiance, fragile, scratch):
-    """Add the light of all `lights` at the samples `index` (Q,) to radiance (G, P, 3).
-
-    rows (C, 3, Q) are the axes of the coordinates that `integrate` wants, colors (F, 3, Q) the reflectances of its
-    integrals, `width` that of the lobes as for `round_levels`. Points left to double precision are appended to
-    `fragile`, per light.
-    """
-    position = np.ascontiguousarray(samples.position[index].T)
-    sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in lights}
-    for number, (light, group, corners) in enumerate(lights):
-        allowed = light.receives(samples.receiver, index)
-        if light.is_focused:
-            near = light_cone.may_reach(light, position)
-            allowed = near if allowed is None else allowed & near
-        if light.spread < NARROW_SPREAD:
-            fragile[number].append(index[allowed])
-            continue
-        for part, outline, effort in _batches(light, corners, position, width):
-            offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
-            facing = dot(offset, light.direction.astype(np.float32)) < 0.0
-            if allowed is not None:
-                facing &= allowed[part]
-            axes, of_part = rows[:, :, part], partial(integrate, part)
-            if light.is_focused:
-                of_part = Focused(light, effort, offset, axes, of_part, len(colors))
-                axes = of_part.rows
-            polygons = local_corners(light, outline, offset, axes, scratch)
-            found, redo = integrate_visible(polygons, facing, clip_rows, len(colors), of_part)
-            if redo.any():
-                found[:, redo] = 0.0
-                fragile[number].append(index[part][redo])
-            total = sums[group]
-            for channel in range(3):
-                total[:, channel, part] += found * np.float32(light.radiance[channel])
-    signed = (colors < 0.0).any()
-    for group, total in sums.items():
-        reflected = (colors * total).sum(axis=0)
-        if signed and all((light.radiance >= 0.0).all() for light, its_group, _ in lights if its_group == group):
-            # Terms that cancel in the Fresnel factor may leave a rest below zero.
-            np.maximum(reflected, np.float32(0.0), out=reflected)
-        radiance[group, index] += reflected.T
-
-
-def _batches(light, corners, position, width):
-    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
-    for outline, effort, chosen in light_levels(light, corners, position, width):
-        count = position.shape[1] if chosen is None else len(chosen)
-        step = max(CORNERS // len(outline), 512)
-        for start in range(0, count, step):
-            part = slice(start, start + step)
-            yield part if chosen is None else chosen[part], outline, effort
-
-
 def _normal_frame(normal):
     """Frames (3, 3, P) around normals (3, P), without a preferred tangent (Duff et al. 2017)."""
     x, y, z = normal
@@ -326,7 +247,7 @@ def _normal_frame(normal):
 
 def _lobe_rows(samples, index, ridges, vectors, scratch):
     """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
-    normal, view = columns(samples.normal, index), columns(samples.view, index)
+    normal, view = _columns(samples.normal, index), _columns(samples.view, index)
     cosine = dot(normal, view)
     # The difference of vectors that are close is exact, so that nothing of it runs along the normal.
     tangent = view - normal
@@ -357,3 +278,98 @@ def _lobe_rows(samples, index, ridges, vectors, scratch):
         rows.append(np.ascontiguousarray(geometric.T, dtype=np.float32))
         clip_rows = (len(rows) - 1, *clip_rows)
     return np.stack(rows), clip_rows, weights
+
+
+def _any_component(vectors):
+    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
+    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
+
+
+def _columns(vectors, index):
+    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
+    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
+
+
+def _selected(values, part, index):
+    """Columns `index` (None: all) of the columns `part`, a slice, of values (..., Q)."""
+    values = values[..., part]
+    return values if index is None else np.take(values, index, axis=-1)
+
+
+class FormFactor:
+    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
+
+    def __init__(self, scratch):
+        self.scratch = scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        integral, needs_float64 = moments32.cosine_integral(corners, self.scratch, smallest)
+        integral *= np.float32(-1.0 / np.pi)
+        return np.maximum(integral, np.float32(0.0))[None], needs_float64
+
+
+class ShadowedFormFactor:
+    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+
+    def __init__(self, rows, bump_alpha2, scratch):
+        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
+        self.bump_alpha2, self.scratch = bump_alpha2, scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
+        integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
+        direction = np.negative(integrals, out=integrals)
+        along = np.maximum(dot(direction, smooth), np.float32(1e-15))
+        tangent2 = np.maximum(dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
+        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
+        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
+        return values[None], needs_float64
+
+
+class LobeIntegral:
+    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`."""
+
+    def __init__(self, ridges, weights, scratch):
+        self.ridges, self.weights, self.scratch = ridges, weights, scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        weights = _selected(self.weights, part, index)
+        values, _, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
+        np.negative(values, out=values)
+        return np.maximum(values, np.float32(0.0), out=values), needs_float64
+
+
+class FocusedIntegral:
+    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
+
+    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
+    """
+
+    def __init__(self, light, effort, offset, axes, integrate, count):
+        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
+        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
+        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
+        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
+
+    def __call__(self, corners, index):
+        index = np.arange(corners.shape[2]) if index is None else index
+        values = np.zeros((self.count, len(index)), np.float32)
+        needs_float64 = np.zeros(len(index), bool)
+        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
+        for start in range(0, len(index), step):
+            part = slice(start, start + step)
+            flat, view = corners[-2:, :, part], self.view.take(index[part])
+            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
+            for number, (near, weights, polygons) in enumerate(layers):
+                # The small disks count little, so that the rounding of their edges is lost in the sum.
+                smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
+                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
+                values[:, start + near] += weights * found
+                needs_float64[start + near] |= redo
+        return values, needs_float64
+
+
+def _along_rows(axes, vector):
+    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
+    x, y, z = vector.astype(np.float32)
+    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]

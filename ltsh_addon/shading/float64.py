@@ -1,6 +1,6 @@
 """Shading in double precision: exact polygons, any degree, and the reference quadrature.
 
-`single_precision` is the fast path; the points for which that is not accurate come here.
+`float32` is the fast path; the points for which that is not accurate come here.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ from .light_polygons import light_view, local_frames, seen_parts, to_local
 from .lobes import form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
 from .reference import reference_integrals
+
+# Of the roughness by which the effort for a lobe is chosen.
+LEAST_ROUGHNESS = 1e-3
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ def shade_diffuse(samples, lights, radiance):
 
 def lobe_width(samples, index) -> np.ndarray:
     """About how many radians (Q,) wide the specular lobes are: alpha."""
-    return np.maximum(samples.roughness[index].astype(np.float64), 1e-3) ** 2
+    return np.maximum(samples.roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
 def _focused(light, view, effort, index, polygon, integral, count):

@@ -1,4 +1,7 @@
-"""`shade`: samples and lights in, radiance per light group out, block by block."""
+"""`shade`: samples and lights in, radiance per light group out, block by block.
+
+A block is shaded by a `Task`, which is the same in this process and in a worker process.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,13 @@ import numpy as np
 from ..scene import PASSES, REFERENCE, AreaLight, SurfaceSamples
 from . import float32, float64, light_cone, moments32, parallel
 from .light_polygons import fitting_patches
+from .lobes import FLOAT64_CHUNK
 from .lookup_table import LookupTable, load_table
 
-# Double precision arrays of this many samples stay in the cache.
-DOUBLE_CHUNK = 4096
+# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
+# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
+BLOCK_LIMITS = (24592, 49184)
+REFERENCE_BLOCK_LIMITS = (256, 2048)
 # Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
 # In single precision for degree 0, and that for every degree more.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
@@ -91,8 +97,8 @@ class Task:
             if "specular" in radiance:
                 float32.shade_specular(samples, prepared, self.table, radiance["specular"], scratch)
             return
-        for start in range(0, len(samples), DOUBLE_CHUNK):
-            chunk = slice(start, start + DOUBLE_CHUNK)
+        for start in range(0, len(samples), FLOAT64_CHUNK):
+            chunk = slice(start, start + FLOAT64_CHUNK)
             part = samples.take(chunk)
             views = {name: values[:, chunk] for name, values in radiance.items()}
             if "diffuse" in views:
@@ -109,12 +115,6 @@ def _corners_integrated(light, is_reference):
         effort = light_cone.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
-
-
-# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
-# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
-BLOCK_LIMITS = (24592, 49184)
-REFERENCE_BLOCK_LIMITS = (256, 2048)
 
 
 @dataclass(frozen=True)

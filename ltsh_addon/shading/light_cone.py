@@ -18,9 +18,13 @@ from functools import cache
 
 import numpy as np
 
+from .polygon import dot
+
 # Half angle in rad below which Cycles takes the series of tan h - h.
 _SERIES = 0.05
 WIDTH_RANGE = (1e-4, 1e3)
+# A round light is a polygon of the same area, whose corners stand out a little.
+ROUND_MARGIN = 1.02
 
 
 def cone(spread: float) -> tuple[float, float]:
@@ -79,8 +83,7 @@ def _place_in_cone(light, position):
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
     beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
-    # A round light is a polygon of the same area, whose corners stand out a little.
-    extent = 1.02 * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
+    extent = ROUND_MARGIN * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
     return extent, cone(light.spread)[0] * distance, beside
 
 
@@ -99,8 +102,8 @@ class LightView:
     def of(cls, light, offset, along) -> LightView:
         """From the offsets (3, P) of the light's center, and along(vector (3,)) -> (C, P), its coordinates."""
         axes = plane_axes(light)
-        distance = -_scaled(offset, light.direction)
-        center = np.stack([_scaled(offset, axis) for axis in axes])
+        distance = -dot(offset, light.direction.astype(offset.dtype))
+        center = np.stack([dot(offset, axis) for axis in axes.astype(offset.dtype)])
         extent = tuple(float(np.sqrt((half**2).sum())) for half in (light.half_u, light.half_v))
         foot = -distance * along(light.direction)
         return cls(distance, center, extent, foot, along(axes[0]), along(axes[1]))
@@ -275,9 +278,3 @@ def _dot(a, b):
 
 def _cross(a, b):
     return a[0] * b[1] - a[1] * b[0]
-
-
-def _scaled(vectors, direction):
-    """Products (P,) of vectors (3, P) with one vector (3,), in the type of the first."""
-    x, y, z = direction.astype(vectors.dtype)
-    return vectors[0] * x + vectors[1] * y + vectors[2] * z

@@ -1,4 +1,8 @@
-"""Area lights as samples see them: their corners, what lies above the horizon, patches as fine as a lobe needs."""
+"""Area lights as samples see them: their corners, what lies above the horizon, patches as fine as a lobe needs.
+
+First what both precisions share, then the corners and parts of lights in single and in double precision, last the
+patches of lights with a texture.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +17,21 @@ from .polygon import split_at_horizon
 
 # Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
 MOSTLY_WHOLE = 0.6
-
-
 # Corners of a round light by how far it reaches, in units of the lobe's width where it meets the light: below 8 of them
 # 32 corners are within 0.1 % of an ellipse, and so on.
 ROUND_CORNERS = (32, 64, 128, 256)
 ROUND_LIMITS = (8.0, 40.0, 300.0)
-_FOCUSED_ROUND_CORNERS = (32, 64)
+FOCUSED_ROUND_CORNERS = (32, 64)
+# The product of the contrast of a patch (see `_largest_size`) and the square of its size by that length is at most
+# this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
+# sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
+PATCH_PRODUCT = 0.004
+# Half the diagonal of a patch by that length, at most: also where the means of its parts are equal.
+LARGEST_PATCH = 0.5
+# The width of GGX lobes in rad, by alpha: where the normal distribution has a quarter of its peak.
+LOBE_WIDTH = 2.0
+# Lobes seen at grazing angles are narrower across the view; below this cosine they become no narrower.
+LEAST_COSINE = 0.1
 
 
 def light_levels(light, corners, position, width):
@@ -31,7 +43,7 @@ def light_levels(light, corners, position, width):
     if light.is_focused:
         for effort, chosen in light_cone.efforts(light, position, width):
             if light.is_round:
-                corners = light.polygon(_FOCUSED_ROUND_CORNERS[effort.chords > 2])
+                corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
                 effort = replace(effort, chords=2)
             yield corners, effort, chosen
     elif light.is_round:
@@ -89,7 +101,7 @@ def _along(rows, vector, out, scratch):
 
 
 def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
-    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of fragile points.
+    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of points that need float64.
 
     A point sees the part of its polygon where all coordinates `clip_rows` are positive, if it is `facing` (P,) it.
     `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
@@ -105,18 +117,18 @@ def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count:
     for row in clip_rows:
         partly = partly & (np.maximum.reduce(corners[row], axis=0) > 0.0)
     cut = np.nonzero(partly & ~whole)[0]
-    values, fragile = np.zeros((count, points), np.float32), np.zeros(points, bool)
+    values, needs_float64 = np.zeros((count, points), np.float32), np.zeros(points, bool)
     if seen_whole > MOSTLY_WHOLE * points:
         found, mask = integrate(corners, None)
         np.multiply(found, whole, out=values)
-        np.logical_and(mask, whole, out=fragile)
+        np.logical_and(mask, whole, out=needs_float64)
     elif seen_whole:
         index = np.nonzero(whole)[0]
-        values[:, index], fragile[index] = integrate(np.take(corners, index, axis=2), index)
+        values[:, index], needs_float64[index] = integrate(np.take(corners, index, axis=2), index)
     if len(cut):
         for index, polygons in _clipped(np.take(corners, cut, axis=2), clip_rows):
-            values[:, cut[index]], fragile[cut[index]] = integrate(polygons, cut[index])
-    return values, fragile
+            values[:, cut[index]], needs_float64[cut[index]] = integrate(polygons, cut[index])
+    return values, needs_float64
 
 
 def _clipped(corners, clip_rows):
@@ -209,20 +221,13 @@ def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:
     return light_cone.LightView.of(light, offset, along)
 
 
-# The product of the contrast of a patch (see `_largest_size`) and the square of its size by that length is at most
-# this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
-# sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
-PRODUCT = 0.004
-# Half the diagonal of a patch by that length, at most: also where the means of its parts are equal.
-LARGEST = 0.5
-# The width of GGX lobes in rad, by alpha: where the normal distribution has a quarter of its peak.
-WIDTH = 2.0
-# Lobes seen at grazing angles are narrower across the view; below this cosine they become no narrower.
-LEAST_COSINE = 0.1
-
-
 def fitting_patches(light: AreaLight, samples: SurfaceSamples, specular: bool) -> Iterator[tuple]:
-    """Yield (index (Q,), lights): patches of `light`, and the samples that take them. Each sample gets all of it."""
+    """Yield (index (Q,), lights): the coarsest patches of `light` that the lobes of the samples `index` cannot resolve.
+
+    Each sample gets all of the light. A patch has the mean radiance of its parts. What the mean loses is second order
+    in the size of the patch by the length over which the rest of the integrand changes: the distance for diffuse lobes;
+    for specular ones the width of the lobe, or the angle from its peak where that is larger.
+    """
     brightness = np.abs(light.radiance).sum()
     open_patches = [(light, np.arange(len(samples)))]
     while open_patches:
@@ -247,7 +252,7 @@ def _largest_size(patch, brightness: float) -> float:
     # What is missing of a patch is dark.
     dark = max(1.0 - areas.sum() / np.linalg.norm(patch.area_vector), 0.0)
     contrast += dark * np.abs(patch.radiance).sum() / brightness
-    return min(np.sqrt(PRODUCT / max(contrast, 1e-9)), LARGEST)
+    return min(np.sqrt(PATCH_PRODUCT / max(contrast, 1e-9)), LARGEST_PATCH)
 
 
 def _sizes(patch, samples, specular) -> np.ndarray:
@@ -265,7 +270,7 @@ def _sizes(patch, samples, specular) -> np.ndarray:
 
 def _lobe_width(samples) -> np.ndarray:
     cosine = np.abs((samples.normal * samples.view).sum(axis=1))
-    return WIDTH * np.square(samples.roughness) * np.maximum(cosine, LEAST_COSINE)
+    return LOBE_WIDTH * np.square(samples.roughness) * np.maximum(cosine, LEAST_COSINE)
 
 
 def _angle_from_peak(samples, direction, size) -> np.ndarray:

@@ -1,4 +1,8 @@
-"""The lobe of a table: its value in a direction, its integral over a polygon."""
+"""Linearly transformed lobes: their values, and their integrals over polygons in closed form.
+
+LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and Peters 2021: both integrate the
+original distribution over the transformed polygon, which is clipped at the horizon first.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +17,10 @@ from .polygon import edge_sums, one_plus_cosine, project_to_sphere, solid_angle,
 
 # Edges with a smaller 1 + cos(theta), 11 degrees short of a half circle, get a corner in between.
 LONG_EDGE = 0.02
-DOUBLE_CHUNK = 4096
+# Samples whose arrays in float64 stay in the cache.
+FLOAT64_CHUNK = 4096
+# Corners per chunk in float32: a compromise between calls of numpy and arrays that stay in the cache.
+_FLOAT32_CORNERS = 49216
 
 
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
@@ -56,17 +63,17 @@ def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, s
         raise ValueError(f"vertices have shape {vertices.shape}, expected ({len(cosine)}, V >= 3, 3)")
     result = np.zeros(len(cosine), dtype=vertices.dtype)
     if vertices.dtype == np.float32 and table.degree <= moments32.MAX_DEGREE:
-        result, redo = integrate(table, cosine, roughness, vertices, signed)
+        result, redo = _integrate_in_float32(table, cosine, roughness, vertices, signed)
     else:
         redo = np.arange(len(cosine))
-    for start in range(0, len(redo), DOUBLE_CHUNK):
-        index = redo[start : start + DOUBLE_CHUNK]
+    for start in range(0, len(redo), FLOAT64_CHUNK):
+        index = redo[start : start + FLOAT64_CHUNK]
         arrays = (array[index].astype(np.float64, copy=False) for array in (cosine, roughness, vertices))
-        result[index] = _integrate_in_double(table, *arrays, signed)
+        result[index] = _integrate_in_float64(table, *arrays, signed)
     return result
 
 
-def _integrate_in_double(table, cosine, roughness, vertices, signed):
+def _integrate_in_float64(table, cosine, roughness, vertices, signed):
     lobe = table.lookup(cosine, roughness, curves=1)
     result = np.zeros(len(cosine))
     for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
@@ -134,17 +141,22 @@ def _as_float(cos_theta_o, roughness, vectors):
     return np.asarray(cos_theta_o, dtype=dtype), np.asarray(roughness, dtype=dtype), vectors.astype(dtype, copy=False)
 
 
-# Corners per chunk: a compromise between calls of numpy and arrays that stay in the cache.
-CORNERS = 49216
-
-
-def integrate(table, cosine, roughness, vertices, signed):
-    """Integrals (P,) as `lobe_integrals.integrate_polygon` returns them, all arrays float32, and the indices of the
-    points whose values are not accurate."""
+def _integrate_in_float32(table, cosine, roughness, vertices, signed):
+    """Integrals (P,) as `integrate_polygon` returns them, all arrays float32, and the indices of the points that need
+    float64."""
     count, corners = vertices.shape[:2]
     ridges, scratch = moments32.prepare(table), moments32.Scratch()
     result, redo = np.zeros(count, np.float32), np.zeros(count, bool)
-    step = max(CORNERS // corners, 512)
+
+    def integrate(corners, index):
+        chosen = weights if index is None else np.take(weights, index, axis=2)
+        values, angle, needs_float64 = ridges.integrals(corners, chosen, scratch)
+        if not signed:
+            values *= np.sign(angle)
+            np.maximum(values, np.float32(0.0), out=values)
+        return values, needs_float64
+
+    step = max(_FLOAT32_CORNERS // corners, 512)
     for start in range(0, count, step):
         part = slice(start, start + step)
         mu = np.clip(cosine[part], np.float32(0.0), np.float32(1.0))
@@ -152,10 +164,8 @@ def integrate(table, cosine, roughness, vertices, signed):
         sine = np.sqrt((np.float32(1.0) - mu) * (np.float32(1.0) + mu))
         warp, weights, tilt = ridges.fetch((0,), mu, sine, rough, None, scratch)
         polygons, clip_rows = _warped(vertices[part], warp, tilt, scratch)
-        values, fragile = integrate_visible(
-            polygons, np.ones(len(mu), bool), clip_rows, 1, partial(_integral, weights[0], ridges, signed, scratch)
-        )
-        result[part], redo[part] = values[0], fragile
+        values, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 1, integrate)
+        result[part] = values[0]
     redo |= roughness < moments32.SHARP_ROUGHNESS
     return result, np.nonzero(redo)[0]
 
@@ -181,20 +191,3 @@ def _warped(vertices, warp, tilt, scratch):
     rows[0] *= cosine
     rows[0] -= np.multiply(rows[3], sine, out=work)
     return rows, (3, 2)
-
-
-def _integral(weights, ridges, signed, scratch, corners, index):
-    """Integrals (1, Q) of the lobes `index` (None: all) and the mask (Q,) of fragile points."""
-    if index is not None:
-        weights = np.take(weights, index, axis=1)
-    if ridges.source.family == "ltc":
-        values, fragile = moments32.cosine_integral(corners, scratch)
-        values *= weights[0]
-        values *= np.float32(1.0 / np.pi)
-        # The clamped cosine is not negative: its integral has the sign of the solid angle.
-        return (values if signed else np.abs(values, out=values))[None], fragile
-    values, angle, fragile = moments32.weighted_moments(corners, weights[None], ridges.degree, scratch)
-    if not signed:
-        values *= np.sign(angle)
-        np.maximum(values, np.float32(0.0), out=values)
-    return values, fragile

@@ -1,4 +1,10 @@
-"""The hot path in float32: moments of polygon edges (equation numbers are the paper's), lobes along ridges."""
+"""The hot path in float32: moments of polygons, and the tables that weight them.
+
+The moments are those of `edge_integrals`, as coefficients of forms, from the cosines of the edges instead of the sums
+of their ends, and without any branch. Where that is not accurate the mask `needs_float64` tells so: the caller computes
+these points again in double precision. Arrays that are needed for a moment come from a `Scratch`, whose next user
+overwrites them.
+"""
 
 from __future__ import annotations
 
@@ -8,99 +14,27 @@ from math import prod
 
 import numpy as np
 
-from .edge_integrals import RIDGE_DIRECTIONS
+from .edge_integrals import RIDGE_DIRECTIONS, arc_polynomial
 from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
 from .spherical_harmonics import coefficient_count
 
-_PHI_DEGREE, _PSI_DEGREE = 7, 8
-
-
-@cache
-def _arc_polynomials() -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients in s = sqrt(1 + cos theta), highest power first, of s theta / sin(theta) and of s psi.
-
-    psi = (theta / sin(theta) - 1) / (1 - cos theta). Interpolated at Chebyshev points; relative errors 8e-7 and 6e-7.
-    """
-
-    def phi(s):
-        return s * _phi(s)
-
-    def psi(s):
-        rest = 2.0 - s * s
-        small = rest < 1e-3
-        return s * np.where(small, 1.0 / 3.0 + 2.0 / 15.0 * rest, (_phi(s) - 1.0) / np.where(small, 1.0, rest))
-
-    domain = [0.0, np.sqrt(2.0)]
-    fits = [
-        np.polynomial.Chebyshev.interpolate(function, degree, domain=domain).convert(kind=np.polynomial.Polynomial)
-        for function, degree in ((phi, _PHI_DEGREE), (psi, _PSI_DEGREE))
-    ]
-    return tuple(fit.coef[::-1].astype(np.float32) for fit in fits)
-
-
-def _phi(s):
-    cosine = np.clip(s * s - 1.0, -1.0, 1.0)
-    theta = 2.0 * np.arctan2(np.sqrt(1.0 - cosine), np.sqrt(1.0 + cosine))
-    return np.where(theta > 0.0, theta / np.where(theta > 0.0, np.sin(theta), 1.0), 1.0)
-
-
-def _horner(coefficients, variable, out):
-    np.multiply(variable, coefficients[0], out=out)
-    for coefficient in coefficients[1:-1]:
-        out += coefficient
-        out *= variable
-    out += coefficients[-1]
-    return out
-
-
-def phi_of(shifted, scratch):
-    """theta / sin(theta) of edges with 1 + cos(theta) in `shifted` (V, P)."""
-    root = np.sqrt(shifted, out=scratch("root", shifted.shape))
-    phi = _horner(_arc_polynomials()[0], root, scratch("phi", shifted.shape))
-    phi /= root
-    return phi
-
-
-class ArcFactors:
-    """What all ridges share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None where unused."""
-
-    def __init__(self, degree, shifted, scratch):
-        shape = shifted.shape
-        self.q = self.psi = self.square = self.cube = None
-        if degree < 3:
-            self.phi = phi_of(shifted, scratch)
-        else:
-            root = np.sqrt(shifted, out=scratch("root", shape))
-            self.psi = _horner(_arc_polynomials()[1], root, scratch("psi", shape))
-            self.psi /= root
-            self.phi = np.subtract(np.float32(2.0), shifted, out=scratch("phi", shape))
-            self.phi *= self.psi
-            self.phi += np.float32(1.0)
-        if degree > 1:
-            self.q = np.divide(np.float32(1.0), shifted, out=scratch("q", shape))
-        if degree > 2:
-            self.square = np.add(self.psi, np.float32(1.0), out=scratch("square", shape))
-            self.square *= self.q
-            self.square *= np.float32(0.5)
-        if degree > 3:
-            self.cube = np.add(self.q, np.float32(1.0), out=scratch("cube", shape))
-            self.cube *= np.float32(1.0 / 3.0)
-
-
 MAX_DEGREE = 4
-# Where single precision fails, points are reported as fragile. An edge short of a half circle, here by 8 degrees, has
-# no direction: least 1 + cos(theta). The edges of a tiny polygon cancel: least sum of their angles, if all are equal.
-# Corners are as exact as the farthest of them: least distance of a corner, as a share of that.
+# An edge short of a half circle, here by 8 degrees, has no direction: least 1 + cos(theta). The edges of a tiny polygon
+# cancel: least sum of their angles, if all are equal. Corners are as exact as the farthest of them: least distance of a
+# corner, as a share of that.
 SHORTEST_SAFE = 0.01
 SMALLEST_SAFE = 0.08
 NEAREST_SAFE = 0.01
 # Solid angles close to 2 pi are close to the branch cut of the arc tangent.
 LARGEST_SAFE_ANGLE = 5.9
+# Sharper lobes amplify the rounding of directions too much for single precision: at this roughness 2 alpha = 0.02.
+SHARP_ROUGHNESS = 0.1
 # Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
 MANY_CORNERS = 64
 # Corners of the polygons whose moments are computed at a time: their arrays stay in a second-level cache of 1 MiB.
 PIECE_CORNERS = 24624
-VIEWS_KEPT = 1000
+_VIEWS_KEPT = 1000
+_DIELECTRICS_KEPT = 64
 _TINY = np.float32(1e-30)
 
 
@@ -122,15 +56,74 @@ class Scratch:
             # A larger array replaces this one: views of it would keep it alive.
             self._views = {key: view for key, view in self._views.items() if key[0] != name}
             array = self._arrays[name] = np.empty(size, dtype=np.float32)
-        elif len(self._views) > VIEWS_KEPT:
+        elif len(self._views) > _VIEWS_KEPT:
             self._views.clear()
         view = self._views[name, shape] = array[:size].reshape(shape)
         return view
 
 
-def project(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (3, V + 1, P) along the corners (>= 3 rows, V, P), the first corner once more at the end, and the
-    mask (P,) of polygons with a corner that is fragile because it is near."""
+def pieces(count: int, most: int) -> list[slice]:
+    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
+    number = max(-(-count // max(most, 512)), 1)
+    size = max(-(-count // number), 1)
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+@cache
+def _arc_coefficients(factor: str, degree: int) -> np.ndarray:
+    """Coefficients as of `arc_polynomial` in s = sqrt(1 + cos theta); relative errors 8e-7 of phi and 6e-7 of psi."""
+    return arc_polynomial(factor, degree, np.sqrt(2.0)).astype(np.float32)
+
+
+def _horner(coefficients, variable, out):
+    np.multiply(variable, coefficients[0], out=out)
+    for coefficient in coefficients[1:-1]:
+        out += coefficient
+        out *= variable
+    out += coefficients[-1]
+    return out
+
+
+def _arc_factor(factor, degree, shifted, scratch):
+    """phi or psi of edges with 1 + cos(theta) in `shifted` (V, P), from a polynomial."""
+    root = np.sqrt(shifted, out=scratch("root", shifted.shape))
+    values = _horner(_arc_coefficients(factor, degree), root, scratch(factor, shifted.shape))
+    values /= root
+    return values
+
+
+def _phi(shifted, scratch):
+    return _arc_factor("phi", 7, shifted, scratch)
+
+
+class _ArcFactors:
+    """What all ridges share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None where unused."""
+
+    def __init__(self, degree, shifted, scratch):
+        shape = shifted.shape
+        self.q = self.psi = self.square = self.cube = None
+        if degree < 3:
+            self.phi = _phi(shifted, scratch)
+        else:
+            self.psi = _arc_factor("psi", 8, shifted, scratch)
+            self.phi = np.subtract(np.float32(2.0), shifted, out=scratch("phi", shape))
+            self.phi *= self.psi
+            self.phi += np.float32(1.0)
+        if degree > 1:
+            self.q = np.divide(np.float32(1.0), shifted, out=scratch("q", shape))
+        if degree > 2:
+            self.square = np.add(self.psi, np.float32(1.0), out=scratch("square", shape))
+            self.square *= self.q
+            self.square *= np.float32(0.5)
+        if degree > 3:
+            self.cube = np.add(self.q, np.float32(1.0), out=scratch("cube", shape))
+            self.cube *= np.float32(1.0 / 3.0)
+
+
+def _edges(corners, scratch, smallest):
+    """Unit vectors (3, V + 1, P) along the corners (>= 3 rows, V, P), the first once more at the end, 1 + cos(theta)
+    (V, P) of the edges, kept positive, and the mask (P,) of polygons that need float64, among them those whose edges
+    are shorter than `smallest` in all."""
     _, count, points = corners.shape
     unit = scratch("unit", (3, count + 1, points))
     length = scratch("two", (count, points))
@@ -138,29 +131,22 @@ def project(corners: np.ndarray, scratch: Scratch) -> tuple[np.ndarray, np.ndarr
     np.add.reduce(squares, axis=0, out=length)
     near = np.maximum.reduce(length, axis=0)
     near *= np.float32(NEAREST_SAFE**2)
-    fragile = np.minimum.reduce(length, axis=0) < near
+    needs_float64 = np.minimum.reduce(length, axis=0) < near
     # A corner at the point itself becomes the zero vector.
     length += _TINY
     np.divide(np.float32(1.0), np.sqrt(length, out=length), out=length)
     np.multiply(corners[:3], length, out=unit[:, :-1])
     unit[:, -1] = unit[:, 0]
-    return unit, fragile
-
-
-def shifted_cosines(unit: np.ndarray, scratch: Scratch, smallest: float) -> tuple[np.ndarray, np.ndarray]:
-    """1 + cos(theta) (V, P) of the edges, kept positive, and the mask (P,) of fragile polygons, among them those whose
-    edges are shorter than `smallest` in all."""
-    _, count, points = unit.shape
-    products = np.multiply(unit[:, :-1], unit[:, 1:], out=scratch("three", (3, count - 1, points)))
-    shifted = np.add.reduce(products, axis=0, out=scratch("shifted", (count - 1, points)))
+    products = np.multiply(unit[:, :-1], unit[:, 1:], out=scratch("three", (3, count, points)))
+    shifted = np.add.reduce(products, axis=0, out=scratch("shifted", (count, points)))
     shifted += np.float32(1.0)
     least = np.minimum.reduce(shifted, axis=0)
     np.absolute(shifted, out=shifted)
     shifted += np.float32(1e-12)
-    fragile = least < np.float32(SHORTEST_SAFE)
+    needs_float64 |= least < np.float32(SHORTEST_SAFE)
     if smallest > 0.0:
-        fragile |= least > np.float32(2.0 - 0.5 * (smallest / min(count - 1, MANY_CORNERS)) ** 2)
-    return shifted, fragile
+        needs_float64 |= least > np.float32(2.0 - 0.5 * (smallest / min(count, MANY_CORNERS)) ** 2)
+    return unit, shifted, needs_float64
 
 
 def _cross_component(unit, first, second, scratch, out):
@@ -173,33 +159,30 @@ def _cross_component(unit, first, second, scratch, out):
 def cosine_integral(
     corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed integral (P,) of z over polygons (>= 3 rows, V, P) in z >= 0, and the mask (P,) of fragile points."""
-    unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch, smallest)
-    fragile |= near
-    normal = _cross_component(unit, 0, 1, scratch, scratch("normal", shifted.shape))
-    normal *= phi_of(shifted, scratch)
-    integral = np.add.reduce(normal, axis=0)
-    integral *= np.float32(0.5)
-    return integral, fragile
+    """Signed integral (P,) of z over polygons (>= 3 rows, V, P) in z >= 0, and the mask (P,) of points that need
+    float64."""
+    integrals, needs_float64 = _direction_integrals(corners, (2,), scratch, smallest)
+    return integrals[0], needs_float64
 
 
 def vector_irradiance(
     corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Signed integrals (3, P) of the direction over polygons (>= 3 rows, V, P), and the mask (P,) of fragile points."""
-    unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch, smallest)
-    fragile |= near
-    phi = phi_of(shifted, scratch)
-    integrals = np.empty((3, corners.shape[2]), dtype=np.float32)
-    for axis in range(3):
-        out = scratch("normal", shifted.shape)
-        normal = _cross_component(unit, (axis + 1) % 3, (axis + 2) % 3, scratch, out)
+    """Signed integrals (3, P) of the direction over polygons (>= 3 rows, V, P), and the mask (P,) of points that need
+    float64."""
+    return _direction_integrals(corners, (0, 1, 2), scratch, smallest)
+
+
+def _direction_integrals(corners, axes, scratch, smallest):
+    unit, shifted, needs_float64 = _edges(corners, scratch, smallest)
+    phi = _phi(shifted, scratch)
+    integrals = np.empty((len(axes), corners.shape[2]), dtype=np.float32)
+    for axis, out in zip(axes, integrals, strict=True):
+        normal = _cross_component(unit, (axis + 1) % 3, (axis + 2) % 3, scratch, scratch("normal", shifted.shape))
         normal *= phi
-        np.add.reduce(normal, axis=0, out=integrals[axis])
+        np.add.reduce(normal, axis=0, out=out)
     integrals *= np.float32(0.5)
-    return integrals, fragile
+    return integrals, needs_float64
 
 
 def form_matrix(degree: int) -> np.ndarray:
@@ -221,10 +204,8 @@ def moments(
     corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0 that need not be unit, in the order of `form_matrix`, and
-    the mask (P,) of fragile points. `degree` 1 to 4. The result is overwritten by the next call."""
-    unit, near = project(corners, scratch)
-    shifted, fragile = shifted_cosines(unit, scratch, smallest)
-    fragile |= near
+    the mask (P,) of points that need float64. `degree` 1 to 4. The result is overwritten by the next call."""
+    unit, shifted, needs_float64 = _edges(corners, scratch, smallest)
     shape = shifted.shape
     result = scratch("moments", (coefficient_count(degree), shape[1]))
     normal = scratch("normal", (2, *shape))
@@ -232,21 +213,21 @@ def moments(
         _cross_component(unit, first, second, scratch, row)
     total = np.add(unit[::2, :-1], unit[::2, 1:], out=scratch("total", normal.shape))
     result[0] = angle = _solid_angle(shifted, total[1], normal[1], scratch)
-    fragile |= np.abs(angle) > np.float32(LARGEST_SAFE_ANGLE)
-    factors = ArcFactors(degree, shifted, scratch)
+    needs_float64 |= np.abs(angle) > np.float32(LARGEST_SAFE_ANGLE)
+    factors = _ArcFactors(degree, shifted, scratch)
     pair = scratch("pair", normal.shape)
-    _sum_edges(np.multiply(normal, factors.phi, out=pair), result[1:3])
+    np.add.reduce(np.multiply(normal, factors.phi, out=pair), axis=1, out=result[1:3])
     if degree == 1:
-        return result, fragile
+        return result, needs_float64
     np.multiply(normal, factors.q, out=pair)
     linear = _product(pair, total, scratch("linear", (3, *shape)), scratch)
-    _sum_edges(linear, result[3:6])
+    np.add.reduce(linear, axis=1, out=result[3:6])
     if degree == 2:
-        return result, fragile
+        return result, needs_float64
     product = _product(unit[::2, :-1], unit[::2, 1:], scratch("product", linear.shape), scratch)
     squared = _product(total, total, scratch("squared", linear.shape), scratch)
     if degree == 4:
-        _sum_edges(_quartic(linear, product, squared, factors.cube, pair, scratch), result[10:15])
+        np.add.reduce(_quartic(linear, product, squared, factors.cube, pair, scratch), axis=1, out=result[10:15])
     squared *= factors.square
     product *= factors.psi
     squared -= product
@@ -254,8 +235,8 @@ def moments(
     np.multiply(normal, squared[::2], out=cubic[::3])
     np.multiply(normal, squared[1], out=cubic[1:3])
     cubic[1:3] += np.multiply(normal[::-1], squared[::2], out=pair)
-    _sum_edges(cubic, result[6:10])
-    return result, fragile
+    np.add.reduce(cubic, axis=1, out=result[6:10])
+    return result, needs_float64
 
 
 def _product(a, b, out, scratch):
@@ -280,35 +261,6 @@ def _quartic(linear, product, squared, cube, pair, scratch):
     result[2] += pair[0]
     result[2] += pair[1]
     return result
-
-
-def weighted_moments(
-    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
-    in sr, and the mask (P,) of fragile points. `degree` 1 to 4."""
-    vectors, _, points = weights.shape
-    sums = np.empty((vectors, points), np.float32)
-    angle, fragile = np.empty(points, np.float32), np.empty(points, bool)
-    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
-        found, fragile[part] = moments(corners[:, :, part], degree, scratch, smallest)
-        weight = weights[:, :, part]
-        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
-        np.add.reduce(products, axis=1, out=sums[:, part])
-        angle[part] = found[0]
-    return sums, angle, fragile
-
-
-def pieces(count: int, most: int) -> list[slice]:
-    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
-    number = max(-(-count // max(most, 512)), 1)
-    size = max(-(-count // number), 1)
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-
-def _sum_edges(values, out):
-    """Sum (D, P) over the edges of values (D, V, P)."""
-    np.add.reduce(values, axis=1, out=out)
 
 
 def _normalize(real, imaginary, scratch):
@@ -350,16 +302,31 @@ def _solid_angle(shifted, total_z, normal_z, scratch):
     return angle
 
 
-# Sharper lobes amplify the rounding of directions too much for single precision: at this roughness 2 alpha = 0.02.
-SHARP_ROUGHNESS = 0.1
-DIELECTRICS_KEPT = 64
+def weighted_moments(
+    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
+    in sr, and the mask (P,) of points that need float64. `degree` 1 to 4."""
+    vectors, _, points = weights.shape
+    sums = np.empty((vectors, points), np.float32)
+    angle, needs_float64 = np.empty(points, np.float32), np.empty(points, bool)
+    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
+        found, needs_float64[part] = moments(corners[:, :, part], degree, scratch, smallest)
+        weight = weights[:, :, part]
+        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
+        np.add.reduce(products, axis=1, out=sums[:, part])
+        angle[part] = found[0]
+    return sums, angle, needs_float64
 
 
 @dataclass(frozen=True)
 class RidgeTable:
-    """One table; `fetch` interpolates chosen vectors of its weights.
+    """One table, ready for the hot path; `fetch` interpolates chosen vectors of its weights.
 
-    A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each sample's own IOR.
+    Coefficients of spherical harmonics become weights of the moments once, at the nodes of the table: both steps are
+    linear, so they may change places with the interpolation. Only those Fresnel curves are fetched that a batch of
+    points needs. A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each
+    sample's own IOR.
     """
 
     source: LookupTable
@@ -376,7 +343,7 @@ class RidgeTable:
         """Float32 array (C, R * T): the warp's parameters, then the K weights of each vector."""
         stacked = self._stacked.get(vectors)
         if stacked is None:
-            if len(self._stacked) >= DIELECTRICS_KEPT:
+            if len(self._stacked) >= _DIELECTRICS_KEPT:
                 self._stacked.clear()
             parts = [self.parameters, *(self._vector(vector) for vector in vectors)]
             stacked = self._stacked[vectors] = np.concatenate(parts).astype(np.float32)
@@ -413,15 +380,25 @@ class RidgeTable:
             weights = np.concatenate([weights[:first], combined[None]])
         return warp, weights, values[3] if count == 4 else None
 
+    def integrals(self, corners, weights, scratch, smallest=SMALLEST_SAFE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Signed integrals (F, P) of lobes with weights (F, K, P) over polygons (>= 3 rows, V, P), numbers (P,) with
+        the sign of the solid angle, and the mask (P,) of points that need float64."""
+        if self.source.family == "ltsh":
+            return weighted_moments(corners, weights, self.degree, scratch, smallest)
+        # The clamped cosine is not negative: its integral has the sign of the solid angle.
+        integral, needs_float64 = cosine_integral(corners, scratch, smallest)
+        values = weights[:, 0] * integral
+        values *= np.float32(1.0 / np.pi)
+        return values, integral, needs_float64
+
 
 def prepare(table: LookupTable) -> RidgeTable:
-    """The table for the hot path, with weights of the moments of `edge_loop`, made once per table. Degrees above
-    `edge_loop.MAX_DEGREE` have none: ValueError."""
-    return _kept(table, "_ridge_table", lambda: _ridge_product(table.ridge_weights, form_matrix(table.degree)))
+    """The table with weights of the `moments` here, made once per table. Degrees above MAX_DEGREE: ValueError."""
+    return _kept(table, "_ridge_table", lambda: _product_in_order(table.ridge_weights, form_matrix(table.degree)))
 
 
 def along_directions(table: LookupTable) -> RidgeTable:
-    """As `prepare`, with weights of the moments of `edge_integrals`, which shaders use."""
+    """As `prepare`, with weights of `edge_integrals.moments`, which shaders use."""
     return _kept(table, "_direction_table", lambda: table.ridge_weights)
 
 
@@ -443,11 +420,11 @@ def _build(table, matrix):
     rows, columns, curves, count = table.coefficients.shape
     flat = table.coefficients.reshape(rows * columns, curves, count)
     if table.family == "ltsh":
-        flat = _ridge_product(flat, matrix())
+        flat = _product_in_order(flat, matrix())
     return RidgeTable(table, table.warp.reshape(rows * columns, -1).T, flat.transpose(1, 2, 0))
 
 
-def _ridge_product(vectors, matrix):
+def _product_in_order(vectors, matrix):
     """Vectors (..., K) times a matrix (K, K). Not a matrix product of numpy's: the same bits on every machine."""
     return sum(vectors[..., k, None] * row for k, row in enumerate(matrix))
 

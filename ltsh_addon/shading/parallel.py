@@ -1,4 +1,10 @@
-"""Blocks of samples for several processes: shared memory, the queue, the children."""
+"""Blocks of samples on all cores: this process and child processes take them from one list.
+
+Threads do not pay off here, numpy's calls are too short. Children are interpreters started by path, never forked:
+inside Blender a fork would copy a process with threads and a window. The blocks and what happens in each do not depend
+on how many processes there are, so the result does not either; where no child can be started this process does it all.
+A block reaches a child, and its radiance comes back, through memory that both share.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +26,27 @@ import numpy as np
 from ..scene import SCALAR_FIELDS, Cancelled, SurfaceSamples
 from . import moments32, worker
 
+# A child takes some 0.2 s to start: shorter tasks are done in this process.
+SECONDS_WORTH_A_CHILD = 0.5
+PATIENCE_SECONDS = 0.1
+ENDING_SECONDS = 5.0
+CORES_VARIABLE = "LTSH_CORES"
+_PACKAGE = __package__.rpartition(".")[0]
+_logger = logging.getLogger(__name__)
+# Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
+_ONLY_DIFFUSE = {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"}
+_ONLY_SPECULAR = {
+    "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
+}  # fmt: skip
 _ALIGNMENT = 64
 
 
 class SharedBlock:
-    """`size` bytes of shared memory; `handle` is what a child process needs to attach to them."""
+    """`size` bytes of shared memory; `handle` is what a child process needs to attach to them.
+
+    On Linux and macOS it is a file without a name that the child inherits, on Windows a named mapping: in either case
+    the system frees it as soon as both processes are gone, however they end.
+    """
 
     def __init__(self, size: int):
         self._file = None
@@ -75,13 +97,6 @@ def layout_of(arrays: dict[str, tuple[tuple[int, ...], np.dtype]]) -> tuple[list
 def arrays_in(memory, layout) -> dict[str, np.ndarray]:
     """Arrays by name in a buffer."""
     return {name: np.ndarray(shape, dtype, memory, offset) for name, shape, dtype, offset in layout}
-
-
-# Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
-_ONLY_DIFFUSE = {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"}
-_ONLY_SPECULAR = {
-    "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
-}  # fmt: skip
 
 
 class ParentSide:
@@ -169,15 +184,6 @@ class ChildSide:
 def _is_zero_everywhere(values) -> bool:
     """True for one zero that stands for all elements, as `SurfaceSamples` has it for what is left out."""
     return values.size > 0 and not any(values.strides) and not values.flat[0]
-
-
-# A child takes some 0.2 s to start: shorter tasks are done in this process.
-SECONDS_WORTH_A_CHILD = 0.5
-PATIENCE_SECONDS = 0.1
-ENDING_SECONDS = 5.0
-CORES_VARIABLE = "LTSH_CORES"
-_PACKAGE = __package__.rpartition(".")[0]
-_logger = logging.getLogger(__name__)
 
 
 def run(

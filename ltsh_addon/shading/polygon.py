@@ -1,10 +1,25 @@
-"""Polygons on the sphere: cut at the horizon, solid angle, convex pieces."""
+"""Polygons seen from shading points: cut at the horizon, projected to the sphere, solid angle, convex pieces.
+
+Batches of polygons are arrays (3, V, P): coordinate, corner, point. Unused corners repeat a neighbor: an edge between
+equal corners contributes exactly zero to every integral.
+"""
 
 from __future__ import annotations
 
 from functools import cache
 
 import numpy as np
+
+# Up to this many corners a bit pattern tells which are above the horizon.
+PATTERN_CORNERS = 8
+DARK, WHOLE, SINGLE_RUN, SEVERAL_RUNS = range(4)
+# Turns below this share of the squared size of the polygon count as straight.
+STRAIGHT = 1e-12
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Scalar products (...) of vectors (3, ...)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
@@ -34,11 +49,6 @@ def _compact(slots: np.ndarray, used: np.ndarray) -> np.ndarray:
     row = np.minimum(np.arange(max(int(count.max(initial=1)), 1))[:, None], count - 1)
     index = np.take_along_axis(order, row, axis=0)
     return np.take_along_axis(slots, index[None], axis=1)
-
-
-# Up to this many corners a bit pattern tells which are above the horizon.
-PATTERN_CORNERS = 8
-DARK, WHOLE, SINGLE_RUN, SEVERAL_RUNS = range(4)
 
 
 @cache
@@ -136,16 +146,9 @@ def split_long_edges(vertices: np.ndarray) -> np.ndarray:
     return np.stack([vertices, nearest], axis=2).reshape(3, -1, vertices.shape[2])
 
 
-def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products (...) of vectors (3, ...)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
 def project_to_sphere(vertices: np.ndarray) -> np.ndarray:
     """Unit vectors along `vertices` (3, V, P); a corner at the origin stays (0, 0, 0)."""
-    squared = vertices[0] * vertices[0] + vertices[1] * vertices[1] + vertices[2] * vertices[2]
-    tiny = np.finfo(vertices.dtype).tiny
-    return vertices / np.sqrt(np.maximum(squared, tiny))
+    return vertices / np.sqrt(np.maximum(dot(vertices, vertices), np.finfo(vertices.dtype).tiny))
 
 
 def edge_sums(unit: np.ndarray) -> np.ndarray:
@@ -159,7 +162,7 @@ def edge_sums(unit: np.ndarray) -> np.ndarray:
 
 def one_plus_cosine(total: np.ndarray) -> np.ndarray:
     """1 + cos(theta) of edges of length theta from the sums (3, ...) of their ends."""
-    return 0.5 * (total[0] * total[0] + total[1] * total[1] + total[2] * total[2])
+    return 0.5 * dot(total, total)
 
 
 def solid_angle(unit: np.ndarray) -> np.ndarray:
@@ -189,14 +192,12 @@ def solid_angle(unit: np.ndarray) -> np.ndarray:
     return np.where(wrapped, -angle, angle)
 
 
-# Turns below this share of the squared size of the polygon count as straight.
-STRAIGHT = 1e-12
-
-
 def convex_pieces(corners: np.ndarray) -> list[np.ndarray]:
     """Convex polygons (W, 3), all the same way around as the simple, flat polygon `corners` (V, 3) that they make up.
 
-    Repeated corners and corners on straight edges are left out. A polygon without area gives no pieces.
+    Repeated corners and corners on straight edges are left out. A polygon without area gives no pieces. Ears are
+    clipped off, then pieces are joined as long as they stay convex (Hertel and Mehlhorn 1983): there are at most four
+    times as many as needed.
     """
     flat = _in_its_plane(corners)
     size = np.ptp(flat, axis=0).max()

@@ -1,4 +1,14 @@
-"""Quadrature of the true BRDF over area lights: the technique `reference`."""
+"""Quadrature of the true BRDF over area lights, with an estimate of its error: the technique `reference`.
+
+The light is warped by W (see `lookup_table`) with A = B = C = 1, the limit of GGX for alpha -> 0, which flattens the
+lobe's peak; no fitted number enters. With an apex p inside the warped light and its boundary w(t),
+
+    int f dw = contour_integral (w x dw) . p  int_0^rho f J sin(r) dr / sin^2(rho),
+
+where rho is the angle between p and w(t), the inner integral runs along the arc from p to w(t), and J is the Jacobian
+of the warp. The integrands are analytic on every piece of the boundary, so Gauss-Legendre rules converge fast; their
+order grows until two orders agree. Lights are exact ellipses, convex pieces of polygons, and their parts in a cone.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +28,9 @@ _ORDERS = ((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72))
 _ELLIPSE_PIECES = 8
 # Evaluations per batch: the arrays of one batch stay in the cache.
 _BATCH = 60_000
+_ROUND_CORNERS = 128
+# Per arc of a cone's edge, where the factor of the spread is 0.
+_CONE_CHORDS = 4
 
 
 @dataclass(frozen=True)
@@ -240,15 +253,10 @@ def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
     return values / ((warp.xx * warp.yy * warp.zz) * length**3), half, direction
 
 
-FINE_ROUND_LIGHT_CORNERS = 128
-# Per arc of a cone's edge, where the factor of the spread is 0.
-CONE_CHORDS = 4
-
-
 def reference_integrals(samples, cosine, frame, light, corners, candidates, error):
     """Yield (index, integrals (4, Q)) by quadrature; integrals of the same point add up. Adds to error (P,)."""
     if light.is_round:
-        corners = light.polygon(FINE_ROUND_LIGHT_CORNERS)
+        corners = light.polygon(_ROUND_CORNERS)
     if light.is_focused:
         batches = _cone_parts(samples, cosine, frame, light, corners, candidates)
     elif light.is_round:
@@ -294,8 +302,7 @@ def _uncut_ellipses(samples, frame, light, candidates):
 
 def _ellipse_extent(normal, offset, light):
     """Heights (P,) of the light's center over the planes with `normal` (3, P), and how far it reaches up and down."""
-    u, v = (sum(normal[k] * vector[k] for k in range(3)) for vector in (light.half_u, light.half_v))
-    return (normal * offset).sum(axis=0), np.hypot(u, v)
+    return dot(normal, offset), np.hypot(dot(normal, light.half_u), dot(normal, light.half_v))
 
 
 def _cone_parts(samples, cosine, frame, light, corners, candidates):
@@ -311,7 +318,7 @@ def _cone_parts(samples, cosine, frame, light, corners, candidates):
         index, view = index[near], view.take(near)
         part = light_cone.DiskParts(polygon[3:, :, near])
         reach = tangent * view.distance
-        flat = part.inside(reach, CONE_CHORDS)
+        flat = part.inside(reach, _CONE_CHORDS)
         axis = view.foot[3:] / view.distance
         for chosen, boundary, at_foot in _around_foot_and_peak(part, reach, flat, view):
             cone = Cone(axis[:, chosen], tangent, share, at_foot)

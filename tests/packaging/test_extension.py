@@ -41,7 +41,8 @@ def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
     """On a copy with one file of every kind, so that the answer does not hang on what lies in this clone."""
     source = tmp_path / "source"
     kept = ["__init__.py", "LICENSE", "README.md", "docs/manual.md", "ltsh_addon/__init__.py",
-            "ltsh_addon/blender/x.py", "tables/a.npz"]  # fmt: skip
+            "ltsh_addon/blender/x.py", "ltsh_addon/blender/glsl/x.glsl", "ltsh_addon/shading/glsl/x.h",
+            "tables/a.npz"]  # fmt: skip
     left = ["Makefile", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py", "tables/README.md",
             "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run", "ltsh.zip",
             "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",

@@ -1,26 +1,28 @@
-"""The second pass: light of all samples, and what horizons leave of lobes."""
+"""The second pass: reflected radiance of a G-buffer under area lights, and before it which horizons end its lobes.
+
+Same lights, tables and integrals as `shading.shade`, in float32 throughout.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 
 import gpu
-from gpu_extras.batch import batch_for_shader
 
 from ...cycles import horizons
-from ...scene import AreaLight
+from ...scene import PASSES, AreaLight
 from ...shading import load_table
 from ...shading.lookup_table import LookupTable
 from .shaders import (
     BRIGHTNESS,
     CHOICE,
     EXCESS,
-    HORIZON_ROUND_CORNERS,
-    TEXTURES,
-    VERTEX,
+    HORIZON_CORNERS,
+    HORIZON_SAMPLERS,
     Features,
-    fragment_source,
-    horizon_fragment_source,
+    horizon_shader,
+    lighting_shader,
 )
 from .textures import (
     SAMPLERS,
@@ -33,15 +35,18 @@ from .textures import (
     upload_lights,
 )
 
-_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _RESULTS = {BRIGHTNESS: "brightnesses", EXCESS: "excesses", CHOICE: "horizons"}
+_SHOWN_PASSES = (*PASSES, "combined")
 
 
 class HorizonPass:
-    """The choice for one view; needs an active GPU context."""
+    """Chooses per pixel which horizon ends the specular lobe, as `cycles.horizons` does for samples.
+
+    Needs an active GPU context.
+    """
 
     def __init__(self):
-        self._shaders = {step: _shader(step) for step in TEXTURES}
+        self._shaders = {step: horizon_shader(step) for step in _RESULTS}
         self._size, self._textures, self._buffers = None, {}, {}
 
     def free(self) -> None:
@@ -54,7 +59,7 @@ class HorizonPass:
         `view` is the camera's place and 1, or for parallel views the unit direction toward it and 0.
         """
         self._resize(gbuffer.size)
-        corners = [HORIZON_ROUND_CORNERS if light.is_round else len(light.polygon()) for light in lights.lights]
+        corners = [HORIZON_CORNERS if light.is_round else len(light.polygon()) for light in lights.lights]
         directions = horizons.AROUND * len(horizons.HEIGHTS)
         self._run(BRIGHTNESS, gbuffer, lights, shares(corners))
         self._run(EXCESS, gbuffer, lights, shares([directions * count for count in corners]), view)
@@ -77,7 +82,7 @@ class HorizonPass:
             gpu.state.depth_test_set("NONE")
             try:
                 shader.bind()
-                for name in TEXTURES[step]:
+                for name in HORIZON_SAMPLERS[step]:
                     own = self._textures.get(name) or (lights.texture if name == "lights" else None)
                     shader.uniform_sampler(name, own or getattr(gbuffer, SAMPLERS[name]))
                 if view is not None:
@@ -89,26 +94,6 @@ class HorizonPass:
                     gpu.state.blend_set("ADDITIVE_PREMULT")
             finally:
                 gpu.state.blend_set("NONE")
-
-
-def _shader(step):
-    info = gpu.types.GPUShaderCreateInfo()
-    info.vertex_in(0, "VEC2", "corner")
-    info.fragment_out(0, "VEC4", "color")
-    # What a shader does not use is not there for whom sets it.
-    if step != CHOICE:
-        info.push_constant("IVEC2", "place")
-    if step == EXCESS:
-        info.push_constant("VEC4", "view")
-    for slot, name in enumerate(TEXTURES[step]):
-        info.sampler(slot, "FLOAT_2D", name)
-    info.vertex_source(VERTEX)
-    info.fragment_source(horizon_fragment_source(step))
-    shader = gpu.shader.create_from_info(info)
-    return shader, batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
-
-
-PASSES = ("specular", "diffuse", "combined")
 
 
 class LightingPass:
@@ -161,12 +146,13 @@ class LightingPass:
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is one of `PASSES`. Give the camera's place, or for orthographic cameras the unit direction toward
-        it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in `target` (None: what
-        is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of the same surfaces.
+        `passes` is "specular", "diffuse" or "combined". Give the camera's place, or for orthographic cameras the unit
+        direction toward it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in
+        `target` (None: what is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of
+        the same surfaces.
         """
-        if passes not in PASSES:
-            raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(PASSES)}")
+        if passes not in _SHOWN_PASSES:
+            raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
         if (view_position is None) == (view_direction is None):
             raise ValueError("lighting pass: give either view_position or view_direction")
         x, y, width, height = rect or (0, 0, *gbuffer.size)
@@ -179,45 +165,30 @@ class LightingPass:
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
         )
-        if target is None:
-            self._draw(features, gbuffer, view, (x, y, width, height), add)
-            return
-        with target.bind():
-            self._draw(features, gbuffer, view, (x, y, width, height), add)
-
-    def _draw(self, features, gbuffer, view, rect, add):
-        shader, batch, samplers = self._shader(features)
-        x, y, width, height = rect
-        previous = gpu.state.viewport_get(), gpu.state.blend_get()
-        gpu.state.viewport_set(x, y, width, height)
-        gpu.state.blend_set("ADDITIVE" if add else "NONE")
-        try:
-            shader.bind()
-            for name in samplers:
-                shader.uniform_sampler(name, self._texture(name, gbuffer))
-            if features.specular:
-                shader.uniform_float("view", view)
-            for first, end in self._shares:
-                shader.uniform_int("place", (x, y, first, end))
-                batch.draw(shader)
-                gpu.state.blend_set("ADDITIVE")
-        finally:
-            gpu.state.viewport_set(*previous[0])
-            gpu.state.blend_set(previous[1])
+        if features not in self._shaders:
+            self._shaders[features] = lighting_shader(self.table, features)
+        shader, batch = self._shaders[features]
+        with nullcontext() if target is None else target.bind():
+            previous = gpu.state.viewport_get(), gpu.state.blend_get()
+            gpu.state.viewport_set(x, y, width, height)
+            gpu.state.blend_set("ADDITIVE" if add else "NONE")
+            try:
+                shader.bind()
+                for name in features.samplers:
+                    shader.uniform_sampler(name, self._texture(name, gbuffer))
+                if features.specular:
+                    shader.uniform_float("view", view)
+                for first, end in self._shares:
+                    shader.uniform_int("place", (x, y, first, end))
+                    batch.draw(shader)
+                    gpu.state.blend_set("ADDITIVE")
+            finally:
+                gpu.state.viewport_set(*previous[0])
+                gpu.state.blend_set(previous[1])
 
     def _texture(self, name, gbuffer):
         own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}
         return own[name] if name in own else getattr(gbuffer, SAMPLERS[name])
-
-    def _shader(self, features):
-        """The shader for `features`, its batch and the names of its textures; compiled when first wanted."""
-        found = self._shaders.get(features)
-        if found is None:
-            info, samplers = _create_info(self.table, features)
-            shader = gpu.shader.create_from_info(info)
-            batch = batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
-            found = self._shaders[features] = shader, batch, samplers
-        return found
 
 
 def _loops(light: AreaLight) -> int:
@@ -225,27 +196,3 @@ def _loops(light: AreaLight) -> int:
     if light.is_focused:
         return 16000 if light.is_round else 2000
     return 2500 if light.is_round else 10 * len(light.polygon())
-
-
-def _create_info(table, features):
-    info = gpu.types.GPUShaderCreateInfo()
-    info.vertex_in(0, "VEC2", "corner")
-    info.fragment_out(0, "VEC4", "color")
-    # What a shader does not use is not there for whom sets it.
-    info.push_constant("IVEC4", "place")
-    if features.specular:
-        info.push_constant("VEC4", "view")
-    samplers = ["positions", "normals", "bases", "lights"]
-    if features.specular:
-        samplers += ["f0s", "f90s", "dielectric_weights", "table", "dielectrics"]
-    if features.geometric:
-        samplers.append("geometric_normals")
-    if features.turned or features.bumped:
-        samplers.append("diffuse_normals")
-    if features.bumped:
-        samplers.append("smooth_normals")
-    for slot, name in enumerate(samplers):
-        info.sampler(slot, "FLOAT_2D_ARRAY" if name == "table" else "FLOAT_2D", name)
-    info.vertex_source(VERTEX)
-    info.fragment_source(fragment_source(table, features))
-    return info, tuple(samplers)

@@ -1,4 +1,4 @@
-"""Evaluated meshes as batches: corners, normals, tangents."""
+"""Evaluated meshes as batches for the graphics card, one per material slot, with the normals and tangents of Cycles."""
 
 from __future__ import annotations
 
@@ -70,6 +70,7 @@ def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray
 def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
     """Tangents (C, 4) for corners with places (C, 3), unit normals (C, 3) and UV coordinates (C, 2), in the frame of
     the places; the last number is the sign of the bitangent. (1, 0, 0, -1) where no triangle (T, 3) has an area in UV.
+    As MikkTSpace has them (Mikkelsen 2008), which Cycles uses.
 
     Triangles that share a place, a normal, UV coordinates and their orientation in UV share a tangent there: the mean
     of theirs, each projected onto the plane of the normal and weighted by its angle.

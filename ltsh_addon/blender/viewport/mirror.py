@@ -1,4 +1,7 @@
-"""The scene as the viewport keeps it, updated by what changed."""
+"""The scene as the viewport keeps it: only what a change touches is read again.
+
+First its area lights and flat emissive meshes, as far as constants and images tell what they emit, then all the rest.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A picture of the mirrored scene: surfaces, light, then what the view shows of it."""
+"""One frame of a view: G-buffer, lighting, picture. What has not changed is not drawn again."""
 
 from __future__ import annotations
 
@@ -6,105 +6,16 @@ from dataclasses import dataclass, replace
 
 import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 
+from ...shading.header import definitions
 from ..materials.values import Value
 from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
+from .shaders import glsl, pixel_shader
 from .surfaces import SurfacePass, View, has_bent_lobes
 from .textures import GBufferTextures, UploadedLights, upload_lights
 
 MODES = ("single", "split", "difference")
-_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
-_VERTEX = """
-void main()
-{
-  gl_Position = vec4(corner, 0.0, 1.0);
-}
-"""
-# Red is brighter, blue darker, white equal, as in `imaging.false_color`.
-_FRAGMENT = """
-vec4 over_background(vec4 lit)
-{
-  float alpha = mix(lit.a, 1.0, background.a);
-  return vec4(lit.rgb * scales.x + background.rgb * (1.0 - lit.a), alpha);
-}
-
-void main()
-{
-  ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
-  vec4 first = texelFetch(first_picture, texel, 0);
-  vec4 second = texelFetch(second_picture, texel, 0);
-  second.a = min(first.a, second.a);
-  color = over_background(first);
-  if (place.z == 1) {
-    float beyond = float(texel.x) + 0.5 - scales.z;
-    color = beyond > 0.0 ? over_background(second) : color;
-    color = abs(beyond) <= scales.w ? vec4(vec3(0.8), 1.0) : color;
-  }
-  else if (place.z == 2) {
-    float difference = dot(first.rgb - second.rgb, vec3(1.0 / 3.0)) * scales.x / scales.y;
-    float strength = clamp(abs(difference), 0.0, 1.0);
-    vec3 side = difference > 0.0 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 0.0, 1.0);
-    color = vec4((second.a > 0.0 ? mix(vec3(1.0), side, strength) : vec3(0.2)) * white, 1.0);
-  }
-}
-"""
-
-
-class PicturePass:
-    """Draws one or two pictures into what is bound; needs an active GPU context."""
-
-    def __init__(self):
-        info = gpu.types.GPUShaderCreateInfo()
-        info.vertex_in(0, "VEC2", "corner")
-        info.fragment_out(0, "VEC4", "color")
-        info.push_constant("IVEC4", "place")
-        info.push_constant("VEC4", "scales")
-        info.push_constant("VEC4", "background")
-        info.push_constant("FLOAT", "white")
-        info.sampler(0, "FLOAT_2D", "first_picture")
-        info.sampler(1, "FLOAT_2D", "second_picture")
-        info.vertex_source(_VERTEX)
-        info.fragment_source(_FRAGMENT)
-        self._shader = gpu.shader.create_from_info(info)
-        self._batch = batch_for_shader(self._shader, "TRIS", {"corner": _TRIANGLE})
-
-    def draw(
-        self,
-        first: gpu.types.GPUTexture,
-        second: gpu.types.GPUTexture | None,
-        rect: tuple[int, int, int, int],
-        *,
-        mode: str = "single",
-        exposure: float = 1.0,
-        background=(0.0, 0.0, 0.0),
-        transparent: bool = False,
-        split: float = 0.5,
-        difference_scale: float = 1.0,
-        line_width: float = 1.0,
-        white: float = 1.0,
-    ) -> None:
-        """Fill `rect` (x, y, width, height) of what is bound, scene-linear, from pictures RGBA with alpha 1 where they
-        show a surface. `mode` is one of MODES; `split` is the place of the line between 0 and 1, `white` the
-        brightness of no difference."""
-        x, y, width, height = rect
-        gpu.state.viewport_set(x, y, width, height)
-        gpu.state.blend_set("NONE")
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
-        shader = self._shader
-        shader.bind()
-        shader.uniform_sampler("first_picture", first)
-        shader.uniform_sampler("second_picture", first if second is None else second)
-        shader.uniform_int("place", (x, y, MODES.index(mode), 0))
-        shader.uniform_float("scales", (exposure, difference_scale, split * width, 0.5 * line_width))
-        behind = (0.0, 0.0, 0.0) if transparent else [exposure * float(value) for value in background]
-        shader.uniform_float("background", (*behind, 0.0 if transparent else 1.0))
-        shader.uniform_float("white", white)
-        self._batch.draw(shader)
-
-
 # The lighting pass is fast for so many indices of refraction, and exact for all.
 MOST_IORS = 6
 
@@ -115,15 +26,44 @@ class ShownPicture:
 
     technique: str
     passes: str  # combined, specular or diffuse
-    mode: str  # of `picture_pass.MODES`
+    mode: str  # of MODES
     second_technique: str
-    split: float
+    split: float  # place of the line between 0 and 1
     difference_scale: float
     exposure: float
     transparent: bool
     line_width: float = 1.0
     second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
-    white: float = 1.0  # what the false colors' white is before the scene's own exposure
+    white: float = 1.0  # brightness of no difference, before the scene's own exposure
+
+
+class PicturePass:
+    """Draws one or two pictures into what is bound; needs an active GPU context."""
+
+    def __init__(self):
+        constants = {"mode": "INT", "scales": "VEC4", "background": "VEC4", "white": "FLOAT"}
+        modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
+        source = modes + glsl("picture")
+        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture"), constants)
+
+    def draw(self, first, second, size: tuple[int, int], shown: ShownPicture, background) -> None:
+        """Fill `size` pixels of what is bound, scene-linear, from textures RGBA with alpha 1 where they show a surface;
+        `second` may be None. `background` is a color (3,)."""
+        gpu.state.viewport_set(0, 0, *size)
+        gpu.state.blend_set("NONE")
+        gpu.state.depth_test_set("NONE")
+        gpu.state.depth_mask_set(False)
+        shader = self._shader
+        shader.bind()
+        shader.uniform_sampler("first_picture", first)
+        shader.uniform_sampler("second_picture", first if second is None else second)
+        shader.uniform_int("mode", MODES.index(shown.mode))
+        scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
+        shader.uniform_float("scales", scales)
+        behind = (0.0, 0.0, 0.0) if shown.transparent else [shown.exposure * float(value) for value in background]
+        shader.uniform_float("background", (*behind, 0.0 if shown.transparent else 1.0))
+        shader.uniform_float("white", shown.white)
+        self._batch.draw(shader)
 
 
 class ViewRenderer:
@@ -154,19 +94,8 @@ class ViewRenderer:
         second = others[0] if others else shown.second_picture
         # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
         with frame_buffer.bind():
-            self._picture.draw(
-                first,
-                second,
-                (0, 0, *size),
-                mode=shown.mode,
-                exposure=shown.exposure,
-                background=mirror.background if shown.passes == "combined" else np.zeros(3),
-                transparent=shown.transparent,
-                split=shown.split,
-                difference_scale=shown.difference_scale,
-                line_width=shown.line_width,
-                white=shown.white,
-            )
+            background = mirror.background if shown.passes == "combined" else np.zeros(3)
+            self._picture.draw(first, second, size, shown, background)
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
         """Draw the G-buffer if anything has changed, and tell that."""
@@ -196,7 +125,7 @@ class ViewRenderer:
     def _with_horizons(self, gbuffer, horizons, mirror, view: View) -> GBufferTextures:
         if gbuffer.geometric_normal is None:
             return gbuffer
-        horizon = horizons.draw(gbuffer, self._lights, (*view.eye, 0.0 if view.is_parallel else 1.0))
+        horizon = horizons.draw(gbuffer, self._lights, view.homogeneous_eye)
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import gpu
 import numpy as np
 
-from ...cycles import closures
+from ...cycles import closures, horizons
 from ...cycles.lobes import LOBE_KINDS
 from ...scene import AreaLight, SurfaceSamples
 from ...shading import light_cone, moments32
@@ -33,17 +33,20 @@ SAMPLERS = {
 
 @dataclass(frozen=True)
 class GBufferTextures:
-    """Textures of one size; see the module's docstring."""
+    """The surface points of a picture as textures of one size: what `scene.SurfaceSamples` holds.
 
-    position: gpu.types.GPUTexture
-    normal: gpu.types.GPUTexture
-    base: gpu.types.GPUTexture
-    f0: gpu.types.GPUTexture
-    f90: gpu.types.GPUTexture
-    dielectric: gpu.types.GPUTexture
-    geometric_normal: gpu.types.GPUTexture | None = None
-    diffuse_normal: gpu.types.GPUTexture | None = None
-    smooth_normal: gpu.types.GPUTexture | None = None
+    RGBA32F, one texel per pixel, row 0 at the bottom. What is None is everywhere what its comment names.
+    """
+
+    position: gpu.types.GPUTexture  # in the world, m; w = 1 + receiver, 0 where there is no surface
+    normal: gpu.types.GPUTexture  # shading normal of the specular lobe; w = roughness
+    base: gpu.types.GPUTexture  # diffuse albedo; w = index of refraction of the dielectric lobe
+    f0: gpu.types.GPUTexture  # specular_f0; w = red of specular_dip
+    f90: gpu.types.GPUTexture  # specular_f90; w = green of specular_dip
+    dielectric: gpu.types.GPUTexture  # weight of the dielectric lobe; w = blue of specular_dip
+    geometric_normal: gpu.types.GPUTexture | None = None  # `normal`; w is not read
+    diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
+    smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:
@@ -150,7 +153,21 @@ def circle_first(count: int) -> int:
 
 
 def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
-    """Texels (H, `WIDTH`, 4) of `lights` in float32; lights without area have no part of it: see `visible_lights`."""
+    """Texels (H, `WIDTH`, 4) of `lights` in float32; leave out lights without area by `visible_lights`.
+
+    A corner of a light is center + s * half_u + t * half_v. First come lists of corners s, t that lights share, nodes
+    and weights of quadratures over cones, then `HEADER` texels per light, then corners and receivers of single lights.
+    Headers:
+
+        0   center; texel of the first corner
+        1   half_u; number of corners, 0: chosen per pixel from the circles
+        2   half_v; flags
+        3   direction; texel of the first receiver
+        4   radiance; number of receivers, -1: all
+        5   tan h and 1 / (tan h - h) of the spread, 0 without one; largest half length; bound
+
+    No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
+    """
     lights = list(lights)
     headers, lists = [], []
     place = FIRST_LIGHT + HEADER * len(lights)
@@ -213,7 +230,11 @@ IOR_STEPS = 200
 
 
 def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
-    """Texels (N, R, T, 4) in float32, with one more curve for every index of refraction of `iors`."""
+    """Texels (N, R, T, 4) in float32, with one more curve for every index of refraction of `iors`.
+
+    The first layer holds the warp, then each curve takes as many layers as its weights need, four in each. An integral
+    over a polygon is the product of these weights with `edge_integrals.moments`.
+    """
     ridges = moments32.along_directions(table)
     rows, columns, parameters = table.warp.shape
     vectors = (*range(len(ridges.weights)), *(("dielectric", float(ior)) for ior in iors))
@@ -275,8 +296,18 @@ VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
     **{name.upper(): str(int(number)) for name, number in KINDS.items()},
-    **{"FIRST_SLOT": str(FIRST_SLOT), "SLOT_SIZE": str(SLOT_SIZE), "FIRST_TERM": str(FIRST_TERM)},
+    **{f"{name.upper()}_SLOT": str(position) for position, name in enumerate(IMAGE_SLOTS)},
+    **{f"EXTENSION_{name}": str(position) for position, name in enumerate(EXTENSIONS)},
+    "EXTENSIONS": str(len(EXTENSIONS)),
+    "FIRST_SLOT": str(FIRST_SLOT),
+    "SLOT_SIZE": str(SLOT_SIZE),
+    "FIRST_TERM": str(FIRST_TERM),
     "LAYERS": str(LAYERS),
+    "MAX_F0": str(closures.MAX_F0),
+    "AVERAGE_START": str(closures.DIELECTRIC_AVERAGE[0]),
+    "AVERAGE_SLOPE": str(closures.DIELECTRIC_AVERAGE[1]),
+    "ELEVATION_SHARE": str(horizons.ELEVATION_SHARE),
+    "MINIMUM_REFLECTION_ELEVATION": str(horizons.MINIMUM_REFLECTION_ELEVATION),
 }
 
 
@@ -321,7 +352,7 @@ def _slot_values(value: Value) -> np.ndarray:
         rows[:3], rows[3, 3] = value.matrix, 1.0
         rows[4:6, :3] = use.mapping
         rows[4, 3] = use.closest
-        rows[5, 3] = EXTENSIONS.index(use.extension) + 4 * is_encoded(use.image)
+        rows[5, 3] = EXTENSIONS.index(use.extension) + len(EXTENSIONS) * is_encoded(use.image)
     return rows
 
 
@@ -339,11 +370,7 @@ def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
 
 def albedo_table() -> np.ndarray:
     """(33, 32): directional albedo of GGX by roughness and cosine, then its average by roughness."""
-    nodes = np.linspace(0.0, 1.0, closures.ALBEDO_NODES)
-    roughness, cosine = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
-    directional, _ = closures.albedos(roughness, cosine)
-    _, average = closures.albedos(nodes, np.ones_like(nodes))
-    return np.vstack([directional.reshape(len(nodes), -1), average])
+    return np.vstack(closures.albedo_tables())
 
 
 def blend_table() -> np.ndarray:

@@ -8,8 +8,7 @@ import gpu
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport import lighting, renderer, surfaces, textures
-from ltsh_addon.blender.viewport.shaders import Features
+from ltsh_addon.blender.viewport import lighting, renderer, shaders, surfaces, textures
 
 # Vulkan asks for 128 bytes of push constants and 16384 of a uniform buffer, Metal has 16 samplers per stage, and all
 # can draw into 8 textures; Blender's OpenGL path has 31 locations of attributes and varyings.
@@ -47,8 +46,7 @@ def recorded(monkeypatch):
     monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", create)
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
-    for module in (renderer, lighting):
-        monkeypatch.setattr(module, "batch_for_shader", lambda *arguments: None)
+    monkeypatch.setattr(shaders, "batch_for_shader", lambda *arguments: None)
 
     def run(function):
         made.clear()
@@ -76,9 +74,9 @@ def check(info):
 def test_the_lighting_pass_keeps_to_the_limits(technique, recorded):
     table = shading.load_table(technique)
     for choice in itertools.product((False, True), repeat=6):
-        features = Features(*choice)
+        features = shaders.Features(*choice)
         if features.specular or features.diffuse:
-            [info] = recorded(lambda features=features: lighting._create_info(table, features))
+            [info] = recorded(lambda features=features: shaders.lighting_shader(table, features))
             check(info)
 
 

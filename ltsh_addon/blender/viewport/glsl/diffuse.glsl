@@ -1,0 +1,80 @@
+struct diffuse_lobe { vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2; };
+/* Integral of the direction over a polygon, times 2. */
+struct diffuse_sum { vec3 total; };
+
+vec3 diffuse_warped(diffuse_lobe lobe, vec3 v) { return v; }
+
+diffuse_sum diffuse_empty()
+{
+    diffuse_sum sum;
+    sum.total = vec3(0.0);
+    return sum;
+}
+
+diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
+{
+    ltsh_edge edge = ltsh_edge_between(start, end);
+    sum.total += edge.phi * edge.normal;
+    return sum;
+}
+
+diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle)
+{
+    sum.total += 2.0 * solid_angle * direction;
+    return sum;
+}
+
+/* Heights of v above the horizons. The smooth one is left out where it is the bent one's. */
+vec3 diffuse_heights(diffuse_lobe lobe, vec3 v, vec3 warped, float rest)
+{
+#ifdef LTSH_BUMPED
+    return vec3(dot(lobe.plane_0, v), lobe.is_spare ? rest : dot(lobe.plane_1, v), rest);
+#else
+    return vec3(dot(lobe.plane_0, v), rest, rest);
+#endif
+}
+
+@INTEGRAL@
+diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
+{
+    diffuse_lobe lobe;
+    lobe.plane_0 = point.normal;
+    lobe.plane_1 = vec3(0.0);
+    lobe.plane_2 = vec3(0.0);
+    lobe.is_spare = true;
+    lobe.bump_alpha2 = 0.0;
+#ifdef LTSH_BUMPED
+    vec4 normal = texelFetch(diffuse_normals, texel, 0);
+    lobe.plane_0 = normal.xyz;
+    lobe.plane_1 = texelFetch(smooth_normals, texel, 0).xyz;
+    lobe.is_spare = ltsh_is_same(lobe.plane_0, lobe.plane_1);
+    lobe.bump_alpha2 = all(equal(lobe.plane_0, lobe.plane_1)) ? 0.0 : normal.w;
+#elif defined(LTSH_TURNED)
+    lobe.plane_0 = texelFetch(diffuse_normals, texel, 0).xyz;
+#endif
+    return lobe;
+}
+
+/* Bump shadowing, that of `scene.SurfaceSamples`, is taken at the mean direction of the light. */
+float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
+{
+#ifdef LTSH_BUMPED
+    vec3 direction = -0.5 * sum.total;
+    float along = max(dot(direction, lobe.plane_1), 1e-15);
+    float tangent2 = max(dot(direction, direction) / (along * along) - 1.0, 0.0);
+    float shadowing = 2.0 / (1.0 + sqrt(1.0 + lobe.bump_alpha2 * tangent2));
+    return max(dot(lobe.plane_0, direction), 0.0) * shadowing * LTSH_ONE_OVER_PI;
+#else
+    return max(-0.5 * LTSH_ONE_OVER_PI * dot(lobe.plane_0, sum.total), 0.0);
+#endif
+}
+
+#ifdef LTSH_FOCUSED
+/* To coordinates around the diffuse normal. */
+mat3 diffuse_frame(diffuse_lobe lobe)
+{
+    ltsh_frame frame = ltsh_make_frame(lobe.plane_0, lobe.plane_0);
+    return transpose(mat3(frame.tangent, frame.bitangent, frame.normal));
+}
+@FOCUSED@
+#endif

@@ -1,0 +1,80 @@
+/* Quantities of a look, from constants and images. The uniform buffer `look` is an array of vec4, see
+   `textures.look_values`. Images are read by texelFetch: Blender 4.5 has no say in a texture's filter and extension. */
+
+int wrapped(int texel, int size, int extension)
+{
+  if (extension == EXTENSION_REPEAT) {
+    int inside = texel % size;
+    return inside < 0 ? inside + size : inside;
+  }
+  if (extension == EXTENSION_MIRROR) {
+    int period = 2 * size;
+    int inside = texel % period;
+    inside = inside < 0 ? inside + period : inside;
+    return inside < size ? inside : period - 1 - inside;
+  }
+  return clamp(texel, 0, size - 1);
+}
+
+float encoded(float value)
+{
+  return value <= 0.0031308 ? 12.92 * value : 1.055 * pow(value, 1.0 / 2.4) - 0.055;
+}
+
+float decoded(float value)
+{
+  return value <= 0.04045 ? value / 12.92 : pow((value + 0.055) / 1.055, 2.4);
+}
+
+vec4 texel_at(sampler2D image, ivec2 texel, ivec2 size, int extension, bool encode)
+{
+  if (extension == EXTENSION_CLIP && (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size)))) {
+    return vec4(0.0);
+  }
+  ivec2 place = ivec2(wrapped(texel.x, size.x, extension), wrapped(texel.y, size.y, extension));
+  vec4 value = texelFetch(image, place, 0);
+  if (encode) {
+    value.rgb = vec3(encoded(value.r), encoded(value.g), encoded(value.b));
+  }
+  return value;
+}
+
+/* The quantity of a slot: its offset, plus its matrix times the image where there is one. */
+vec3 slot_value(sampler2D image, int slot, vec2 uv)
+{
+  int base = FIRST_SLOT + SLOT_SIZE * slot;
+  vec4 offset = look.data[base + 3];
+  if (offset.w < 0.5) {
+    return offset.xyz;
+  }
+  vec4 row_u = look.data[base + 4];
+  vec4 row_v = look.data[base + 5];
+  vec3 place = vec3(uv, 1.0);
+  int code = int(row_v.w + 0.5);
+  int extension = code % EXTENSIONS;
+  bool encode = code >= EXTENSIONS;
+  ivec2 size = textureSize(image, 0);
+  vec2 texel = vec2(dot(row_u.xyz, place), dot(row_v.xyz, place)) * vec2(size);
+  vec4 value;
+  if (row_u.w > 0.5) {
+    value = texel_at(image, ivec2(floor(texel)), size, extension, false);
+    encode = false;
+  }
+  else {
+    texel -= 0.5;
+    ivec2 corner = ivec2(floor(texel));
+    vec2 share = texel - floor(texel);
+    vec4 low = mix(texel_at(image, corner, size, extension, encode),
+                   texel_at(image, corner + ivec2(1, 0), size, extension, encode),
+                   share.x);
+    vec4 high = mix(texel_at(image, corner + ivec2(0, 1), size, extension, encode),
+                    texel_at(image, corner + ivec2(1, 1), size, extension, encode),
+                    share.x);
+    value = mix(low, high, share.y);
+  }
+  if (encode) {
+    value.rgb = vec3(decoded(value.r), decoded(value.g), decoded(value.b));
+  }
+  return offset.xyz +
+         vec3(dot(look.data[base], value), dot(look.data[base + 1], value), dot(look.data[base + 2], value));
+}

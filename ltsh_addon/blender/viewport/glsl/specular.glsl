@@ -1,0 +1,167 @@
+@SUM@
+/* Axes of the warped local frame, and the normals of the horizons. */
+struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; };
+/* Weights of the moments by Fresnel term, and how wide the lobe is in radians. */
+struct specular_weights {
+    float plain[LTSH_COEFFICIENTS]; float schlick[LTSH_COEFFICIENTS]; float dip[LTSH_COEFFICIENTS];
+    float dielectric[LTSH_COEFFICIENTS]; float width;
+};
+
+vec3 specular_warped(specular_lobe lobe, vec3 v)
+{
+    return vec3(dot(lobe.row_x, v), dot(lobe.row_y, v), dot(lobe.row_z, v));
+}
+
+/* Heights of v above the horizons. The geometric one is left out where it is the smooth one's. */
+vec3 specular_heights(specular_lobe lobe, vec3 v, vec3 warped, float rest)
+{
+#if defined(LTSH_COSINE) && defined(LTSH_GEOMETRIC)
+    return vec3(warped.z, dot(lobe.plane_1, v), lobe.is_spare ? rest : dot(lobe.plane_2, v));
+#elif defined(LTSH_COSINE)
+    return vec3(warped.z, dot(lobe.plane_1, v), rest);
+#elif defined(LTSH_GEOMETRIC)
+    return vec3(warped.z, lobe.is_spare ? rest : dot(lobe.plane_1, v), rest);
+#else
+    return vec3(warped.z, rest, rest);
+#endif
+}
+
+@INTEGRAL@
+vec4 ltsh_table_at(ltsh_cell cell, int layer)
+{
+    ivec3 node = ivec3(cell.node % LTSH_COLUMNS, cell.node / LTSH_COLUMNS, layer);
+    vec4 first = texelFetch(table, node, 0);
+    first += cell.column_weight * (texelFetch(table, node + ivec3(1, 0, 0), 0) - first);
+    vec4 second = texelFetch(table, node + ivec3(0, 1, 0), 0);
+    second += cell.column_weight * (texelFetch(table, node + ivec3(1, 1, 0), 0) - second);
+    return first + cell.row_weight * (second - first);
+}
+
+specular_sum ltsh_curve_at(ltsh_cell cell, int curve)
+{
+    int layer = 1 + curve * LTSH_BLOCKS;
+    specular_sum weights = specular_empty();
+@FETCHES@
+    return weights;
+}
+
+/* Weights of four curves for a dielectric; w of column 1 is 1 + the number of its own curve, if it has one. */
+vec4 ltsh_dielectric_texel(float position, int column)
+{
+    int last = textureSize(dielectrics, 0).y - 1;
+    int row = min(int(position), last);
+    vec4 near = texelFetch(dielectrics, ivec2(column, row), 0);
+    vec4 far = texelFetch(dielectrics, ivec2(column, min(row + 1, last)), 0);
+    return near + (position - float(row)) * (far - near);
+}
+
+specular_weights ltsh_weights(ltsh_cell cell, ltsh_point point)
+{
+    specular_weights w;
+    for (int k = 0; k < LTSH_COEFFICIENTS; ++k) {
+        w.plain[k] = 0.0;
+        w.schlick[k] = 0.0;
+        w.dip[k] = 0.0;
+        w.dielectric[k] = 0.0;
+    }
+    vec3 dip = vec3(point.f0.w, point.f90.w, point.dielectric.w);
+    bool dipped = any(notEqual(dip, vec3(0.0)));
+    bool metal = dipped || any(notEqual(point.f0.xyz, vec3(0.0))) || any(notEqual(point.f90.xyz, vec3(0.0)));
+    bool coated = any(notEqual(point.dielectric.xyz, vec3(0.0)));
+    float last = float(textureSize(dielectrics, 0).y - 1);
+    float position = ltsh_clamped((point.ior - 1.0) * LTSH_IOR_STEPS, last);
+    float nearest = floor(position + 0.5);
+    float own = texelFetch(dielectrics, ivec2(1, int(nearest)), 0).w;
+    bool known = own > 0.0 && abs(position - nearest) < 1e-3;
+    vec4 first_shares = ltsh_dielectric_texel(position, 0);
+    vec4 last_shares = ltsh_dielectric_texel(position, 1);
+    bool summed = coated && !known;
+    int count = summed ? LTSH_CURVES : (metal ? (dipped ? 3 : 2) : 0);
+    int end = coated && known ? count + 1 : count;
+    for (int i = 0; i < end; ++i) {
+        bool is_own = i == count;
+        int curve = is_own ? LTSH_CURVES + int(own) - 1 : i;
+        vec4 four = i < 4 ? first_shares : last_shares;
+        int component = i % 4;
+        float part = component == 0 ? four.x : (component == 1 ? four.y : (component == 2 ? four.z : four.w));
+        vec4 share = vec4(i == 0 ? 1.0 : 0.0, i == 1 ? 1.0 : 0.0, i == 2 ? 1.0 : 0.0, summed ? part : 0.0);
+        share = is_own ? vec4(0.0, 0.0, 0.0, 1.0) : share;
+        specular_sum values = ltsh_curve_at(cell, curve);
+@TERMS@
+    }
+    w.width = max(point.roughness, LTSH_LEAST_ROUGHNESS) * max(point.roughness, LTSH_LEAST_ROUGHNESS);
+    return w;
+}
+
+ltsh_cell specular_cell(ltsh_point point)
+{
+    ltsh_frame frame = ltsh_make_frame(point.normal, point.view);
+    float cosine = ltsh_clamped(dot(point.normal, point.view), 1.0);
+    float sine = ltsh_clamped(dot(frame.tangent, point.view - point.normal), 1.0);
+    return ltsh_make_cell_at(cosine, sine, point.roughness, LTSH_ROWS, LTSH_COLUMNS);
+}
+
+specular_lobe specular_at(ltsh_point point, ltsh_cell cell)
+{
+    ltsh_frame frame = ltsh_make_frame(point.normal, point.view);
+    vec4 entries = ltsh_table_at(cell, 0);
+    ltsh_warp warp = ltsh_make_warp(cell, entries.x, entries.y, entries.z, 0.0);
+    specular_lobe lobe;
+    lobe.row_x = warp.xx * frame.tangent + warp.xz * frame.normal;
+    lobe.row_y = warp.yy * frame.bitangent;
+    lobe.row_z = warp.zz * frame.normal;
+#ifdef LTSH_COSINE
+    float sine = sin(entries.w);
+    float cosine = cos(entries.w);
+    vec3 toward = sine * lobe.row_x + cosine * lobe.row_z;
+    lobe.row_x = cosine * lobe.row_x - sine * lobe.row_z;
+    lobe.row_z = toward;
+#endif
+    lobe.plane_1 = vec3(0.0);
+    lobe.plane_2 = vec3(0.0);
+    lobe.is_spare = true;
+    lobe.plane_0 = ltsh_unit(lobe.row_z);
+#ifdef LTSH_COSINE
+    lobe.plane_1 = point.normal;
+#endif
+#ifdef LTSH_GEOMETRIC
+#ifdef LTSH_COSINE
+    lobe.plane_2 = point.geometric;
+#else
+    lobe.plane_1 = point.geometric;
+#endif
+    lobe.is_spare = ltsh_is_same(point.geometric, point.normal);
+#endif
+    return lobe;
+}
+
+float ltsh_product(float weights[LTSH_COEFFICIENTS], specular_sum sum)
+{
+    float product = 0.0;
+    for (int k = 0; k < LTSH_COEFFICIENTS; ++k) {
+        product += weights[k] * sum.values[k];
+    }
+    /* Corners run clockwise as seen from the point. */
+    return max(-product, 0.0);
+}
+
+/* Integrals of the plain, the Schlick, the dip and the dielectric term. */
+vec4 specular_values(specular_weights weights, specular_sum sum)
+{
+    sum = specular_finished(sum);
+    return vec4(
+        ltsh_product(weights.plain, sum),
+        ltsh_product(weights.schlick, sum),
+        ltsh_product(weights.dip, sum),
+        ltsh_product(weights.dielectric, sum)
+    );
+}
+
+vec3 ltsh_reflected(ltsh_point point, vec4 values)
+{
+    vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;
+    reflected -= vec3(point.f0.w, point.f90.w, point.dielectric.w) * values.z;
+    reflected += point.dielectric.xyz * values.w;
+    return max(reflected, vec3(0.0));
+}
+@FOCUSED@

@@ -1,0 +1,84 @@
+/* Surfaces into the G-buffer, lobe by lobe: what `cycles.lobes` does for samples. */
+
+#if defined(IS_FURTHER) || defined(DRAWS_EMISSION)
+/* What is drawn later is drawn where it is the surface of the G-buffer. */
+bool is_seen()
+{
+  vec4 seen = texelFetch(positions, ivec2(gl_FragCoord.xy), 0);
+  vec3 between = seen.xyz - v_position;
+  float distance2 = view.eye.w < 0.5 ? 1.0 : dot(view.eye.xyz - v_position, view.eye.xyz - v_position);
+  return seen.w != 0.0 && dot(between, between) <= 1e-7 * distance2;
+}
+#endif
+
+#ifdef DRAWS_EMISSION
+void main()
+{
+  if (!is_seen()) {
+    discard;
+  }
+  out_emission = vec4(look.data[1].xyz, 0.0);
+}
+#else
+@FUNCTIONS@
+void main()
+{
+  bool backfacing = gl_FrontFacing == (placement.y < 0.0);
+  vec3 towards_eye = view.eye.w < 0.5 ? view.eye.xyz : normalize(view.eye.xyz - v_position);
+  vec3 smooth_normal = normalize(v_normal) * (backfacing ? -1.0 : 1.0);
+  vec3 true_normal = normalize(cross(dFdx(v_position), dFdy(v_position)));
+  true_normal *= dot(true_normal, towards_eye) < 0.0 ? -1.0 : 1.0;
+  /* Exact where it can be: derivatives are rounded. */
+  true_normal = placement.z > 0.0 ? true_normal : smooth_normal;
+  vec3 diffuse_normal = smooth_normal;
+  vec3 specular_normal = smooth_normal;
+  float alpha2 = 0.0;
+  int flags = int(look.data[0].z + 0.5);
+  if (flags % 2 == 1) {
+    diffuse_normal = mapped_normal(smooth_normal, backfacing);
+    specular_normal = diffuse_normal;
+    alpha2 = flags >= 2 ? bump_alpha2(diffuse_normal, smooth_normal) : 0.0;
+  }
+  if (flags >= 2) {
+    specular_normal = valid_specular_normal(diffuse_normal, true_normal, towards_eye);
+  }
+
+#ifdef DRAWS_SURFACES
+  vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
+  float roughness = clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0);
+  float metallic = clamp(slot_value(metallic_image, METALLIC_SLOT, v_uv).x, 0.0, 1.0);
+  float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1.0);
+  float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
+  Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
+  vec3 weight = vec3(look.data[LAYERS].x);
+  weight *= clamp(slot_value(weight_image, WEIGHT_SLOT, v_uv).x, 0.0, 1.0);
+  weight *= view_factor(look.data[LAYERS + 2].xyz, abs(dot(smooth_normal, towards_eye)), backfacing);
+  if (look.data[LAYERS].y > 0.0 && int(look.data[0].x + 0.5) != COAT) {
+    vec3 coat_normal = specular_normal;
+    if (look.data[LAYERS + 1].w < 0.5) {
+      coat_normal = flags >= 2 ? valid_specular_normal(smooth_normal, true_normal, towards_eye) : smooth_normal;
+    }
+    weight *= left_under_coat(clamp(dot(coat_normal, towards_eye), 0.0, 1.0));
+  }
+  out_position = vec4(v_position, 1.0 + placement.x);
+  out_normal = vec4(specular_normal, roughness);
+  out_base = vec4(weight * lobe.diffuse, lobe.ior);
+  out_f0 = vec4(weight * lobe.f0, weight.r * lobe.dip.r);
+  out_f90 = vec4(weight * lobe.f90, weight.g * lobe.dip.g);
+  out_dielectric = vec4(weight * lobe.dielectric, weight.b * lobe.dip.b);
+#else
+  out_geometric_normal = vec4(true_normal, 0.0);
+  if (int(look.data[0].x + 0.5) == TRANSLUCENT) {
+    diffuse_normal = -specular_normal;
+    smooth_normal = -smooth_normal;
+  }
+  out_diffuse_normal = vec4(diffuse_normal, alpha2);
+  out_smooth_normal = vec4(smooth_normal, 0.0);
+#endif
+#ifdef IS_FURTHER
+  if (!is_seen()) {
+    discard;
+  }
+#endif
+}
+#endif

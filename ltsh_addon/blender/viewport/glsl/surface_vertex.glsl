@@ -1,0 +1,12 @@
+void main()
+{
+  vec4 world = model * vec4(position, 1.0);
+  v_position = world.xyz;
+  v_normal = transpose(inverse(mat3(model))) * normal;
+  /* A mesh with one user Cycles moves into the world, and there its normals have unit length again. */
+  v_normal /= ONLY_USER ? max(length(v_normal), 1e-30) : 1.0;
+  v_object_normal = normal;
+  v_uv = uv;
+  v_tangent = tangent;
+  gl_Position = view.projection * world;
+}

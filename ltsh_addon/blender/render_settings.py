@@ -52,7 +52,7 @@ def choose_camera(scene, name: str | None):
     else:
         camera = scene.objects.get(name)
         if camera is None or camera.type != "CAMERA":
-            cameras = listed((ob.name for ob in scene.objects if ob.type == "CAMERA"), name)
+            cameras = listed(ob.name for ob in scene.objects if ob.type == "CAMERA")
             raise SceneError(f"camera {name!r} is not in scene {scene.name!r}; cameras there: {cameras}")
     if camera.type != "CAMERA":
         raise SceneError(
@@ -286,7 +286,7 @@ VIEW_LAYER = "ltsh"
 def choose_view_layer(scene, warnings: list[str], name: str | None = None):
     """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
     if name is not None and name not in scene.view_layers:
-        layers = listed((layer.name for layer in scene.view_layers), name)
+        layers = listed(layer.name for layer in scene.view_layers)
         raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
     used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
     if name is not None:

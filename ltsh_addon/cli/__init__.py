@@ -7,7 +7,6 @@ Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the argu
 from __future__ import annotations
 
 import argparse
-import difflib
 import logging
 import re
 import shlex
@@ -108,11 +107,11 @@ def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
 
 
 def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
-    """What the arguments mean. Raises Misuse, with what may have been meant."""
+    """What the arguments mean. Raises Misuse."""
     parser, commands = _parser(program)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
-        hint = _similar(arguments[0], commands) or f"expected one of {', '.join(commands)}"
-        raise Misuse(f"{program}: command {arguments[0]!r} is unknown ({hint}); see {program} --help")
+        known = f"expected one of {', '.join(commands)}"
+        raise Misuse(f"{program}: command {arguments[0]!r} is unknown ({known}); see {program} --help")
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         raise Misuse(_unknown_argument(options, unknown, commands))
@@ -128,13 +127,8 @@ def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
         return f"{program}: {unknown[0]!r} is not expected here{hint}; see {program} --help"
     known = {command: re.findall(r"--[\w-]+", parser.format_help()) for command, parser in commands.items()}
     owners = [command for command, names in known.items() if name in names]
-    hint = f"an option of {', '.join(owners)}" if owners else _similar(name, known[options.command])
-    return f"{program}: option {name} is unknown here{f' ({hint})' if hint else ''}; see {program} --help"
-
-
-def _similar(name: str, known) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f"did you mean {near[0]}?" if near else ""
+    hint = f" (an option of {', '.join(owners)})" if owners else ""
+    return f"{program}: option {name} is unknown here{hint}; see {program} --help"
 
 
 def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:

@@ -9,34 +9,22 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ..pipeline.bake import BAKE_PASSES, MARGIN_TYPES, SIZES, BakeOptions
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import merge
-from ..pipeline.picture import DEFAULT_TECHNIQUES, Options, prepare
+from ..pipeline.options import BakeOptions, PictureOptions, options_from, table
+from ..pipeline.picture import prepare
 from ..pipeline.tasks import Job
-from ..scene import SceneError, error_line
-from ..shading import PASSES, SHIPPED_TABLES, TableError
+from ..scene import SHIPPED_TABLES, SceneError, error_line
+from ..shading import TableError
 from . import arguments as arguments_module
 from .arguments import (
-    SCENES,
-    TECHNIQUES_HELP,
     Misuse,
     add_baseline,
     add_batch,
-    add_memory,
-    add_moments,
-    add_output,
-    add_scenes,
+    add_option,
+    add_options,
     add_talk,
-    add_trust,
-    cameras,
-    cycles_samples,
-    name_of_bake,
-    name_of_picture,
-    passes,
-    positive,
-    table,
-    techniques,
+    from_text,
     with_examples,
 )
 from .job_file import Command, Wanted, read_jobs
@@ -71,16 +59,17 @@ SHADE_EXAMPLES = """examples:
 def add_demo(parser) -> None:
     """Add the arguments and the function that runs."""
     with_examples(parser, DEMO, DEMO_EXAMPLES)
-    add_moments(parser, name_of_picture)
-    _add_picture(parser, cycles=True, resolution="{}x{}".format(*DEMO_RESOLUTION))
+    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
+    add_options(parser, PictureOptions, but=("scene", "scripts"), resolution=size)
+    _add_run(parser, PictureOptions)
     parser.set_defaults(run=_demo, scenes=[])
 
 
 def add_compare(parser) -> None:
     """Add the arguments and the function that runs."""
     with_examples(parser, COMPARE, COMPARE_EXAMPLES)
-    add_scenes(parser)
-    _add_picture(parser, cycles=True)
+    add_options(parser, PictureOptions, but=("scripts",))
+    _add_run(parser, PictureOptions)
     add_baseline(parser)
     parser.set_defaults(run=_run_picture)
 
@@ -88,54 +77,27 @@ def add_compare(parser) -> None:
 def add_shade(parser) -> None:
     """Add the arguments and the function that runs."""
     with_examples(parser, SHADE, SHADE_EXAMPLES)
-    add_scenes(parser)
-    _add_picture(parser, cycles=False)
-    parser.set_defaults(run=_run_picture)
+    add_options(parser, PictureOptions, but=("scripts", "cycles_samples"))
+    _add_run(parser, PictureOptions)
+    parser.set_defaults(run=_run_picture, cycles_samples=0)
 
 
-def _add_picture(parser, *, cycles, resolution="as in the file"):
-    add_output(parser)
-    names = ",".join(DEFAULT_TECHNIQUES)
-    parser.add_argument("--techniques", type=techniques, default=DEFAULT_TECHNIQUES, metavar="T",
-                        help=f"{TECHNIQUES_HELP} (default: {names})")  # fmt: skip
-    parser.add_argument("--passes", type=passes, default=PASSES, metavar="P",
-                        help=f"some of {','.join(PASSES)} (default: both)")  # fmt: skip
-    parser.add_argument("--resolution", type=arguments_module.resolution, metavar="WxH", help=f"default: {resolution}")
-    parser.add_argument("--aa", type=positive, default=1, metavar="N",
-                        help="points per pixel, drawn from its filter; 1: pixel centers")  # fmt: skip
-    parser.add_argument(
-        "--reference-samples", type=positive, default=Options.reference_samples, metavar="N",
-        help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
-    )  # fmt: skip
-    if cycles:
-        parser.add_argument(
-            "--cycles-samples", type=cycles_samples, default=Options.cycles_samples, metavar="N",
-            help="of both halves of the Cycles reference together (default: %(default)s)",
-        )  # fmt: skip
+def _add_run(parser, kind) -> None:
+    """What all commands that open a .blend end with."""
     add_batch(parser)
-    add_trust(parser)
-    add_memory(parser, "picture")
+    add_option(parser, kind, "scripts")
     add_talk(parser)
 
 
-def picture_job(arguments, scenes: tuple[Path, ...], resolution=None) -> Job:
-    """The job that the arguments describe; `resolution` where they say nothing about it."""
-    width, height = arguments.resolution or resolution or (None, None)
-    command = "shade" if arguments.command == "shade" else "compare"
-    wanted = Options(
-        scene=scenes[0],
-        output=arguments.output,
-        techniques=arguments.techniques,
-        passes=arguments.passes,
-        width=width,
-        height=height,
-        sub_samples=arguments.aa,
-        cycles_samples=getattr(arguments, "cycles_samples", 0),
-        reference_samples=arguments.reference_samples,
-        scripts=arguments.enable_autoexec,
-        memory_mib=arguments.memory_limit,
-    )
-    return Job(command, wanted, scenes, cameras(arguments), arguments.frames, arguments.name)
+def picture_job(arguments, scenes: tuple[Path, ...]) -> Job:
+    """The job that the arguments describe."""
+    return _job("shade" if arguments.command == "shade" else "compare", PictureOptions, arguments, scenes)
+
+
+def _job(command, kind, arguments, scenes) -> Job:
+    options = options_from(kind, vars(arguments), scene=scenes[0])
+    cameras = tuple(dict.fromkeys(arguments.cameras or ()))
+    return Job(command, options, scenes, cameras, arguments.frames, arguments.pattern)
 
 
 def _run_picture(arguments, bar, open_file) -> int:
@@ -147,7 +109,7 @@ def _run_picture(arguments, bar, open_file) -> int:
 def _demo(arguments, bar, open_file) -> int:
     from ..blender.process import client
 
-    job = picture_job(arguments, (arguments.output / "demo.blend",), DEMO_RESOLUTION)
+    job = picture_job(arguments, (arguments.output / "demo.blend",))
     prepare(job.options)
     client.build_demo(job.scenes[0], progress=bar)
     return run_job(job, arguments, bar)
@@ -164,52 +126,13 @@ BAKE_EXAMPLES = """examples:
 
 An object that cannot be baked is named at the end, and the exit code is 1; the others are baked all the same.
 """
-ERROR_SAMPLES = 256
 
 
-def add_bake(parser: argparse.ArgumentParser) -> None:
+def add_bake(parser) -> None:
     """Add the arguments and the function that runs."""
     with_examples(parser, BAKE, BAKE_EXAMPLES)
-    parser.add_argument("scenes", nargs="*", metavar=SCENES, help="left out when Blender has a file open")
-    add_output(parser)
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--object", action="append", metavar="NAME", help="may be given several times; default: --all")
-    chosen.add_argument("--selected", action="store_true", help="the objects that are selected in the file")
-    chosen.add_argument("--all", action="store_true", help="all meshes that render")
-    parser.add_argument("--uv", metavar="NAME", help="UV map; default: the active one")
-    parser.add_argument(
-        "--size", type=_size, default=(1024, 1024), metavar="N", help="N or WxH in texels (default: 1024)"
-    )
-    parser.add_argument("--margin", type=_margin, default=16, metavar="PX", help="in texels (default: 16)")
-    parser.add_argument(
-        "--margin-type", choices=MARGIN_TYPES, default=BakeOptions.margin_type,
-        help="the margin repeats the nearest texel, or shows the adjacent face (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--conservative", action="store_true", help="bake every texel that a face touches")
-    parser.add_argument(
-        "--view", type=_view, default="camera", metavar="V",
-        help="camera, above (along the normals) or a position X,Y,Z in m (default: camera)",
-    )  # fmt: skip
-    parser.add_argument("--techniques", type=techniques, default=BakeOptions.techniques, metavar="T",
-                        help=f"{TECHNIQUES_HELP} (default: ltsh4)")  # fmt: skip
-    parser.add_argument(
-        "--passes", type=_passes, default=BakeOptions.passes, metavar="P",
-        help=f"some of {','.join(BAKE_PASSES)} (default: {','.join(BakeOptions.passes)})",
-    )  # fmt: skip
-    add_moments(parser, name_of_bake)
-    parser.add_argument("--error", action="store_true", help="beside Cycles' bake: signed errors, also as pictures")
-    parser.add_argument(
-        "--cycles-samples", type=cycles_samples, default=ERROR_SAMPLES, metavar="N",
-        help="of both halves of Cycles' bake together (default: %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--apply", action="store_true",
-        help="also a texture of each object, and a copy of the .blend whose materials show it",
-    )  # fmt: skip
-    add_batch(parser)
-    add_trust(parser)
-    add_memory(parser, "bake")
-    add_talk(parser)
+    add_options(parser, BakeOptions, but=("scripts",))
+    _add_run(parser, BakeOptions)
     parser.set_defaults(run=_run_bake)
 
 
@@ -220,65 +143,10 @@ def _run_bake(arguments, bar, open_file) -> int:
 
 def bake_job(arguments, scenes: tuple[Path, ...]) -> Job:
     """The job that the arguments describe. Raises Misuse."""
-    cameras = arguments_module.cameras(arguments)
-    if arguments.apply and (len(cameras) > 1 or len(arguments.frames) > 1):
+    job = _job("bake", BakeOptions, arguments, scenes)
+    if arguments.apply and (len(job.cameras) > 1 or len(job.frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
-    width, height = arguments.size
-    wanted = BakeOptions(
-        scene=scenes[0],
-        output=arguments.output,
-        objects=tuple(dict.fromkeys(arguments.object or ())) or ("selected" if arguments.selected else "all"),
-        uv=arguments.uv,
-        width=width,
-        height=height,
-        margin=arguments.margin,
-        margin_type=arguments.margin_type,
-        conservative=arguments.conservative,
-        view=arguments.view,
-        techniques=arguments.techniques,
-        passes=arguments.passes,
-        cycles_samples=arguments.cycles_samples if arguments.error else 0,
-        apply=arguments.apply,
-        scripts=arguments.enable_autoexec,
-        memory_mib=arguments.memory_limit,
-    )
-    return Job("bake", wanted, scenes, cameras, arguments.frames, arguments.name)
-
-
-def _size(text: str) -> tuple[int, int]:
-    sides = text.split("x")
-    if len(sides) in (1, 2) and all(side.isdecimal() for side in sides):
-        width, height = int(sides[0]), int(sides[-1])
-        if SIZES[0] <= min(width, height) and max(width, height) <= SIZES[1]:
-            return width, height
-    raise argparse.ArgumentTypeError(
-        f"size is {text!r}, expected N or WIDTHxHEIGHT such as 2048, each from {SIZES[0]} to {SIZES[1]}"
-    )
-
-
-def _margin(text: str) -> int:
-    if text.isdecimal() and int(text) <= 512:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"margin is {text!r}, expected a whole number from 0 to 512")
-
-
-def _view(text: str):
-    if text in ("camera", "above"):
-        return text
-    try:
-        position = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        position = ()
-    if len(position) == 3 and all(abs(value) < 1e12 for value in position):
-        return position
-    raise argparse.ArgumentTypeError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")
-
-
-def _passes(text: str) -> tuple[str, ...]:
-    names = tuple(dict.fromkeys(name for name in text.split(",") if name))
-    if not names or any(name not in BAKE_PASSES for name in names):
-        raise argparse.ArgumentTypeError(f"passes are {text!r}, expected some of {', '.join(BAKE_PASSES)}")
-    return names
+    return job
 
 
 MERGE = "Write report.json and timing.json of all that the shards of a job have done in OUT."
@@ -332,7 +200,7 @@ night.toml:
   size = 2048
   error = true
 
-All mistakes in the file are named with their lines, before anything starts. A job that fails is named, and the others
+All mistakes in the file are named, before anything starts. A job that fails is named, and the others
 are done all the same.
 """
 
@@ -439,7 +307,7 @@ def add_tables(parser) -> None:
         script.set_defaults(run=_run_table_script, quiet=False, log=None)
     export = actions.add_parser("export", help="for other engines: an EXR, a header for C, C++ and GLSL")
     with_examples(export, EXPORT, EXPORT_EXAMPLES)
-    export.add_argument("names", nargs="*", type=table, metavar="TABLE",
+    export.add_argument("names", nargs="*", type=from_text(table), metavar="TABLE",
                         help="or a path (.npz); default: all shipped")  # fmt: skip
     export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
     add_talk(export, "name the files on stdout in one JSON document")

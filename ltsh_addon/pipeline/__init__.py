@@ -1,1 +1,15 @@
-"""A .blend in, files out: pictures, bakes, comparisons, tasks."""
+"""A .blend in, files out. What scripts call: the functions do with a file what the commands of these names do.
+
+    from pathlib import Path
+    from ltsh_addon.pipeline import PictureOptions, compare_scene
+
+    report = compare_scene(PictureOptions(Path("room.blend"), Path("out/room"), techniques=("ltc", "ltsh4")))
+
+Blender runs in a process of its own, so that nothing here needs bpy to be imported.
+"""
+
+from .bake import bake_scene
+from .options import BakeOptions, PictureOptions
+from .picture import compare_scene, shade_scene
+
+__all__ = ["BakeOptions", "PictureOptions", "bake_scene", "compare_scene", "shade_scene"]

@@ -7,17 +7,18 @@ import shutil
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from .. import imaging, shading
-from ..scene import AreaLight, Cancelled, Progress, SurfaceSamples
+from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples
 from ..shading.parallel import cores
 from . import picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
-from .picture import Made, percent
+from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
+from .picture import TaskResult, percent
 from .tasks import Records, contents_digest, file_stems, options_digest
 
 # Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
@@ -54,7 +55,7 @@ class ObjectBaker:
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
         self.wanted = self.tiles if tile is None else [tile]
         self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
-        if not options.cycles_samples:
+        if not options.error:
             self.compared = ()
         self._sample, self._raster = texel_samples, uv.UvTriangles
         self._seams = uv.UvSeams.of
@@ -137,7 +138,7 @@ class ObjectBaker:
 
     def _threads(self) -> int:
         """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
-        return 1 if shading.REFERENCE in self.tables.values() else cores()
+        return 1 if REFERENCE in self.tables.values() else cores()
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR but for the coverage."""
@@ -276,37 +277,8 @@ def _summed(radiance, texel, count):
     return np.add.reduceat(radiance, first, axis=1)
 
 
-BAKE_PASSES = ("specular", "diffuse", "diffuse_light", "combined")
-SIZES = (64, 8192)
-# Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
-MARGIN_TYPES = ("extend", "adjacent")
 # Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
 NOTED_SHARE_OUTSIDE = 0.01
-
-
-@dataclass(frozen=True)
-class BakeOptions:
-    """What to bake and how; None means as in the file."""
-
-    scene: Path
-    output: Path
-    objects: tuple[str, ...] | str = "all"  # names, "selected" or "all"
-    uv: str | None = None
-    width: int = 1024
-    height: int = 1024
-    margin: int = 16  # texels
-    margin_type: str = "extend"  # one of MARGIN_TYPES
-    conservative: bool = False  # also texels that a triangle touches without covering their center
-    view: tuple[float, float, float] | str = "camera"  # a position in m, "camera" or "above"
-    techniques: tuple[str, ...] = ("ltsh4",)
-    passes: tuple[str, ...] = ("specular", "diffuse")
-    frame: int | None = None
-    camera: str | None = None
-    cycles_samples: int = 0  # 0: no Cycles bake and no error
-    resume: bool = False  # keep what the same job has finished
-    scripts: bool = False  # run those of the file
-    apply: bool = False  # also a texture per object, and a .blend that shows it
-    memory_mib: int = 0  # a bake that needs more is refused; 0: as the environment says, else what is free
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -316,7 +288,6 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
     but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
     """
-    check_memory(options)
     made = bake_objects(options, progress)
     document = made.report
     if options.apply and document["objects"]:
@@ -332,12 +303,10 @@ def bake_objects(
     options: BakeOptions,
     progress: Progress | None = None,
     *,
-    stems: dict[str, str] | None = None,
     tile: int | None = None,
     following: tuple[str, ...] = (),
-) -> Made:
-    """Bake the objects and write their files, but no report.json; `stems` are the names of files by object, `tile` is
-    the one UDIM tile that is wanted.
+) -> TaskResult:
+    """Bake the objects and write their files, but no report.json; `tile` is the one UDIM tile that is wanted.
 
     In `kept_blender` the scene stays open for the next call with the same options: for objects that are named here, or
     announced as `following`. Raises as `bake_scene` does.
@@ -348,13 +317,12 @@ def bake_objects(
     _check(options)
     tables = picture.prepare(options)
     client.check_readable(options.scene)
-    tiles = TileRecords(options, stems)
+    tiles = TileRecords(options)
     with client.temporary_folder() as folder:
-        job = replace(_job(options, tiles.finished), tile=tile, following=following)
-        manifest = client.extract_bake(job, folder, progress=progress)
+        manifest = client.extract_bake(_job(options, tiles.finished, tile, following), folder, progress=progress)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         names = [record["name"] for record in manifest["objects"]]
-        found = [stems[name] for name in names] if stems else file_stems(names)
+        found = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         for record, stem in zip(manifest["objects"], found, strict=True):
             if record["problem"] is None:
@@ -364,36 +332,19 @@ def bake_objects(
                 shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
-    return Made(document, seconds, tuple(files))
-
-
-def check_memory(options: BakeOptions) -> None:
-    """Raise SceneError where the bake of an object needs more memory than there may be."""
-    from ..blender.process import memory
-
-    width, height = options.width, options.height
-    reference = shading.REFERENCE in options.techniques
-    shaded = block_rows(options) * width * (1 if reference else cores())
-    written = min(block_rows(options) + 2 * options.margin, height) * width if options.margin else 0
-    parts = memory.BakeParts(
-        texels=min(shaded, width * height),
-        channels=3 * len(options.techniques) * len(options.passes),
-        margin_texels=written,
-        compared=options.cycles_samples > 0,
-    )
-    memory.check_bake(f"{width}x{height} texels", parts, options.memory_mib)
+    return TaskResult(document, seconds, tuple(files))
 
 
 class TileRecords:
     """Which tiles of objects the same job has finished (with `resume`), and those that follow.
 
-    Where `stems`, names of files by object, are given, no others are looked at.
+    Where the options have a `name`, no records of other names are looked at.
     """
 
-    def __init__(self, options: BakeOptions, stems: dict[str, str] | None = None):
+    def __init__(self, options: BakeOptions):
         self._records = Records(options.output, "tiles")
         self._key = options_digest("bake", options, contents_digest(options))
-        names = None if stems is None else stems.values()
+        names = None if options.name is None else [options.name]
         whole = self._records.all_whole(self._key, names) if options.resume else []
         self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
 
@@ -409,8 +360,9 @@ class TileRecords:
 
 def _check(options: BakeOptions) -> None:
     for side in (options.width, options.height):
-        if not SIZES[0] <= side <= SIZES[1]:
-            raise ValueError(f"size is {options.width}x{options.height}, expected {SIZES[0]} to {SIZES[1]} each")
+        if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
+            limits = "{} to {}".format(*TEXTURE_SIDES)
+            raise ValueError(f"size is {options.width}x{options.height}, expected {limits} each")
     if options.margin_type not in MARGIN_TYPES:
         raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
@@ -418,24 +370,18 @@ def _check(options: BakeOptions) -> None:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
 
 
-def _job(options, finished):
+def _job(options, finished, tile, following):
     from ..blender.process import client
 
-    shaded = tuple(name for name in ("specular", "diffuse") if name in shaded_passes(options))
-    return client.BakeJob(
-        scene=options.scene,
-        objects=options.objects,
-        uv=options.uv,
-        width=options.width,
-        height=options.height,
+    return child_job(
+        client.BakeJob,
+        options,
         block_rows=block_rows(options),
-        view=options.view,
-        camera=options.camera,
-        frame=options.frame,
-        scripts=options.scripts,
-        cycles_samples=options.cycles_samples,
-        passes=shaded,
+        cycles_samples=options.cycles_samples if options.error else 0,
+        passes=tuple(name for name in PASSES if name in shaded_passes(options)),
         finished=tuple(finished),
+        tile=tile,
+        following=following,
     )
 
 

@@ -58,8 +58,6 @@ def run_tasks(
     from ..blender.process.client import temporary_folder
 
     picture.prepare(job.options)
-    if job.command == "bake":
-        bake.check_memory(job.options)
     with temporary_folder() as folder, kept_blender(folder):
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)
@@ -109,12 +107,11 @@ def _is_done(records, task, existing) -> bool:
     return record is not None and "problem" not in record and not record["report"].get("problems")
 
 
-def _perform(job: Job, task: Task, following: tuple, existing: str, progress) -> picture.Made:
+def _perform(job: Job, task: Task, following: tuple, existing: str, progress) -> picture.TaskResult:
     options = task.options(job)
     if job.command == "bake":
         options = replace(options, resume=existing == RESUME)
-        stems = {task.object: task.stem}
-        return bake.bake_objects(options, progress, stems=stems, tile=task.tile, following=following)
+        return bake.bake_objects(options, progress, tile=task.tile, following=following)
     return picture.make_picture(options, job.command == "compare", progress)
 
 

@@ -6,17 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import imaging, shading
+from .. import imaging
 from ..imaging.exr import write_channels
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
+from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES
 
 FOLDER = "images"
-CYCLES = "cycles"
 ERROR = "error_"
 COMBINED = "combined"
-# As on the buttons of the panels.
-LABELS = {"ltc": "LTC", "ltsh2": "LTSH 2", "ltsh4": "LTSH 4", "reference": "Reference", CYCLES: "Cycles"}
+LABELS = {CYCLES: "Cycles", **{name: technique.label for name, technique in TECHNIQUES.items()}}
 FILES = {"shade": "shade.exr", "compare": "compare.exr"}
 
 
@@ -45,7 +44,7 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
     names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
-    passes = [name for name in ("specular", "diffuse", "diffuse_light", COMBINED) if f"{names[0]}.{name}" in layers]
+    passes = [name for name in BAKE_PASSES if f"{names[0]}.{name}" in layers]
     _add_combined(layers, names, passes)
     written = {}
     for name in names:
@@ -69,11 +68,9 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
 
 def _techniques(layers) -> list[str]:
     """Names that have radiance, techniques in their usual order, then tables of the user, Cycles last."""
-    passes = ("specular", "diffuse", "diffuse_light", COMBINED)
-    found = {name.rpartition(".")[0] for name in layers if name.rpartition(".")[2] in passes}
-    usual = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-    others = sorted(found - {*usual, CYCLES})
-    return [name for name in (*usual, *others, CYCLES) if name in found]
+    found = {name.rpartition(".")[0] for name in layers if name.rpartition(".")[2] in BAKE_PASSES}
+    others = sorted(found - {*TECHNIQUES, CYCLES})
+    return [name for name in (*TECHNIQUES, *others, CYCLES) if name in found]
 
 
 def _add_combined(layers, names, passes) -> None:
@@ -123,7 +120,7 @@ def _measured(layers, names, pass_name) -> dict:
             continue
         picture = layers[f"{name}.{pass_name}"]
         # The reference may stand for a part of the pixels only, the others are black.
-        mask = hit & picture.any(axis=-1) if name == shading.REFERENCE else hit
+        mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
         statistics = imaging.noisy_error_statistics(picture, *halves, mask).to_dict()
         flip = imaging.mean_flip(mean, np.where(mask[..., None], picture, mean), mask)
         rows[name] = {**statistics, "flip": flip}

@@ -14,32 +14,10 @@ from typing import Any
 import numpy as np
 
 from .. import imaging, shading
-from ..scene import VERSION, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, Film, Progress, SurfaceSamples
+from .options import PictureOptions, child_job
 
-DEFAULT_TECHNIQUES = ("ltc", "ltsh2", "ltsh4", shading.REFERENCE)
 REFERENCE_SEED = 20160725
-LABELS = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", shading.REFERENCE: "Reference quadrature"}
-
-
-@dataclass(frozen=True)
-class Options:
-    """What to shade and how; None means as in the file."""
-
-    scene: Path
-    output: Path
-    techniques: tuple[str, ...] = DEFAULT_TECHNIQUES
-    passes: tuple[str, ...] = shading.PASSES
-    width: int | None = None
-    height: int | None = None
-    sub_samples: int = 1
-    frame: int | None = None
-    camera: str | None = None
-    cycles_samples: int = 512  # of both halves together
-    reference_samples: int = 150_000  # above this many, `reference` takes a random subset
-    name: str | None = None  # stem of the files, below `output`; None: "shade" or "compare"
-    page: str = "report.html"  # of a comparison
-    scripts: bool = False  # run those of the file
-    memory_mib: int = 0  # a picture that needs more is refused; 0: as the environment says, else what is free
 
 
 @dataclass(frozen=True)
@@ -52,7 +30,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Made:
+class TaskResult:
     """What a task has done: its report, the seconds it took, and its files by their names below the output folder."""
 
     report: dict
@@ -60,7 +38,7 @@ class Made:
     files: tuple[str, ...]
 
 
-def shade_scene(options: Options, progress: Progress | None = None) -> dict:
+def shade_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
     """Shade a scene per pixel, write shade.exr, report.json and timing.json; the report with times as "seconds".
 
     Raises SceneError, TableError, OSError, Cancelled.
@@ -68,7 +46,7 @@ def shade_scene(options: Options, progress: Progress | None = None) -> dict:
     return _with_report(options, False, progress)
 
 
-def compare_scene(options: Options, progress: Progress | None = None) -> dict:
+def compare_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
     """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html too."""
     return _with_report(options, True, progress)
 
@@ -82,7 +60,7 @@ def _with_report(options, with_cycles, progress):
     return {**picture.report, "seconds": picture.seconds}
 
 
-def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
+def prepare(options: PictureOptions) -> dict[str, str | shading.LookupTable]:
     """Tables by the names under which techniques appear in results; proves that the output folder takes files.
 
     Done before anything takes long. Raises TableError, OSError.
@@ -95,11 +73,11 @@ def prepare(options: Options) -> dict[str, str | shading.LookupTable]:
 def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
     """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
     names = technique_names(techniques)
-    return {name: given if given == shading.REFERENCE else _table(given) for name, given in names.items()}
+    return {name: given if given == REFERENCE else _table(given) for name, given in names.items()}
 
 
 def _table(given: str) -> shading.LookupTable:
-    return _shipped_table(given) if given in shading.SHIPPED_TABLES else shading.load_table(given)
+    return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
 
 
 @cache
@@ -112,7 +90,7 @@ def technique_names(techniques: Sequence[str]) -> dict[str, str]:
     """What was given, by the names under which techniques appear in results: those of tables are short."""
     names = {}
     for given in techniques:
-        name = given if given in (*shading.SHIPPED_TABLES, shading.REFERENCE) else _short_name(given, names)
+        name = given if given in TECHNIQUES else _short_name(given, names)
         names[name] = given
     return names
 
@@ -121,11 +99,11 @@ def _short_name(path: str, taken) -> str:
     """The name of a table's file without folder and dots, which separate the parts of a layer's name."""
     stem = Path(path).stem.replace(".", "_")
     candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
-    reserved = {*shading.SHIPPED_TABLES, shading.REFERENCE, "cycles", *taken}
+    reserved = {*TECHNIQUES, "cycles", *taken}
     return next(name for name in candidates if name not in reserved)
 
 
-def make_picture(options: Options, with_cycles: bool, progress: Progress | None = None) -> Made:
+def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress | None = None) -> TaskResult:
     """Shade one picture, beside Cycles where asked for, and write its files but report.json.
 
     Raises as `shade_scene` does.
@@ -137,18 +115,7 @@ def make_picture(options: Options, with_cycles: bool, progress: Progress | None 
     start = time.perf_counter()
     tables = prepare(options)
     extraction = client.extract(
-        client.ExtractOptions(
-            scene=options.scene,
-            width=options.width,
-            height=options.height,
-            sub_samples=options.sub_samples,
-            cycles_samples=options.cycles_samples if with_cycles else 0,
-            frame=options.frame,
-            camera=options.camera,
-            scripts=options.scripts,
-            techniques=len(tables),
-            memory_mib=options.memory_mib,
-        ),
+        child_job(client.ExtractOptions, options, cycles_samples=options.cycles_samples if with_cycles else 0),
         progress=progress,
     )
     results = {name: _evaluate(name, table, extraction, options, progress) for name, table in tables.items()}
@@ -158,7 +125,7 @@ def make_picture(options: Options, with_cycles: bool, progress: Progress | None 
     files = comparison.write(Path(options.output), report, with_cycles, progress)
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
-    return Made(report, seconds, tuple(files))
+    return TaskResult(report, seconds, tuple(files))
 
 
 def _make_writable(path: Path) -> None:
@@ -174,7 +141,7 @@ def _make_writable(path: Path) -> None:
 def _evaluate(name, table, extraction, options, progress) -> Result:
     """Shade all samples, or for the reference those of randomly chosen pixels where the image is large."""
     samples, subset = extraction.samples, None
-    if name == shading.REFERENCE and len(samples) > options.reference_samples:
+    if name == REFERENCE and len(samples) > options.reference_samples:
         subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
         samples = samples.take(subset)
 
@@ -183,7 +150,7 @@ def _evaluate(name, table, extraction, options, progress) -> Result:
 
         def report(fraction, done=index):
             whole = (done + fraction) / len(options.passes)
-            return None if progress is None else progress(LABELS.get(name, name), whole)
+            return None if progress is None else progress(_title(name), whole)
 
         if report(0.0) is False:
             raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
@@ -234,10 +201,9 @@ def versions(blender_version: str) -> dict[str, str]:
     }
 
 
-def known_technique(name: str) -> bool:
-    """True for shipped tables, "reference", and paths of .npz files."""
-    names: Sequence[str] = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-    return name in names or name.endswith(".npz")
+def _title(name: str) -> str:
+    """What a technique is called on sheets and by progress; a table of the user by its name."""
+    return TECHNIQUES[name].title if name in TECHNIQUES else name
 
 
 def percent(value) -> str:
@@ -306,7 +272,7 @@ SAMPLE_LAYERS = {
 class Comparison:
     """The results of one scene, ready to be measured and written."""
 
-    options: Options
+    options: PictureOptions
     extraction: Any  # blender.child.Extraction, which the core does not import
     results: dict[str, Result]
 
@@ -370,7 +336,7 @@ class Comparison:
         }
 
     def _reference_facts(self) -> dict | None:
-        result = self.results.get(shading.REFERENCE)
+        result = self.results.get(REFERENCE)
         if result is None:
             return None
         count = len(self.extraction.samples) if result.subset is None else len(result.subset)
@@ -410,8 +376,8 @@ class Comparison:
             rec709, mask = self.extraction.color_space.rec709, self._mask(result)
             difference = imaging.mean_flip(rec709(halves.mean(axis=0)), rec709(shaded), mask)
             report["against_cycles"] = {**statistics.to_dict(), "flip": difference}
-        reference = self.results.get(shading.REFERENCE)
-        if reference is not None and name != shading.REFERENCE:
+        reference = self.results.get(REFERENCE)
+        if reference is not None and name != REFERENCE:
             report["against_reference"] = self._against_reference(result, reference, pass_name)
         return report
 
@@ -496,7 +462,7 @@ class Comparison:
         for name, result in self.results.items():
             report = self._technique_report(name, pass_name)
             error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
-            label = LABELS.get(name, name)
+            label = _title(name)
             image = self.images[name, pass_name]
             tiles.append(imaging.Tile(label, rec709(image), rec709(error), _caption(report)))
         title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"

@@ -14,12 +14,9 @@ from typing import Any
 
 from ..imaging import write_json
 from ..scene import VERSION
+from .options import what_matters
 
-FIELDS = ("scene", "camera", "frame", "object")
 LONGEST_STEM = 100
-LONGEST_PATTERN = 200
-# Neither names of files anywhere nor harmless: separators of folders and drives, wildcards, quotes.
-_REFUSED = '\\:*?"<>|'
 
 
 class NameClash(ValueError):
@@ -40,31 +37,6 @@ def file_stems(names: Iterable[str]) -> list[str]:
     return stems
 
 
-def check_pattern(pattern: str, fields: tuple[str, ...]) -> str:
-    """`pattern` itself; raises ValueError where it is no pattern of `fields` or names a file outside of the folder."""
-    expected = f"expected fields {', '.join('{' + name + '}' for name in fields)}, such as {{scene}}_{{frame:04d}}"
-    if not pattern or len(pattern) > LONGEST_PATTERN:
-        raise ValueError(f"name has {len(pattern)} letters, expected 1 to {LONGEST_PATTERN}")
-    try:
-        parsed = list(string.Formatter().parse(pattern))
-        for _, name, _, conversion in parsed:
-            if name is not None and (name not in fields or conversion):
-                raise ValueError(f"name {pattern!r}: {{{name}}} is unknown, {expected}")
-        example = pattern.format(**{name: 1 if name == "frame" else "x" for name in fields})
-    except (KeyError, IndexError, ValueError) as error:
-        text = str(error)
-        raise ValueError(text if text.startswith("name ") else f"name {pattern!r}: {text}; {expected}") from None
-    for part in example.split("/"):
-        if not part.strip(" ") or part.startswith(".") or part.endswith((".", " ")):
-            raise ValueError(
-                f"name {pattern!r} gives {example!r}, expected names below the output folder that do not begin or end "
-                "with a dot: folders are separated by single /"
-            )
-    if bad := [letter for letter in example if letter in _REFUSED or not letter.isprintable()]:
-        raise ValueError(f"name {pattern!r} has the letter {bad[0]!r}, which not every file system takes: leave it out")
-    return pattern
-
-
 def fields_of(pattern: str) -> set[str]:
     """The fields that a pattern has."""
     return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
@@ -80,8 +52,6 @@ _digests: dict[tuple, str] = {}
 
 FOLDER = ".ltsh"
 FORMAT = 1
-# What says where results go, which of them are wanted and what becomes of old ones, not what is in them.
-_NO_INFLUENCE = ("output", "scene", "resume", "objects", "name", "page", "memory_mib")
 
 
 def contents_digest(options) -> str:
@@ -100,9 +70,8 @@ def _known_digest(path: Path) -> str:
 
 
 def options_digest(command: str, options, contents: str) -> str:
-    """Digest of the options of a task (a dataclass), the version and `contents_digest`."""
-    values = {name: value for name, value in asdict(options).items() if name not in _NO_INFLUENCE}
-    found = [VERSION, command, values, contents]
+    """Digest of the options of a task on which its results depend, the version and `contents_digest`."""
+    found = [VERSION, command, what_matters(options), contents]
     return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
 
 
@@ -184,8 +153,8 @@ def _read(path: Path) -> dict | None:
 class Job:
     """What is to be done: one command for every combination of scene, camera, frame (and object of a bake).
 
-    `options` are compare.Options or bake.BakeOptions; of them scene, camera and frame are set for each task. No
-    cameras or frames means those of the file. `name` is a pattern of output_names, None the default one.
+    `options` are PictureOptions or BakeOptions, of which scene, camera, frame and name are set for each task. No
+    cameras or frames means those of the file. `name` is a pattern of names of files, None the default one.
     """
 
     command: str  # "shade", "compare" or "bake"
@@ -242,7 +211,7 @@ class Task:
         """The job's options for this task."""
         options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
         if self.object is not None:
-            return replace(options, objects=(self.object,))
+            return replace(options, objects=(self.object,), name=self.stem)
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon import cli, shading
-from ltsh_addon.cli import arguments as arguments_module
 from ltsh_addon.cli import commands
+from ltsh_addon.pipeline.options import techniques
 from ltsh_addon.scene import VERSION
 
 
@@ -143,4 +143,4 @@ def test_the_main_help_names_the_commands_and_examples(capsys):
 
 
 def test_every_shipped_table_is_a_technique():
-    assert arguments_module.techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES
+    assert techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES

@@ -9,14 +9,13 @@ from ltsh_addon.blender.process.blender_process import listed
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ("shad room.blend -o out", "ltsh: command 'shad' is unknown (did you mean shade?); see ltsh --help"),
-        ("frobnicate", "expected one of demo, compare, shade, bake, run, merge, tables"),
-        ("shade room.blend -o out --techniqes ltc", "ltsh shade: option --techniqes is unknown here (did you mean "
-         "--techniques?); see ltsh shade --help"),
-        ("shade room.blend -o out --techniqes=ltc", "did you mean --techniques?"),
+        ("shad room.blend -o out", "ltsh: command 'shad' is unknown (expected one of demo, compare, "
+         "shade, bake, run, merge, tables); see ltsh --help"),
+        ("shade room.blend -o out --techniqes ltc", "ltsh shade: option --techniqes is unknown here; see ltsh "
+         "shade --help"),
+        ("shade room.blend -o out --techniqes=ltc", "option --techniqes is unknown here"),
         ("shade room.blend -o out --cycles-samples 8", "--cycles-samples is unknown here (an option of demo, compare, "
          "bake)"),
-        ("shade room.blend -o out --zzz", "option --zzz is unknown here; see ltsh shade --help"),
         ("shade room.blend -o out hall.blend", "'hall.blend' is not expected here (name all files one "
          "after another); see"),
         ("demo room.blend -o out", "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
@@ -40,8 +39,7 @@ def test_help_says_what_a_command_does_and_gives_examples(capsys, command):
     assert f"\n  ltsh {command} " in text.partition("examples:")[2]
 
 
-def test_names_are_listed_from_the_most_similar_one_and_not_all():
-    names = [f"Chair {number}" for number in range(20)] + ["Floor"]
-    text = listed(names, "floor")
-    assert text.startswith("'Floor', 'Chair 0', ") and text.count("'") == 2 * 8 and text.endswith(" and 13 more")
-    assert listed(iter(("A", "B")), "Z") == "'A', 'B'" and listed((), "Z") == "none"
+def test_some_of_many_names_are_listed_and_counted():
+    text = listed(f"Chair {number}" for number in range(20))
+    assert text.startswith("'Chair 0', 'Chair 1', ") and text.count("'") == 2 * 8 and text.endswith(" and 12 more")
+    assert listed(iter(("A", "B"))) == "'A', 'B'" and listed(()) == "none"

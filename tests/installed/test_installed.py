@@ -223,7 +223,7 @@ def test_enabling_disabling_and_uninstalling_leaves_nothing(tmp_path):
     assert report["enabled_at_start"]
     for turn in ("first", "second"):
         assert report[turn]["enabled"] and "classes" in report[turn]["added"] and report[turn]["left"] == {}
-        assert {"cores", "memory_mib", "output_folder", "log_level"} <= set(report[turn]["preferences"])
+        assert {"cores", "output_folder", "log_level"} <= set(report[turn]["preferences"])
     assert report["uninstalled"] == {"left": {}, "paths": [], "modules": [], "handlers": 0}
     left = [path.name for path in installed.profile.rglob("*") if "ltsh" in path.name.lower() or path.suffix == ".so"]
     told = installed.ltsh("--version")

@@ -8,15 +8,17 @@ import pytest
 
 from ltsh_addon import cli
 from ltsh_addon.cli import arguments as arguments_module
+from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 from ltsh_addon.pipeline.baseline import Baseline, Tolerance
-from ltsh_addon.pipeline.picture import Options, compare_scene, shade_scene
 
 
 @pytest.fixture
 def report(monkeypatch, tmp_path):
     """What report.json of a comparison of one picture holds."""
     fake_scene.FakeChild().install(monkeypatch)
-    options = Options(tmp_path / "room.blend", tmp_path / "out", techniques=("ltc", "reference"), cycles_samples=8)
+    options = PictureOptions(
+        tmp_path / "room.blend", tmp_path / "out", techniques=("ltc", "reference"), cycles_samples=8
+    )
     compare_scene(options)
     return json.loads((tmp_path / "out" / "report.json").read_text())
 
@@ -104,7 +106,7 @@ def test_what_is_no_report_is_refused(tmp_path, document):
 
 def test_a_report_without_cycles_is_refused(monkeypatch, tmp_path):
     fake_scene.FakeChild().install(monkeypatch)
-    shade_scene(Options(tmp_path / "room.blend", tmp_path / "out", techniques=("ltc",)))
+    shade_scene(PictureOptions(tmp_path / "room.blend", tmp_path / "out", techniques=("ltc",)))
     with pytest.raises(ValueError, match="has no errors against Cycles"):
         Baseline.read(tmp_path / "out" / "report.json")
 

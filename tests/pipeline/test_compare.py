@@ -10,7 +10,7 @@ import pytest
 from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline.picture import compare_scene
+from ltsh_addon.pipeline import compare_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"

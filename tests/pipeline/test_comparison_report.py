@@ -10,8 +10,7 @@ import pytest
 from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
 from ltsh_addon import imaging, shading
-from ltsh_addon.pipeline import picture
-from ltsh_addon.pipeline.picture import compare_scene, shade_scene
+from ltsh_addon.pipeline import compare_scene, picture, shade_scene
 
 
 def without_seconds(report):

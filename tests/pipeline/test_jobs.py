@@ -8,9 +8,8 @@ import fake_scene
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.pipeline import batch, tasks
+from ltsh_addon.pipeline import PictureOptions, batch, tasks
 from ltsh_addon.pipeline.batch import merge
-from ltsh_addon.pipeline.picture import Options
 from ltsh_addon.pipeline.tasks import Job
 from ltsh_addon.scene import SceneError
 
@@ -18,7 +17,7 @@ SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
 
 def job(room, output, command="shade", **changes):
-    options = Options(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
+    options = PictureOptions(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
     return Job(command, options, **{"scenes": (room,), **changes})
 
 

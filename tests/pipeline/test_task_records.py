@@ -1,7 +1,6 @@
 """Records of finished tasks: looking them up, digests of what they were made from."""
 
-from ltsh_addon.pipeline import tasks
-from ltsh_addon.pipeline.picture import Options
+from ltsh_addon.pipeline import PictureOptions, tasks
 
 
 def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
@@ -24,7 +23,7 @@ def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path
 def test_a_changed_file_has_another_digest(tmp_path):
     room = tmp_path / "room.blend"
     room.write_bytes(b"BLENDER")
-    options = Options(room, tmp_path, techniques=("ltc",))
+    options = PictureOptions(room, tmp_path, techniques=("ltc",))
     first = tasks.contents_digest(options)
     assert tasks.contents_digest(options) == first
     room.write_bytes(b"BLENDER, other")

@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.cli import arguments as arguments_module
+from ltsh_addon.pipeline import PictureOptions
+from ltsh_addon.pipeline import options as options_module
 from ltsh_addon.pipeline import tasks as tasks_module
-from ltsh_addon.pipeline.picture import Options
 from ltsh_addon.pipeline.tasks import Job, shard_of, tasks_of
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 
 
 def job(room, output, command="shade", **changes):
-    options = Options(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
+    options = PictureOptions(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
     return Job(command, options, **{"scenes": (room,), **changes})
 
 
@@ -39,7 +39,7 @@ def run(capsys, *arguments):
     ],
 )
 def test_frames_are_ranges_and_single_ones_each_once(text, expected):
-    assert arguments_module.frames(text) == expected
+    assert options_module.frames(text) == expected
 
 
 @pytest.mark.parametrize(

@@ -15,14 +15,13 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ... import shading
-from ...scene import Cancelled, Progress, SceneError, error_line
+from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
 from ..process import client
 from ..saving import save_working_copy
 from ..ui.preview import ENGINE
 from . import view
-from .settings import TECHNIQUE_LABELS
 from .view import EngineView
 
 _current: dict = {}
@@ -136,7 +135,7 @@ class FinalJob:
 
     def shaded_as(self) -> dict[str, str]:
         """Names of passes start with -> technique."""
-        return {"LTSH": self.technique, **{TECHNIQUE_LABELS[name]: name for name in self.other_techniques}}
+        return {"LTSH": self.technique, **{TECHNIQUES[name].label: name for name in self.other_techniques}}
 
 
 def pass_names(prefixes) -> list[str]:
@@ -180,7 +179,7 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     }
     emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
     passes[EMISSION] = emission
-    shown = shading.PASSES if job.shown == "combined" else (job.shown,)
+    shown = PASSES if job.shown == "combined" else (job.shown,)
     color = sum(images[job.technique][part] for part in shown)
     if job.shown == "combined":
         color = color + emission
@@ -196,14 +195,14 @@ def _part(progress: Progress, start: float, share: float) -> Progress:
 def _images(extraction, technique: str, progress: Progress) -> dict[str, np.ndarray]:
     """Radiance (H, W, 3) of each pass times the film's exposure."""
     images = {}
-    for index, name in enumerate(shading.PASSES):
-        part = _part(progress, index / len(shading.PASSES), 1.0 / len(shading.PASSES))
+    for index, name in enumerate(PASSES):
+        part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
         shaded = shading.shade(
             extraction.samples,
             extraction.lights,
             technique,
             passes=(name,),
-            progress=lambda fraction, part=part: part(TECHNIQUE_LABELS[technique], fraction),
+            progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
         )
         image = extraction.film.image(extraction.exposure * shaded.combined)
         images[name] = inside_border(image, extraction.border)
@@ -324,8 +323,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
 
 
 def _prefixes(settings) -> list[str]:
-    others = TECHNIQUE_LABELS.values() if settings.technique_passes else ()
-    return ["LTSH", *others]
+    others = SHIPPED_TABLES if settings.technique_passes else ()
+    return ["LTSH", *(TECHNIQUES[name].label for name in others)]
 
 
 def _job_of(engine, depsgraph) -> FinalJob:
@@ -338,7 +337,7 @@ def _job_of(engine, depsgraph) -> FinalJob:
         sub_samples=settings.render_samples,
         technique=settings.technique,
         shown=settings.shown,
-        other_techniques=tuple(TECHNIQUE_LABELS) if settings.technique_passes else (),
+        other_techniques=SHIPPED_TABLES if settings.technique_passes else (),
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
     )
 

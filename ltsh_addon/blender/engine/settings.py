@@ -6,14 +6,10 @@ import bpy
 import gpu
 from gpu_extras.batch import batch_for_shader
 
+from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
 
-TECHNIQUES = (
-    ("ltc", "LTC", "Linearly transformed cosines (Heitz et al. 2016), as in EEVEE"),
-    ("ltsh2", "LTSH 2", "Linearly transformed spherical harmonics up to degree 2"),
-    ("ltsh4", "LTSH 4", "Linearly transformed spherical harmonics up to degree 4, the most accurate"),
-)
-TECHNIQUE_LABELS = {name: label for name, label, _ in TECHNIQUES}
+TECHNIQUE_ITEMS = tuple((name, TECHNIQUES[name].label, TECHNIQUES[name].description) for name in SHIPPED_TABLES)
 SHOWN_PASSES = (
     ("combined", "Both", "Specular and diffuse reflection, emission and background"),
     ("specular", "Specular", "Light that the glossy lobes reflect"),
@@ -24,12 +20,10 @@ MODES = (
     ("split", "Split", "The technique left of a line that can be dragged, the second technique right of it"),
     ("difference", "Difference", "The technique minus the second: red is brighter, blue darker, white equal"),
 )
-CYCLES = "cycles"
-SECOND_PICTURES = (
-    *TECHNIQUES,
+SECOND_ITEMS = (
+    *TECHNIQUE_ITEMS,
     (CYCLES, "Cycles", "The picture that Compare with Cycles has made, where the view is through its camera"),
 )
-SECOND_LABELS = {name: label for name, label, _ in SECOND_PICTURES}
 
 
 def _redraw(settings, context) -> None:
@@ -44,7 +38,7 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     """Settings of the viewport and of final renders with the engine LTSH."""
 
     technique: bpy.props.EnumProperty(
-        name="Technique", description="What shades the picture", items=TECHNIQUES, default="ltsh4", update=_redraw
+        name="Technique", description="What shades the picture", items=TECHNIQUE_ITEMS, default="ltsh4", update=_redraw
     )
     shown: bpy.props.EnumProperty(
         name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw
@@ -55,7 +49,7 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     second_technique: bpy.props.EnumProperty(
         name="Second",
         description="What the technique is put beside",
-        items=SECOND_PICTURES,
+        items=SECOND_ITEMS,
         default="ltc",
         update=_redraw,
     )
@@ -144,23 +138,6 @@ class LTSH_PT_view(_View, bpy.types.Panel):
         column = self.layout.column(heading="Final Render")
         column.prop(context.scene.ltsh_view, "render_samples", text="Samples")
         column.prop(context.scene.ltsh_view, "technique_passes")
-
-
-VIEW_CLASSES = (LTSH_ViewSettings, LTSH_PT_view_sidebar, LTSH_PT_view)
-
-
-def _register_view() -> None:
-    """Add the settings and their panel."""
-    for cls in VIEW_CLASSES:
-        bpy.utils.register_class(cls)
-    bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
-
-
-def _unregister_view() -> None:
-    """Remove what `register` added."""
-    del bpy.types.Scene.ltsh_view
-    for cls in reversed(VIEW_CLASSES):
-        bpy.utils.unregister_class(cls)
 
 
 # Settings of Cycles' renders in these tabs mean nothing to other engines.
@@ -291,30 +268,19 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
         self.line.use_draw_modal = True
 
 
-SPLIT_CLASSES = (LTSH_GT_split, LTSH_GGT_split)
-
-
-def _register_split() -> None:
-    """Add the gizmo."""
-    for cls in SPLIT_CLASSES:
-        bpy.utils.register_class(cls)
-
-
-def _unregister_split() -> None:
-    """Remove it."""
-    for cls in reversed(SPLIT_CLASSES):
-        bpy.utils.unregister_class(cls)
+CLASSES = (LTSH_ViewSettings, LTSH_PT_view_sidebar, LTSH_PT_view, LTSH_GT_split, LTSH_GGT_split)
+_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    """Add all of it to Blender."""
-    _register_view()
+    """Add the settings, their panels and the gizmo; show the panels that others have for the same things."""
+    _add_classes()
+    bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()
-    _register_split()
 
 
 def unregister() -> None:
     """Remove what `register` added."""
-    _unregister_split()
     _unshare_panels()
-    _unregister_view()
+    del bpy.types.Scene.ltsh_view
+    _remove_classes()

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
-from ...scene import error_line
+from ...scene import CYCLES, TECHNIQUES, error_line
 from ..render_settings import cycles_setting
 from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
@@ -24,7 +24,6 @@ from ..viewport.mirror import SceneMirror
 from ..viewport.renderer import ShownPicture, ViewRenderer
 from ..viewport.surfaces import View
 from ..viewport.textures import float_texture, look_values
-from .settings import CYCLES, SECOND_LABELS, TECHNIQUE_LABELS
 
 MOST_NOTES = 4
 FEWEST_LETTERS = 20  # no line is broken into shorter ones
@@ -218,7 +217,7 @@ def reference_of(context, scene, passes: str, projection: np.ndarray) -> Referen
     if scene.frame_current != report.get("frame"):
         return f"The Cycles picture is that of frame {report.get('frame')}, this is {scene.frame_current}"
     files = result.groups[""]["files"]
-    layer = f"{results.CYCLES}.{passes}"
+    layer = f"{CYCLES}.{passes}"
     if layer not in files:
         return f"The Cycles picture has no {passes} pass: compare with that pass"
     region = context.region
@@ -235,7 +234,7 @@ def _comparison_of(scene) -> results.Result | None:
     """The results with a Cycles picture: those that are shown, or the last ones of the command."""
     last = str(output_folder(scene, "compare") / "images")
     for result in (results.result_of(scene), results.result_in(last)):
-        if result is not None and "" in result.groups and results.CYCLES in result.groups[""]["names"]:
+        if result is not None and "" in result.groups and CYCLES in result.groups[""]["names"]:
             return result
     return None
 
@@ -390,7 +389,8 @@ def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:
 
 def _captions(settings, mode: str) -> Captions:
     """What stands at the upper end of the view."""
-    first, second = TECHNIQUE_LABELS[settings.technique], SECOND_LABELS[settings.second_technique]
+    first = TECHNIQUES[settings.technique].label
+    second = "Cycles" if settings.second_technique == CYCLES else TECHNIQUES[settings.second_technique].label
     if mode == "split":
         return Captions(first, second, settings.split_position)
     if mode == "difference":

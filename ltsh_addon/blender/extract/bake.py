@@ -78,7 +78,7 @@ def chosen_objects(scene, view_layer, wanted) -> list:
         return objects
     missing = [name for name in wanted if name not in view_layer.objects]
     if missing:
-        names = listed((ob.name for ob in view_layer.objects if ob.type == "MESH"), missing[0])
+        names = listed(ob.name for ob in view_layer.objects if ob.type == "MESH")
         raise SceneError(f"object {missing[0]!r} is not in scene {scene.name!r}; meshes there: {names}")
     return [view_layer.objects[name] for name in wanted]
 

@@ -21,7 +21,7 @@ from ..materials.aovs import (
     objects_without_material,
     remove_aovs,
 )
-from ..process import client, memory
+from ..process import client
 from ..process.blender_process import listed
 from ..render_settings import (
     enable_passes,
@@ -225,9 +225,6 @@ def extract(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
     picture = _picture(scene, job)
-    if job.get("techniques"):
-        size, compared = (picture["width"], picture["height"]), job["cycles_samples"] > 0
-        memory.check(*size, job["sub_samples"], job["techniques"], compared, job["memory_mib"])
     inventory = prepare_scene(scene, view_layer, camera, warnings)
     seconds["start"] = time.monotonic() - started
 
@@ -259,7 +256,7 @@ def _scene_named(name: str | None):
     if name is None:
         return bpy.context.scene
     if name not in bpy.data.scenes:
-        scenes = listed((scene.name for scene in bpy.data.scenes), name)
+        scenes = listed(scene.name for scene in bpy.data.scenes)
         raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
     return bpy.data.scenes[name]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import errno
 import importlib.util
 import json
@@ -56,12 +55,10 @@ def weigh_session() -> None:
 MOST = 8
 
 
-def listed(names: Iterable[str], wanted: str) -> str:
-    """At most 8 of `names` in quotes, those most like `wanted` first, and how many more there are; else "none"."""
+def listed(names: Iterable[str]) -> str:
+    """At most 8 of `names` in quotes and how many more there are; "none" for no names."""
     names = list(names)
-    near = difflib.get_close_matches(wanted, names, MOST)
-    chosen = [*near, *(name for name in names if name not in near)][:MOST]
-    text = ", ".join(map(repr, chosen)) or "none"
+    text = ", ".join(map(repr, names[:MOST])) or "none"
     return f"{text} and {len(names) - MOST} more" if len(names) > MOST else text
 
 

@@ -104,8 +104,6 @@ class ExtractOptions:
     scene_name: str | None = None
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
-    techniques: int = 0  # so many are to be shaded afterwards: SceneError where there is too little memory for that
-    memory_mib: int = 0  # what may be used; 0: as the environment says, else what is free
     emission: bool = False  # also what the surfaces themselves emit
 
 

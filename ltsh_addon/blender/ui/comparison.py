@@ -248,7 +248,6 @@ def _unregister_viewer():
                 handlers.remove(function)
 
 
-CYCLES = "cycles"
 _active = {"on": False}
 
 

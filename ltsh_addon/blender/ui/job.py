@@ -13,12 +13,14 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
+from ...pipeline.options import BakeOptions, PictureOptions, command_line
+from ...scene import REFERENCE, TECHNIQUES
 from ..process import blender_process
 from . import preflight
 from .settings import preferences
@@ -258,60 +260,63 @@ def _library_folders() -> list[str]:
 
 
 NO_CYCLES = "Not complete: without Cycles"
-REFERENCE = "reference"
 
 
 def runs(context, command: str, scene_file: Path) -> list[dict]:
     """The command lines of a job (see `panel_job.perform`)."""
     if command == "bake":
-        return [_run(bake_arguments(context, scene_file))]
+        return [_run(command, bake_options(context, scene_file))]
+    wanted = picture_options(context.scene, command, scene_file)
     if command == "shade":
-        return [_run(picture_arguments(context.scene, "shade", scene_file))]
+        return [_run(command, wanted)]
     # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
-    first = [name for name in chosen(context.scene.ltsh, "techniques") if name != REFERENCE]
-    early = [_run(picture_arguments(context.scene, "shade", scene_file, first), NO_CYCLES)] if first else []
-    return [*early, _run(picture_arguments(context.scene, "compare", scene_file))]
+    first = tuple(name for name in wanted.techniques if name != REFERENCE)
+    early = replace(picture_options(context.scene, "shade", scene_file), techniques=first)
+    return [*([_run("shade", early, NO_CYCLES)] if first else []), _run(command, wanted)]
 
 
-def _run(arguments: list[str], partial: str = "") -> dict:
-    return {"arguments": arguments, "output": arguments[arguments.index("-o") + 1], "partial": partial}
+def _run(command: str, options, partial: str = "") -> dict:
+    return {"arguments": [command, *command_line(options)], "output": str(options.output), "partial": partial}
 
 
-def picture_arguments(scene, command: str, scene_file: Path, techniques: list[str] | None = None) -> list[str]:
-    """Arguments of `ltsh shade` or `ltsh compare`."""
+def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
+    """What "shade" or "compare" is asked for."""
     settings = scene.ltsh
-    width, height = preflight.picture_of(scene)
-    arguments = [
-        *(command, str(scene_file), "-o", str(output_folder(scene, command))),
-        *("--techniques", ",".join(techniques or chosen(settings, "techniques"))),
-        *("--passes", ",".join(chosen(settings, "passes"))),
-        *("--resolution", f"{width}x{height}", "--aa", str(settings.anti_aliasing)),
-    ]
-    return arguments + (["--cycles-samples", str(settings.cycles_samples)] if command == "compare" else [])
+    samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
+    return PictureOptions(
+        scene=scene_file,
+        output=output_folder(scene, command),
+        techniques=chosen(settings, "techniques"),
+        passes=chosen(settings, "passes"),
+        resolution=preflight.picture_of(scene),
+        sub_samples=settings.anti_aliasing,
+        **samples,
+    )
 
 
-def bake_arguments(context, scene_file: Path) -> list[str]:
-    """Arguments of `ltsh bake` for the selected objects that can be baked."""
-    scene, settings = context.scene, context.scene.ltsh
-    arguments = ["bake", str(scene_file), "-o", str(output_folder(scene, "bake"))]
-    for ob in preflight.bake_objects(context)[0]:
-        arguments.append(f"--object={ob.name}")
-    arguments += [
-        *("--techniques", ",".join(chosen(settings, "techniques"))),
-        *("--passes", ",".join(chosen(settings, "bake_passes"))),
-        *("--size", settings.bake_size, "--margin", str(settings.bake_margin), "--view", settings.bake_view),
-    ]
-    if settings.bake_uv_map:
-        arguments.append(f"--uv={settings.bake_uv_map}")
-    if settings.bake_error:
-        arguments += ["--error", "--cycles-samples", str(settings.cycles_samples)]
-    return arguments
+def bake_options(context, scene_file: Path) -> BakeOptions:
+    """What "bake" is asked for: the selected objects that can be baked."""
+    settings = context.scene.ltsh
+    side = int(settings.bake_size)
+    return BakeOptions(
+        scene=scene_file,
+        output=output_folder(context.scene, "bake"),
+        objects=tuple(ob.name for ob in preflight.bake_objects(context)[0]),
+        uv=settings.bake_uv_map or None,
+        size=(side, side),
+        margin=settings.bake_margin,
+        view=settings.bake_view,
+        techniques=chosen(settings, "techniques"),
+        passes=chosen(settings, "bake_passes"),
+        error=settings.bake_error,
+        cycles_samples=settings.cycles_samples,
+    )
 
 
-def chosen(settings, key: str) -> list[str]:
+def chosen(settings, key: str) -> tuple[str, ...]:
     """The members of a set of choices, in the order in which they are offered."""
     items = settings.bl_rna.properties[key].enum_items.keys()
-    return [name for name in items if name in getattr(settings, key)]
+    return tuple(name for name in items if name in getattr(settings, key))
 
 
 def output_folder(scene, command: str) -> Path:
@@ -328,15 +333,12 @@ def output_folder(scene, command: str) -> Path:
 
 
 # What stages of the command line are called there and here; others keep their names.
-TECHNIQUES = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", REFERENCE: "Reference quadrature"}
-TITLES = {
+STAGE_TITLES = {
     "open scene": "Open Scene",
     "samples": "Sample Surfaces",
     "Cycles A": "Cycles, First Half",
     "Cycles B": "Cycles, Second Half",
-    "LTSH N=2": "LTSH 2",
-    "LTSH N=4": "LTSH 4",
-    "Reference quadrature": "Reference",
+    **{technique.title: technique.label for technique in TECHNIQUES.values()},
     "write": "Write Files",
     "images": "Make Pictures",
 }
@@ -369,7 +371,7 @@ def _picture(scene, techniques: list[str], with_cycles: bool) -> list[Step]:
         Step("open scene", OPEN_SECONDS),
         Step("samples", rendered + SAMPLE_SECONDS * points),
         *(Step(f"Cycles {name}", half.cost) for name in ("A", "B") if with_cycles),
-        *(Step(TECHNIQUES[name], _shading(name, points)) for name in techniques),
+        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques),
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
     ]
@@ -393,7 +395,7 @@ def _shading(technique: str, points: float) -> float:
 
 def stage_title(job: Job) -> str:
     """What the job does now."""
-    return translated(TITLES.get(job.stage, job.stage))
+    return translated(STAGE_TITLES.get(job.stage, job.stage))
 
 
 def progress_text(job: Job) -> str:

@@ -13,7 +13,6 @@ from ...imaging.report import index_stamp, read_index
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
 PREFIX = "LTSH "
 ERROR = "error_"
-CYCLES = "cycles"
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ from bpy.props import (
     StringProperty,
 )
 
+from ...scene import CYCLES, TECHNIQUES
 from ...shading.parallel import CORES_VARIABLE
 from .comparison import changed
 
 # "bl_ext.user_default.ltsh" in Blender, where add-ons are known by it; "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
 LOGGER = __package__.rsplit(".", 2)[0]
-MEMORY_VARIABLE = "LTSH_MEMORY_MIB"
 RESULTS = "results"
 LOG_LEVELS = (
     ("ERROR", "Errors", "Only what failed"),
@@ -36,15 +36,13 @@ LOG_LEVELS = (
     ("DEBUG", "Details", "Everything, to find the cause of a fault"),
 )
 _DEFAULT_LOG_LEVEL = "WARNING"
-_NO_LIMIT = 0
 
 
 @dataclass(frozen=True)
 class Preferences:
-    """What is set; 0 means no limit of the add-on's own. `output_folder` is absolute and need not exist."""
+    """What is set; 0 cores mean all. `output_folder` is absolute and need not exist."""
 
     cores: int
-    memory_mib: int
     output_folder: Path
     log_level: str
 
@@ -54,10 +52,10 @@ def preferences(context) -> Preferences:
     addon = context.preferences.addons.get(ADDON)
     stored = addon.preferences if addon is not None else None
     if stored is None:
-        return Preferences(_NO_LIMIT, _NO_LIMIT, default_output_folder(), _DEFAULT_LOG_LEVEL)
+        return Preferences(0, default_output_folder(), _DEFAULT_LOG_LEVEL)
     chosen = stored.output_folder.strip()
     folder = Path(bpy.path.abspath(chosen)).absolute() if chosen else default_output_folder()
-    return Preferences(stored.cores, stored.memory_mib, folder, stored.log_level)
+    return Preferences(stored.cores, folder, stored.log_level)
 
 
 def default_output_folder() -> Path:
@@ -73,13 +71,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     cores: bpy.props.IntProperty(
         name="Processor Cores",
         description="How many cores shading, baking and the Cycles reference may use; 0 takes all of them",
-        min=0, max=1024, soft_max=64, default=_NO_LIMIT, update=lambda self, context: apply(context),
-    )  # fmt: skip
-    memory_mib: bpy.props.IntProperty(
-        name="Memory Limit",
-        description="A job that needs more than this many MiB is refused before it starts; "
-        "0 allows what the machine has free",
-        min=0, soft_max=2**20, step=1024, default=_NO_LIMIT, update=lambda self, context: apply(context),
+        min=0, max=1024, soft_max=64, default=0, update=lambda self, context: apply(context),
     )  # fmt: skip
     output_folder: bpy.props.StringProperty(
         name="Output Folder",
@@ -101,9 +93,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
         missing = missing_libraries()
         if missing:
             layout.label(text=missing, icon="ERROR", translate=False)
-        limits = layout.column(align=True)
-        limits.prop(self, "cores", text="Processor Cores (0: All)")
-        limits.prop(self, "memory_mib", text="Memory Limit, MiB (0: All Free)")
+        layout.prop(self, "cores", text="Processor Cores (0: All)")
         layout.prop(self, "output_folder", placeholder=str(default_output_folder()))
         layout.prop(self, "log_level")
 
@@ -113,11 +103,10 @@ _log_handlers: list[logging.Handler] = []
 
 
 def apply(context) -> None:
-    """Put limits and log level into effect, here and for processes started from now on."""
+    """Put the limit and the log level into effect, here and for processes started from now on."""
     chosen = preferences(context)
-    for name, value in ((CORES_VARIABLE, chosen.cores), (MEMORY_VARIABLE, chosen.memory_mib)):
-        before = _variables_before.setdefault(name, os.environ.get(name))
-        _set_variable(name, str(value) if value != _NO_LIMIT else before)
+    before = _variables_before.setdefault(CORES_VARIABLE, os.environ.get(CORES_VARIABLE))
+    _set_variable(CORES_VARIABLE, str(chosen.cores) if chosen.cores else before)
     logger = logging.getLogger(LOGGER)
     logger.setLevel(chosen.log_level)
     if not _log_handlers:
@@ -134,39 +123,21 @@ def _set_variable(name: str, value: str | None) -> None:
         os.environ[name] = value
 
 
-def _register_preferences() -> None:
-    """Add the preferences and put them into effect."""
-    bpy.utils.register_class(LTSH_AddonPreferences)
-    apply(bpy.context)
-
-
-def _unregister_preferences() -> None:
-    """Take the preferences and their effects back."""
-    logger = logging.getLogger(LOGGER)
-    while _log_handlers:
-        logger.removeHandler(_log_handlers.pop())
-    logger.setLevel(logging.NOTSET)
-    while _variables_before:
-        _set_variable(*_variables_before.popitem())
-    bpy.utils.unregister_class(LTSH_AddonPreferences)
-
-
-TECHNIQUES = (
-    ("ltc", "LTC", "Linearly transformed cosines, as EEVEE has them: fastest, least accurate", 1),
-    ("ltsh2", "LTSH 2", "Linearly transformed spherical harmonics of degree 2: nearly as fast as LTC", 2),
-    ("ltsh4", "LTSH 4", "Linearly transformed spherical harmonics of degree 4: the most accurate closed form", 4),
-    ("reference", "Reference", "Quadrature of the true lobe: exact and slow, on some of the pixels of large images", 8),
+# Members of sets of choices: name, label, description, bit.
+TECHNIQUE_ITEMS = tuple(
+    (name, technique.label, technique.description, 1 << index)
+    for index, (name, technique) in enumerate(TECHNIQUES.items())
 )
-PASSES = (
+PASS_ITEMS = (
     ("specular", "Specular", "Glossy reflection, surface color included", 1),
     ("diffuse", "Diffuse", "Diffuse reflection, surface color included", 2),
 )
-BAKE_PASSES = (
-    *PASSES,
+BAKE_PASS_ITEMS = (
+    *PASS_ITEMS,
     ("diffuse_light", "Lightmap", "Diffuse reflection without the color of the surface", 4),
     ("combined", "Combined", "Specular and diffuse together", 8),
 )
-PICTURES = (*TECHNIQUES, ("cycles", "Cycles", "The Cycles reference of the same points", 16))
+PICTURE_ITEMS = (*TECHNIQUE_ITEMS, (CYCLES, "Cycles", "The Cycles reference of the same points", 16))
 VIEWS = (
     ("camera", "Active Camera", "The specular part as the scene's camera sees it"),
     ("above", "Above Surface", "The specular part as seen along the normal of each point, independent of any camera"),
@@ -186,14 +157,14 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     techniques: EnumProperty(
         name="Techniques",
         description="How the glossy lobe is integrated over the lights. Shift-click to choose several",
-        items=TECHNIQUES,
+        items=TECHNIQUE_ITEMS,
         options={"ENUM_FLAG"},
         default={"ltc", "ltsh4"},
     )
     passes: EnumProperty(
         name="Passes",
         description="Parts of the reflected light. Shift-click to choose several",
-        items=PASSES,
+        items=PASS_ITEMS,
         options={"ENUM_FLAG"},
         default={"specular", "diffuse"},
     )
@@ -248,7 +219,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     bake_passes: EnumProperty(
         name="Bake Passes",
         description="Parts of the reflected light. Shift-click to choose several",
-        items=BAKE_PASSES,
+        items=BAKE_PASS_ITEMS,
         options={"ENUM_FLAG"},
         default={"specular", "diffuse"},
     )
@@ -270,13 +241,21 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     groups: CollectionProperty(type=bpy.types.PropertyGroup)
     group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
     first: EnumProperty(
-        name="A", description="The first picture, left of the line", items=PICTURES, default="ltsh4", update=changed
+        name="A",
+        description="The first picture, left of the line",
+        items=PICTURE_ITEMS,
+        default="ltsh4",
+        update=changed,
     )
     second: EnumProperty(
-        name="B", description="The second picture, right of the line", items=PICTURES, default="cycles", update=changed
+        name="B",
+        description="The second picture, right of the line",
+        items=PICTURE_ITEMS,
+        default=CYCLES,
+        update=changed,
     )
     pass_name: EnumProperty(
-        name="Pass", description="Which part of the light is shown", items=BAKE_PASSES, default="combined",
+        name="Pass", description="Which part of the light is shown", items=BAKE_PASS_ITEMS, default="combined",
         update=changed,
     )  # fmt: skip
     split: FloatProperty(
@@ -306,16 +285,6 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )
 
 
-def _register_properties():
-    bpy.utils.register_class(LTSH_PG_scene)
-    bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
-
-
-def _unregister_properties():
-    del bpy.types.Scene.ltsh
-    bpy.utils.unregister_class(LTSH_PG_scene)
-
-
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "passes", "resolution_percentage", "anti_aliasing", "cycles_samples",
         "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
@@ -341,30 +310,28 @@ class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
     preset_add_operator = "ltsh.add_preset"
 
 
-_register, _unregister = bpy.utils.register_classes_factory((LTSH_OT_add_preset, LTSH_PT_presets))
+CLASSES = (LTSH_AddonPreferences, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
+_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # Blender looks for a folder "presets" in it.
-FOLDER = str(Path(__file__).parent)
-
-
-def _register_presets():
-    _register()
-    bpy.utils.register_preset_path(FOLDER)
-
-
-def _unregister_presets():
-    bpy.utils.unregister_preset_path(FOLDER)
-    _unregister()
+PRESETS_PARENT = str(Path(__file__).parent)
 
 
 def register() -> None:
-    """Add all of it to Blender."""
-    _register_preferences()
-    _register_properties()
-    _register_presets()
+    """Add settings, preferences and presets; preferences take effect."""
+    _add_classes()
+    apply(bpy.context)
+    bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
+    bpy.utils.register_preset_path(PRESETS_PARENT)
 
 
 def unregister() -> None:
-    """Remove what `register` added."""
-    _unregister_presets()
-    _unregister_properties()
-    _unregister_preferences()
+    """Remove what `register` added; environment and log are as before."""
+    bpy.utils.unregister_preset_path(PRESETS_PARENT)
+    del bpy.types.Scene.ltsh
+    logger = logging.getLogger(LOGGER)
+    while _log_handlers:
+        logger.removeHandler(_log_handlers.pop())
+    logger.setLevel(logging.NOTSET)
+    while _variables_before:
+        _set_variable(*_variables_before.popitem())
+    _remove_classes()

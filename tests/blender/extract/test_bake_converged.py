@@ -27,7 +27,12 @@ def test_reference_and_ltsh4_are_near_a_converged_bake(tmp_path, build, size, pa
     bpy.data.objects["Key"].location.z = 2.0
     build()
     _, files = baked(
-        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4"), cycles_samples=128, width=size, height=size
+        save(tmp_path),
+        tmp_path / "out",
+        techniques=("reference", "ltsh4"),
+        cycles_samples=128,
+        error=True,
+        size=(size, size),
     )
     (layers,) = files.values()
     for pass_name in passes:

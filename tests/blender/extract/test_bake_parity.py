@@ -13,7 +13,8 @@ from scene_parts import bsdf_material, new_material, principled
 
 from ltsh_addon import imaging
 from ltsh_addon.cycles import closures
-from ltsh_addon.pipeline.picture import Options, make_picture
+from ltsh_addon.pipeline import PictureOptions
+from ltsh_addon.pipeline.picture import make_picture
 
 WIDTH, HEIGHT, SCALE = 192, 64, 6.0  # texels, and m of the picture's width
 RED, BLUE = (0.8, 0.3, 0.2, 1.0), (0.2, 0.4, 0.9, 1.0)
@@ -92,8 +93,8 @@ def pictures(tmp_path_factory):
         scene_parts.add_area_light("Light", (x, 0.4, 1.5), size=2.0)
     scene_parts.add_top_camera(SCALE)
     path = save(folder)
-    make_picture(Options(scene=path, output=folder / "picture", techniques=("ltsh4",)), with_cycles=False)
-    report, files = baked(path, folder / "bake", width=WIDTH, height=HEIGHT)
+    make_picture(PictureOptions(scene=path, output=folder / "picture", techniques=("ltsh4",)), with_cycles=False)
+    report, files = baked(path, folder / "bake", size=(WIDTH, HEIGHT))
     (picture,) = (folder / "picture").glob("*.exr")
     return imaging.read_layers(picture), files, report["warnings"]
 

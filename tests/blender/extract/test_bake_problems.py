@@ -10,7 +10,7 @@ from bake_scenes import baked, save, start
 from scene_parts import add_plane, principled
 
 from ltsh_addon.blender.process import blender_process
-from ltsh_addon.pipeline.bake import BakeOptions, bake_scene
+from ltsh_addon.pipeline import BakeOptions, bake_scene
 from ltsh_addon.scene import Cancelled
 
 
@@ -76,7 +76,7 @@ def test_scenes_that_cannot_be_baked_say_why(tmp_path):
         "object 'Plane' has no UV map 'Lightmap', found 'UVMap': unwrap it, or name another with --uv"
     ]
     with pytest.raises(ValueError, match="size is 32x8192, expected 64 to 8192 each"):
-        baked(path, tmp_path / "out", width=32, height=8192)
+        baked(path, tmp_path / "out", size=(32, 8192))
     bpy.data.objects.remove(bpy.data.objects["Plane"])
     with pytest.raises(blender_process.SceneError, match="no mesh that renders, nothing to bake"):
         baked(save(tmp_path), tmp_path / "out")
@@ -100,7 +100,7 @@ def test_stopping_leaves_no_file(tmp_path):
         return not stage.startswith("shade")
 
     with pytest.raises(Cancelled):
-        bake_scene(BakeOptions(scene=save(tmp_path), output=tmp_path / "out", width=64, height=64), stop)
+        bake_scene(BakeOptions(scene=save(tmp_path), output=tmp_path / "out", size=(64, 64)), stop)
     assert list((tmp_path / "out").iterdir()) == []
 
 

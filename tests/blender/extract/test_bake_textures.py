@@ -12,8 +12,7 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.cycles import texels as texels_module
 from ltsh_addon.cycles.images import ImageTexture
 from ltsh_addon.cycles.uv import UvTriangles
-from ltsh_addon.pipeline import bake
-from ltsh_addon.pipeline.bake import BakeOptions
+from ltsh_addon.pipeline import BakeOptions, bake
 from ltsh_addon.scene import AreaLight
 
 # Cycles bakes 0.001 and 0.002 of a texel beside the center, where these textures change by 0.3 per texel at most.
@@ -94,7 +93,7 @@ def plain_scene(folder):
 def samples_by_object(path, folder, look_up):
     """Samples (SurfaceSamples) of every object and whether maps were baked for it."""
     folder.mkdir()
-    options = BakeOptions(scene=path, output=folder, width=SIZE, height=SIZE, view="above")
+    options = BakeOptions(scene=path, output=folder, size=(SIZE, SIZE), view="above")
     job = replace(bake._job(options, {}), look_up_images=look_up)
     manifest = client.extract_bake(job, folder)
     lights = tuple(AreaLight(**record) for record in manifest["lights"])

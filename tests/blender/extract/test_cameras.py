@@ -11,7 +11,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.blender.render_settings import enable_passes, render_exr
-from ltsh_addon.pipeline.picture import Options, shade_scene
+from ltsh_addon.pipeline import PictureOptions, shade_scene
 from ltsh_addon.scene import SceneError
 
 
@@ -112,7 +112,9 @@ def test_a_region_is_recorded_and_has_the_size_of_a_plain_render(tmp_path):
     sizes = {}
     for crop in (False, True):
         set_border(scene, crop=crop)
-        report = shade_scene(Options(saved(tmp_path), tmp_path / "out", techniques=("ltc",), passes=("diffuse",)))
+        report = shade_scene(
+            PictureOptions(saved(tmp_path), tmp_path / "out", techniques=("ltc",), passes=("diffuse",))
+        )
         layers = imaging.read_layers(tmp_path / "out" / "shade.exr")
         sizes[crop] = layers["coverage.hit"]
         # 26 x 15 pixels: columns 8 to 20, rows 2 to 8 from below.

@@ -14,7 +14,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.imaging.color import CHROMATICITIES, identified
-from ltsh_addon.pipeline.picture import Options, compare_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene
 
 CHOOSES_SPACES = bpy.app.version >= (5, 0, 0)
 SPACES = ("Linear Rec.709", "Linear Rec.2020", "ACEScg") if CHOOSES_SPACES else ("Linear Rec.709",)
@@ -49,7 +49,7 @@ def test_lights_and_surfaces_shine_as_in_cycles(tmp_path, space, temperature):
     colored_room(space, surface=(0.8, 0.3, 0.1), color=(0.9, 0.4, 0.2), **given)
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    options = Options(path, tmp_path / "out", techniques=("ltc",), passes=("diffuse",), cycles_samples=512)
+    options = PictureOptions(path, tmp_path / "out", techniques=("ltc",), passes=("diffuse",), cycles_samples=512)
     report = compare_scene(options)
     layers = imaging.read_layers(tmp_path / "out" / "compare.exr")
     ratio = layers["ltc.diffuse"].sum(axis=(0, 1)) / layers["cycles.diffuse"].sum(axis=(0, 1))
@@ -69,7 +69,7 @@ def test_the_sheet_looks_the_same_whatever_the_space(tmp_path):
         colored_room(space, color=(0.9, 0.6, 0.3))
         path = tmp_path / "scene.blend"
         bpy.ops.wm.save_as_mainfile(filepath=str(path))
-        compare_scene(Options(path, tmp_path, techniques=("ltc",), passes=("diffuse",), cycles_samples=64))
+        compare_scene(PictureOptions(path, tmp_path, techniques=("ltc",), passes=("diffuse",), cycles_samples=64))
         image = bpy.data.images.load(str(tmp_path / "compare.png"))
         sheets[space] = 255.0 * np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[..., :3]
         values[space] = imaging.read_layers(tmp_path / "compare.exr")["ltc.diffuse"]

@@ -7,7 +7,7 @@ import scene_parts
 from scene_parts import add_plane, add_sphere, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.pipeline.bake import BakeOptions, bake_scene
+from ltsh_addon.pipeline import BakeOptions, bake_scene
 
 SIZE = 64
 
@@ -28,7 +28,7 @@ def save(folder):
 
 def baked(path, output, **options):
     """Report and layers by file name, row 0 on top."""
-    values = {"width": SIZE, "height": SIZE, "margin": 0, **options}
+    values = {"size": (SIZE, SIZE), "margin": 0, **options}
     report = bake_scene(BakeOptions(scene=path, output=output, **values))
     return report, {file.name: imaging.read_layers(file) for file in sorted(output.glob("*.exr"))}
 

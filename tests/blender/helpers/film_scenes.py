@@ -7,7 +7,7 @@ from scene_parts import add_plane, bsdf_material
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.render_settings import enable_passes, render_exr
-from ltsh_addon.pipeline.picture import Options, compare_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene
 
 SIZE = (26, 16)
 
@@ -55,7 +55,7 @@ def compared(folder, **options):
     path = folder / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
     given = {"techniques": ("ltc",), "cycles_samples": 128, "passes": ("diffuse",), **options}
-    report = compare_scene(Options(path, folder / "out", **given))
+    report = compare_scene(PictureOptions(path, folder / "out", **given))
     return report, imaging.read_layers(folder / "out" / "compare.exr")
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.pipeline.picture import Options, compare_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene
 
 
 def add_curves(material):
@@ -41,7 +41,7 @@ def test_hair_is_shaded_as_in_cycles(tmp_path, add_hair, shape):
     add_hair(scene_parts.principled(Roughness=0.4, Metallic=0.5)[0])
     path = tmp_path / "hair.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    report = compare_scene(Options(path, tmp_path / "out", techniques=("reference",), cycles_samples=512))
+    report = compare_scene(PictureOptions(path, tmp_path / "out", techniques=("reference",), cycles_samples=512))
     assert report["warnings"] == [] and report["surface_samples"] > 1000
     for figures in report["passes"].values():
         found = figures["techniques"]["reference"]["against_cycles"]

@@ -7,7 +7,7 @@ import scene_parts
 
 from ltsh_addon import cli
 from ltsh_addon.blender.process import blender_process, client
-from ltsh_addon.pipeline.picture import Options, compare_scene, shade_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
 
@@ -65,7 +65,7 @@ def fail_at(stage):
 
 def options(path, **changes):
     given = {"techniques": ("ltc",), "cycles_samples": 4, "sub_samples": 2, **changes}
-    return Options(path, path.with_name("out"), **given)
+    return PictureOptions(path, path.with_name("out"), **given)
 
 
 def run_command(path):

@@ -13,10 +13,9 @@ import pytest
 import scene_parts
 
 from ltsh_addon.blender.process import blender_process, client
-from ltsh_addon.pipeline import batch
-from ltsh_addon.pipeline.bake import BakeOptions
+from ltsh_addon.pipeline import BakeOptions, PictureOptions, batch
 from ltsh_addon.pipeline.batch import merge
-from ltsh_addon.pipeline.picture import Options, make_picture
+from ltsh_addon.pipeline.picture import make_picture
 from ltsh_addon.pipeline.tasks import Job, tasks_of
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -60,7 +59,7 @@ def run_python(*arguments):
 
 
 def job(room, output, cycles_samples=4, **changes):
-    options = Options(room, output, techniques=("ltsh4",), cycles_samples=cycles_samples)
+    options = PictureOptions(room, output, techniques=("ltsh4",), cycles_samples=cycles_samples)
     return Job("compare", options, **{"scenes": (room,), **changes})
 
 
@@ -167,7 +166,9 @@ def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
         loads.extend([stage] if stage == "open scene" else [])
 
     def bake(output, **shard):
-        options = BakeOptions(room, output, width=64, height=64, margin=2, techniques=("ltsh4",), cycles_samples=2)
+        options = BakeOptions(
+            room, output, size=(64, 64), margin=2, techniques=("ltsh4",), error=True, cycles_samples=2
+        )
         return batch.run_tasks(Job("bake", options, (room,), frames=(1, 5)), progress=progress, **shard)
 
     assert len(bake(tmp_path / "one").problems) == 2
@@ -192,7 +193,7 @@ def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
 
 def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
     def bake(output, **shard):
-        options = BakeOptions(room, output, objects=("Slab", "Floor"), width=64, height=64, margin=2, apply=True)
+        options = BakeOptions(room, output, objects=("Slab", "Floor"), size=(64, 64), margin=2, apply=True)
         return batch.run_tasks(Job("bake", options, (room,)), **shard)
 
     for number in (1, 2):
@@ -215,7 +216,7 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path):
             pages = [int(Path(f"/proc/{name}/statm").read_text().split()[1]) for name in (process, "self")]
             sizes.append([count * os.sysconf("SC_PAGE_SIZE") / 2**20 for count in pages])
 
-    options = Options(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), width=128, height=96)
+    options = PictureOptions(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), resolution=(128, 96))
     batch.run_tasks(Job("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
     for column in zip(*sizes, strict=True):
         assert max(column[15:]) - max(column[5:15]) < 5.0, column

@@ -181,5 +181,4 @@ def test_objects_that_cannot_be_baked_are_left_out(scene):
     other.data.uv_layers.remove(other.data.uv_layers[0])
     for ob in (floor, other):
         ob.select_set(True)
-    arguments = job.bake_arguments(bpy.context, Path("room.blend"))
-    assert [item for item in arguments if item.startswith("--object")] == ["--object=Floor"]
+    assert job.bake_options(bpy.context, Path("room.blend")).objects == ("Floor",)

@@ -11,22 +11,21 @@ import pytest
 
 import ltsh_addon
 from ltsh_addon.blender.ui import preflight, settings
-from ltsh_addon.blender.ui.settings import MEMORY_VARIABLE, Preferences, preferences
+from ltsh_addon.blender.ui.settings import Preferences, preferences
 from ltsh_addon.shading import parallel
 from ltsh_addon.shading.parallel import CORES_VARIABLE
 
 
 def context_with(**chosen):
     """A context as of a Blender in which the add-on is enabled and some preferences were changed."""
-    stored = {"cores": 0, "memory_mib": 0, "output_folder": "", "log_level": "WARNING", **chosen}
+    stored = {"cores": 0, "output_folder": "", "log_level": "WARNING", **chosen}
     addon = SimpleNamespace(preferences=SimpleNamespace(**stored))
     return SimpleNamespace(preferences=SimpleNamespace(addons={settings.ADDON: addon}))
 
 
 @pytest.fixture
 def enabled(monkeypatch):
-    monkeypatch.delenv(CORES_VARIABLE, raising=False)
-    monkeypatch.setenv(MEMORY_VARIABLE, "512")
+    monkeypatch.setenv(CORES_VARIABLE, "6")
     ltsh_addon.register()
     yield
     ltsh_addon.unregister()
@@ -35,13 +34,13 @@ def enabled(monkeypatch):
 def test_without_being_enabled_there_are_defaults():
     assert settings.ADDON not in bpy.context.preferences.addons
     found = preferences(bpy.context)
-    assert found == Preferences(0, 0, settings.default_output_folder(), "WARNING")
+    assert found == Preferences(0, settings.default_output_folder(), "WARNING")
     assert found.output_folder.is_absolute()
 
 
 def test_defaults_are_those_of_the_registered_properties(enabled):
     properties = settings.LTSH_AddonPreferences.bl_rna.properties
-    stored = {name: properties[name].default for name in ("cores", "memory_mib", "output_folder", "log_level")}
+    stored = {name: properties[name].default for name in ("cores", "output_folder", "log_level")}
     assert preferences(context_with(**stored)) == preferences(bpy.context)
     for name in stored:
         assert len(properties[name].description) > 20 and not properties[name].description.endswith(".")
@@ -49,8 +48,8 @@ def test_defaults_are_those_of_the_registered_properties(enabled):
 
 def test_an_output_folder_beside_the_file_is_made_absolute(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    found = preferences(context_with(output_folder="//results", cores=3, memory_mib=100, log_level="DEBUG"))
-    assert found == Preferences(3, 100, tmp_path / "results", "DEBUG")
+    found = preferences(context_with(output_folder="//results", cores=3, log_level="DEBUG"))
+    assert found == Preferences(3, tmp_path / "results", "DEBUG")
     bpy.ops.wm.read_homefile(use_empty=True)
 
 
@@ -60,18 +59,18 @@ def test_the_folder_of_an_extension_is_the_one_that_updates_keep(monkeypatch):
     assert parts[-5:] == ("extensions", ".user", "user_default", "ltsh", "results")
 
 
-def test_limits_reach_this_process_and_its_children_until_disabled(enabled, monkeypatch):
+def test_the_limit_of_cores_reaches_this_process_and_its_children_until_disabled(enabled, monkeypatch):
     if hasattr(os, "sched_getaffinity"):
         monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(8))
     else:
         monkeypatch.setattr(os, "cpu_count", lambda: 8)
-    assert (parallel.cores(), os.environ[MEMORY_VARIABLE]) == (8, "512")
-    settings.apply(context_with(cores=3, memory_mib=1000))
-    assert (parallel.cores(), os.environ[CORES_VARIABLE], os.environ[MEMORY_VARIABLE]) == (3, "3", "1000")
+    assert parallel.cores() == 6
+    settings.apply(context_with(cores=3))
+    assert (parallel.cores(), os.environ[CORES_VARIABLE]) == (3, "3")
     settings.apply(context_with(cores=100))
-    assert parallel.cores() == 8 and os.environ[MEMORY_VARIABLE] == "512"
+    assert parallel.cores() == 8
     ltsh_addon.unregister()
-    assert CORES_VARIABLE not in os.environ and os.environ[MEMORY_VARIABLE] == "512"
+    assert os.environ[CORES_VARIABLE] == "6"
 
 
 @pytest.mark.parametrize("value", ["0", "", "-2", "many", "1e3"])

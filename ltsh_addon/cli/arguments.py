@@ -50,7 +50,7 @@ def add_option(parser, kind: type, name: str, **changes) -> None:
         group.add_argument(*argument.flags, **keywords)
 
 
-def scenes(arguments, open_file: str | None) -> tuple[Path, ...]:
+def scenes_of(arguments, open_file: str | None) -> tuple[Path, ...]:
     """The files to work on: those named, or the one that Blender has open. Raises Misuse."""
     if arguments.scenes and open_file:
         raise Misuse(f"SCENE is {arguments.scenes[0]!r}, but Blender has {open_file!r} open already; give one of them")

@@ -1,4 +1,7 @@
-"""The commands: shade, compare, demo, bake, merge, run, tables."""
+"""The commands. `add_<command>` declares the arguments of one and names the function that runs it.
+
+That function takes the arguments, the progress bar and the file that Blender has open, and returns the exit code.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ..pipeline.baseline import Baseline
-from ..pipeline.batch import merge
 from ..pipeline.options import BakeOptions, PictureOptions, options_from, table
 from ..pipeline.picture import prepare
 from ..pipeline.tasks import Job
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
-from . import arguments as arguments_module
 from .arguments import (
     Misuse,
     add_baseline,
@@ -25,10 +25,11 @@ from .arguments import (
     add_options,
     add_talk,
     from_text,
+    scenes_of,
     with_examples,
 )
-from .job_file import Command, Wanted, read_jobs
-from .output import do_job, finish, merge_folder, print_json, run_job
+from .job_file import Wanted, read_jobs
+from .output import baseline_of, do_job, merge_job, print_json
 from .progress import say
 
 DEMO_RESOLUTION = (480, 270)
@@ -54,67 +55,6 @@ SHADE_EXAMPLES = """examples:
   %(prog)s room.blend -o out/room --techniques ltsh4 --aa 16
   %(prog)s room.blend -o out/room --frames 1-240 --resume
 """
-
-
-def add_demo(parser) -> None:
-    """Add the arguments and the function that runs."""
-    with_examples(parser, DEMO, DEMO_EXAMPLES)
-    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
-    add_options(parser, PictureOptions, but=("scene", "scripts"), resolution=size)
-    _add_run(parser, PictureOptions)
-    parser.set_defaults(run=_demo, scenes=[])
-
-
-def add_compare(parser) -> None:
-    """Add the arguments and the function that runs."""
-    with_examples(parser, COMPARE, COMPARE_EXAMPLES)
-    add_options(parser, PictureOptions, but=("scripts",))
-    _add_run(parser, PictureOptions)
-    add_baseline(parser)
-    parser.set_defaults(run=_run_picture)
-
-
-def add_shade(parser) -> None:
-    """Add the arguments and the function that runs."""
-    with_examples(parser, SHADE, SHADE_EXAMPLES)
-    add_options(parser, PictureOptions, but=("scripts", "cycles_samples"))
-    _add_run(parser, PictureOptions)
-    parser.set_defaults(run=_run_picture, cycles_samples=0)
-
-
-def _add_run(parser, kind) -> None:
-    """What all commands that open a .blend end with."""
-    add_batch(parser)
-    add_option(parser, kind, "scripts")
-    add_talk(parser)
-
-
-def picture_job(arguments, scenes: tuple[Path, ...]) -> Job:
-    """The job that the arguments describe."""
-    return _job("shade" if arguments.command == "shade" else "compare", PictureOptions, arguments, scenes)
-
-
-def _job(command, kind, arguments, scenes) -> Job:
-    options = options_from(kind, vars(arguments), scene=scenes[0])
-    cameras = tuple(dict.fromkeys(arguments.cameras or ()))
-    return Job(command, options, scenes, cameras, arguments.frames, arguments.pattern)
-
-
-def _run_picture(arguments, bar, open_file) -> int:
-    if getattr(arguments, "baseline", None) and arguments.shard and arguments.shard[1] > 1:
-        raise Misuse("--baseline is for the whole job, not for a shard of it: give it to `merge`")
-    return run_job(picture_job(arguments, arguments_module.scenes(arguments, open_file)), arguments, bar)
-
-
-def _demo(arguments, bar, open_file) -> int:
-    from ..blender.process import client
-
-    job = picture_job(arguments, (arguments.output / "demo.blend",))
-    prepare(job.options)
-    client.build_demo(job.scenes[0], progress=bar)
-    return run_job(job, arguments, bar)
-
-
 BAKE = """Shade the texels of UV maps. OUT gets an EXR for each object, with a layer for each
 technique and pass, and report.json; UDIM tiles get files of their own."""
 BAKE_EXAMPLES = """examples:
@@ -128,25 +68,75 @@ An object that cannot be baked is named at the end, and the exit code is 1; the 
 """
 
 
+def add_demo(parser) -> None:
+    """`ltsh demo`."""
+    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
+    with_examples(parser, DEMO, DEMO_EXAMPLES)
+    _add_job(parser, PictureOptions, but=("scene",), resolution=size)
+    parser.set_defaults(run=_demo, scenes=[])
+
+
+def add_compare(parser) -> None:
+    """`ltsh compare`."""
+    with_examples(parser, COMPARE, COMPARE_EXAMPLES)
+    _add_job(parser, PictureOptions)
+    add_baseline(parser)
+
+
+def add_shade(parser) -> None:
+    """`ltsh shade`."""
+    with_examples(parser, SHADE, SHADE_EXAMPLES)
+    _add_job(parser, PictureOptions, but=("cycles_samples",))
+    parser.set_defaults(cycles_samples=0)
+
+
 def add_bake(parser) -> None:
-    """Add the arguments and the function that runs."""
+    """`ltsh bake`."""
     with_examples(parser, BAKE, BAKE_EXAMPLES)
-    add_options(parser, BakeOptions, but=("scripts",))
-    _add_run(parser, BakeOptions)
-    parser.set_defaults(run=_run_bake)
+    _add_job(parser, BakeOptions)
 
 
-def _run_bake(arguments, bar, open_file) -> int:
-    """Bake; 0, or 1 where some object could not be baked."""
-    return run_job(bake_job(arguments, arguments_module.scenes(arguments, open_file)), arguments, bar)
+def _add_job(parser, kind, *, but=(), **changes) -> None:
+    """The options `kind` `but` for some, with `changes`, and how the job is run."""
+    add_options(parser, kind, but=(*but, "scripts"), **changes)
+    add_batch(parser)
+    add_option(parser, kind, "scripts")
+    add_talk(parser)
+    parser.set_defaults(run=_run_scenes)
 
 
-def bake_job(arguments, scenes: tuple[Path, ...]) -> Job:
-    """The job that the arguments describe. Raises Misuse."""
-    job = _job("bake", BakeOptions, arguments, scenes)
-    if arguments.apply and (len(job.cameras) > 1 or len(job.frames) > 1):
+def _run_scenes(arguments, bar, open_file) -> int:
+    if getattr(arguments, "baseline", None) and arguments.shard and arguments.shard[1] > 1:
+        raise Misuse("--baseline is for the whole job, not for a shard of it: give it to `merge`")
+    job = job_of(arguments, scenes_of(arguments, open_file))
+    return _printed(arguments, *do_job(job, arguments, bar, baseline_of(arguments)))
+
+
+def _demo(arguments, bar, open_file) -> int:
+    from ..blender.process import client
+
+    job = job_of(arguments, (arguments.output / "demo.blend",))
+    prepare(job.options)
+    client.build_demo(job.scenes[0], progress=bar)
+    return _printed(arguments, *do_job(job, arguments, bar))
+
+
+def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
+    """The job that the arguments of demo, compare, shade or bake describe. Raises Misuse."""
+    kind = BakeOptions if arguments.command == "bake" else PictureOptions
+    command = "compare" if arguments.command == "demo" else arguments.command
+    cameras = tuple(dict.fromkeys(arguments.cameras or ()))
+    if command == "bake" and arguments.apply and (len(cameras) > 1 or len(arguments.frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
-    return job
+    options = options_from(kind, vars(arguments), scene=scenes[0])
+    return Job(command, options, scenes, cameras, arguments.frames, arguments.pattern)
+
+
+def _printed(arguments, document: dict, code: int) -> int:
+    """`code`, after the document of --json was printed."""
+    if arguments.json:
+        print_json(document)
+    return code
 
 
 MERGE = "Write report.json and timing.json of all that the shards of a job have done in OUT."
@@ -160,7 +150,7 @@ What is missing is named, and the exit code is 1; the command with --resume and 
 
 
 def add_merge(parser) -> None:
-    """Add the arguments and the function that runs."""
+    """`ltsh merge`."""
     with_examples(parser, MERGE, MERGE_EXAMPLES)
     parser.add_argument("output", type=Path, metavar="OUT", help="the folder that -o named, or JOB.toml of `run`")
     add_baseline(parser)
@@ -169,11 +159,15 @@ def add_merge(parser) -> None:
 
 
 def _merge(arguments, bar, open_file) -> int:
-    if arguments.output.suffix == ".toml" and not arguments.output.is_dir():
-        if arguments.baseline is not None:
-            raise Misuse("--baseline belongs into the job file, to the job that it is for")
-        return merge_jobs(arguments.output, arguments, bar)
-    return merge_folder(arguments, bar)
+    if arguments.output.suffix != ".toml" or arguments.output.is_dir():
+        return _printed(arguments, *merge_job(arguments.output, arguments, bar, baseline_of(arguments)))
+    if arguments.baseline is not None:
+        raise Misuse("--baseline belongs into the job file, to the job that it is for")
+
+    def merge(job, settings, baseline):
+        return merge_job(job.options.output, settings, bar, baseline)
+
+    return _for_each(read_jobs(arguments.output, job_parsers(), job_of), merge, arguments, bar)
 
 
 RUN = "Do the jobs of a file, each a shade, compare or bake, one after another."
@@ -206,7 +200,7 @@ are done all the same.
 
 
 def add_run(parser) -> None:
-    """Add the arguments and the function that runs."""
+    """`ltsh run`."""
     with_examples(parser, RUN, RUN_EXAMPLES)
     parser.add_argument("file", type=Path, metavar="JOB.toml", help="the jobs")
     add_batch(parser)
@@ -214,45 +208,26 @@ def add_run(parser) -> None:
     parser.set_defaults(run=_run_jobs)
 
 
-def commands() -> dict[str, Command]:
-    """The commands that a job file may have."""
+def _run_jobs(arguments, bar, open_file) -> int:
+    def do(job, settings, baseline):
+        return do_job(job, settings, bar, baseline)
+
+    return _for_each(read_jobs(arguments.file, job_parsers(), job_of), do, arguments, bar)
+
+
+def job_parsers() -> dict[str, argparse.ArgumentParser]:
+    """Parsers of the commands that a job file may have."""
     found = {}
-    for name, add_arguments, job_of in (
-        ("shade", add_shade, picture_job),
-        ("compare", add_compare, picture_job),
-        ("bake", add_bake, bake_job),
-    ):
-        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        add_arguments(parser)
-        parser.set_defaults(command=name)
-        found[name] = Command(parser, job_of)
+    for name, add_arguments in (("shade", add_shade), ("compare", add_compare), ("bake", add_bake)):
+        found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        add_arguments(found[name])
+        found[name].set_defaults(command=name)
     return found
 
 
-def merge_jobs(path: Path, arguments, bar) -> int:
-    """`ltsh merge` of every job of a file; 0, or 1 where something is missing or wrong."""
-    return _each(
-        read_jobs(path, commands()),
-        lambda wanted, settings, baseline: finish(
-            merge(wanted.job.options.output, bar), wanted.job.options.output, settings, bar, baseline
-        ),
-        arguments,
-        bar,
-    )
-
-
-def _run_jobs(arguments, bar, open_file) -> int:
-    return _each(
-        read_jobs(arguments.file, commands()),
-        lambda wanted, settings, baseline: do_job(wanted.job, settings, bar, baseline),
-        arguments,
-        bar,
-    )
-
-
-def _each(jobs: list[Wanted], do, arguments, bar) -> int:
-    """Do something with every job; the world's faults in one do not keep the others from being done."""
-    baselines = [_baseline(wanted) for wanted in jobs]
+def _for_each(jobs: list[Wanted], do, arguments, bar) -> int:
+    """Call do(job, settings, baseline) for every job; what is wrong with one does not keep the others from it."""
+    baselines = [baseline_of(wanted.arguments) for wanted in jobs]
     documents, worst = [], 0
     for number, (wanted, baseline) in enumerate(zip(jobs, baselines, strict=True), 1):
         settings = argparse.Namespace(**{**vars(arguments), "tolerance": getattr(wanted.arguments, "tolerance", None)})
@@ -260,21 +235,13 @@ def _each(jobs: list[Wanted], do, arguments, bar) -> int:
         label = f"job {number} of {len(jobs)} ({wanted.job.command}, {output})"
         bar.begin_job(label)
         try:
-            document, code = do(wanted, settings, baseline)
+            document, code = do(wanted.job, settings, baseline)
         except (SceneError, TableError, OSError, ValueError, ImportError, MemoryError) as error:
-            text = error_line(error)
-            bar.note(f"failed: {label}: {text}")
-            document, code = {"error": text}, 1
+            bar.note(f"failed: {label}: {error_line(error)}")
+            document, code = {"error": error_line(error)}, 1
         documents.append({"command": wanted.job.command, "output": str(output), **document})
         worst = max(worst, code)
-    if arguments.json:
-        print_json({"jobs": documents})
-    return worst
-
-
-def _baseline(wanted) -> Baseline | None:
-    path = getattr(wanted.arguments, "baseline", None)
-    return None if path is None else Baseline.read(path)
+    return _printed(arguments, {"jobs": documents}, worst)
 
 
 TABLES = "Fit, measure and export the lookup tables. All but export need the source checkout and scipy."
@@ -297,7 +264,7 @@ SCRIPTS = {
 
 
 def add_tables(parser) -> None:
-    """Add the arguments and the functions that run."""
+    """`ltsh tables`."""
     with_examples(parser, TABLES, TABLES_EXAMPLES)
     actions = parser.add_subparsers(dest="action", required=True)
     for action, meaning in SCRIPTS.items():

@@ -19,18 +19,7 @@ _PATHS = ("baseline",)
 _OF_THE_RUN = ("overwrite", "resume", "skip-existing", "shard", "json", "quiet", "log", "help")
 _OF_EVERY_JOB = ("command", "scene", "scenes", "output")
 
-
-@dataclass(frozen=True)
-class Command:
-    """How a command reads its options: its parser, and what makes the job of them and of the scenes."""
-
-    parser: argparse.ArgumentParser
-    job_of: Callable[[argparse.Namespace, tuple[Path, ...]], Job]
-
-    def options(self) -> dict[str, argparse.Action]:
-        """Actions by the names of options without dashes, but for those of the run as a whole."""
-        actions = {name[2:]: action for action in self.parser._actions for name in action.option_strings}
-        return {name: action for name, action in actions.items() if name and name not in _OF_THE_RUN}
+JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], Job]
 
 
 @dataclass(frozen=True)
@@ -52,8 +41,11 @@ class Mistakes(Misuse):
         self.lines, self.of_the_world = lines, of_the_world
 
 
-def read_jobs(path: Path, commands: dict[str, Command]) -> list[Wanted]:
-    """The jobs of a file. Raises Mistakes with all that is wrong in it, OSError where it cannot be read."""
+def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: JobOf) -> list[Wanted]:
+    """The jobs of a file, by the parsers of commands and what makes a job of parsed arguments and scenes.
+
+    Raises Mistakes with all that is wrong in the file, OSError where it cannot be read.
+    """
     try:
         document = tomllib.loads(path.read_bytes().decode("utf-8"))
     except OSError as error:
@@ -62,7 +54,7 @@ def read_jobs(path: Path, commands: dict[str, Command]) -> list[Wanted]:
         raise Mistakes([f"{path}: is no TOML: {error}"]) from None
     except RecursionError:
         raise Mistakes([f"{path}: is no TOML that can be read: too many brackets within one another"]) from None
-    reader = _Reader(path, commands)
+    reader = _Reader(path, parsers, job_of)
     wanted = reader.read(document)
     if reader.mistakes:
         # Those of the defaults are found with every job.
@@ -73,8 +65,8 @@ def read_jobs(path: Path, commands: dict[str, Command]) -> list[Wanted]:
 class _Reader:
     """Reads one file and collects all mistakes, a line for each, which names the job and the key."""
 
-    def __init__(self, path, commands):
-        self.path, self.commands = path, commands
+    def __init__(self, path, parsers, job_of):
+        self.path, self.parsers, self.job_of = path, parsers, job_of
         self.mistakes: list[str] = []
         self.of_the_world = True
 
@@ -90,7 +82,7 @@ class _Reader:
         if not isinstance(jobs, list) or not jobs or not all(isinstance(job, dict) for job in jobs):
             self._complain("", "no job is there, expected at least one [[job]]")
             return []
-        known = {name for command in self.commands.values() for name in command.options()}
+        known = {name for parser in self.parsers.values() for name in _options(parser)}
         for key in defaults.keys() - known:
             self._unknown("defaults", key, known)
         wanted = [self._job(f"job {number}", job, defaults) for number, job in enumerate(jobs, 1)]
@@ -99,11 +91,12 @@ class _Reader:
 
     def _job(self, where, job, defaults) -> Wanted | None:
         before = len(self.mistakes)
-        command = self.commands.get(job.get("command")) if isinstance(job.get("command"), str) else None
-        if command is None:
-            self._complain(where, f"command is {job.get('command')!r}, expected one of {', '.join(self.commands)}")
+        command = job.get("command")
+        parser = self.parsers.get(command) if isinstance(command, str) else None
+        if parser is None:
+            self._complain(where, f"command is {command!r}, expected one of {', '.join(self.parsers)}")
             return None
-        options, scenes = command.options(), self._scenes(where, job)
+        options, scenes = _options(parser), self._scenes(where, job)
         words = [f"-o{self.path.parent / self._output(where, job)}"]
         for key, value in job.items():
             if key in options:
@@ -112,15 +105,15 @@ class _Reader:
                 self._unknown(where, key, {*options, *_OF_EVERY_JOB})
         for key in defaults.keys() & options.keys() - job.keys():
             words += self._words("defaults", key, defaults[key], options[key])
-        return self._checked(where, command, words, scenes) if len(self.mistakes) == before else None
+        return self._checked(where, parser, words, scenes) if len(self.mistakes) == before else None
 
-    def _checked(self, where, command, words, scenes) -> Wanted | None:
+    def _checked(self, where, parser, words, scenes) -> Wanted | None:
         """The job, if its options make sense together and its files are there."""
         from ..blender.process.client import check_readable
 
         try:
-            arguments = _parse(command.parser, words)
-            job = command.job_of(arguments, scenes)
+            arguments = _parse(parser, words)
+            job = self.job_of(arguments, scenes)
             for scene in scenes:
                 check_readable(scene)
             picture.load_tables(arguments.techniques)
@@ -198,6 +191,12 @@ class _Reader:
         self.of_the_world &= of_the_world
         place = f"{self.path}, {where}" if where else str(self.path)
         self.mistakes.append(f"{place}: {' '.join(text.split())}")
+
+
+def _options(parser) -> dict[str, argparse.Action]:
+    """Actions by the names of options without dashes, but for those of the run as a whole."""
+    actions = {name[2:]: action for action in parser._actions for name in action.option_strings}
+    return {name: action for name, action in actions.items() if name and name not in _OF_THE_RUN}
 
 
 def _parse(parser, words) -> argparse.Namespace:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from pathlib import Path
 
 from ..imaging.report import json_text
 from ..pipeline.baseline import Baseline
@@ -13,16 +14,8 @@ from ..pipeline.tasks import Job
 from .progress import say
 
 
-def run_job(job: Job, arguments, bar) -> int:
-    """Do the job, or its shard; 0, or 1 where something of it is wrong."""
-    document, code = do_job(job, arguments, bar, _baseline(arguments))
-    if arguments.json:
-        print_json(document)
-    return code
-
-
 def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
-    """As `run_job`; the document for --json, which is not printed, and the exit code."""
+    """Do the job, or its shard; the document for --json, and the exit code: 1 where something is wrong."""
     shard = arguments.shard or (1, 1)
 
     def tell(state):
@@ -35,7 +28,7 @@ def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[
     if shard[1] == 1:
         if done.kept:
             bar.remark(f"{done.kept} of {done.tasks} tasks were there already")
-        return finish(merge(job.options.output, bar), job.options.output, arguments, bar, baseline)
+        return merge_job(job.options.output, arguments, bar, baseline)
     bar.finish()
     text = f"{shard[0]}/{shard[1]}"
     kept = f" ({done.kept} were there already)" if done.kept else ""
@@ -45,8 +38,9 @@ def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[
     return {"shard": text, **vars(done)}, 1 if done.problems else 0
 
 
-def finish(merged: Merged, output, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
-    """Print what a whole job has made; the document for --json and the exit code, 1 where something is wrong."""
+def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
+    """Assemble and print what a whole job has made; the document for --json, and the exit code as of `do_job`."""
+    merged = merge(output, bar)
     bar.finish()
     if not arguments.json:
         _complain(bar, "warning", _warnings(merged))
@@ -66,16 +60,7 @@ def print_json(document) -> None:
     say(json.dumps(json.loads(json_text(document)), indent=2), sys.stdout)
 
 
-def merge_folder(arguments, bar) -> int:
-    """`ltsh merge OUT`; 0, or 1 where something is missing or wrong."""
-    baseline = _baseline(arguments)
-    document, code = finish(merge(arguments.output, bar), arguments.output, arguments, bar, baseline)
-    if arguments.json:
-        print_json(document)
-    return code
-
-
-def _baseline(arguments) -> Baseline | None:
+def baseline_of(arguments) -> Baseline | None:
     """What --baseline names, read before anything is done."""
     path = getattr(arguments, "baseline", None)
     return None if path is None else Baseline.read(path)

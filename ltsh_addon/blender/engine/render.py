@@ -63,21 +63,6 @@ def saved_copy() -> Path:
 HANDLERS = (("render_init", _take), ("render_complete", _drop), ("render_cancel", _drop))
 
 
-def _keep_copies() -> None:
-    """Add the handlers."""
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-
-
-def _drop_copies() -> None:
-    """Remove the handlers and the copy."""
-    for name, function in HANDLERS:
-        functions = getattr(bpy.app.handlers, name)
-        if function in functions:
-            functions.remove(function)
-    _drop()
-
-
 ASK_SECONDS = 0.05
 
 
@@ -343,14 +328,19 @@ def _job_of(engine, depsgraph) -> FinalJob:
 
 
 def register() -> None:
-    """Add the engine and what its final renders need."""
+    """Add the engine and what its renders and views need."""
     bpy.utils.register_class(LTSH_RenderEngine)
-    _keep_copies()
+    for name, function in HANDLERS:
+        getattr(bpy.app.handlers, name).append(function)
     view.register()
 
 
 def unregister() -> None:
     """Remove what `register` added."""
     view.unregister()
-    _drop_copies()
+    for name, function in HANDLERS:
+        functions = getattr(bpy.app.handlers, name)
+        if function in functions:
+            functions.remove(function)
+    _drop()
     bpy.utils.unregister_class(LTSH_RenderEngine)

@@ -15,8 +15,10 @@ from . import drawing, results
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
 PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
+GRIP_PIXELS = 12.0
+HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "kept": False, "dragged": None}
+_state = {"lookup": None, "settling": set(), "kept": False, "dragged": None, "probing": False, "drawing": None}
 
 
 def changed(settings, context) -> None:
@@ -233,24 +235,6 @@ def _restore(*_):
     settle()
 
 
-def _register_viewer():
-    bpy.app.handlers.save_pre.append(_shrink)
-    for handlers in (bpy.app.handlers.save_post, bpy.app.handlers.load_post):
-        handlers.append(_restore)
-
-
-def _unregister_viewer():
-    if bpy.app.timers.is_registered(settle):
-        bpy.app.timers.unregister(settle)
-    for handlers in (bpy.app.handlers.save_pre, bpy.app.handlers.save_post, bpy.app.handlers.load_post):
-        for function in (_shrink, _restore):
-            if function in handlers:
-                handlers.remove(function)
-
-
-_active = {"on": False}
-
-
 class LTSH_OT_probe(bpy.types.Operator):
     """Show the radiance of every picture at the pixel under the mouse. Click to leave the probe there, Esc to end"""
 
@@ -267,7 +251,7 @@ class LTSH_OT_probe(bpy.types.Operator):
 
     def invoke(self, context, event):
         self._area = context.area
-        _active["on"] = True
+        _state["probing"] = True
         context.window.cursor_modal_set("EYEDROPPER")
         context.window_manager.modal_handler_add(self)
         context.area.tag_redraw()
@@ -283,7 +267,7 @@ class LTSH_OT_probe(bpy.types.Operator):
             self._area.tag_redraw()
             return {"PASS_THROUGH"}
         if event.type in {"ESC", "RIGHTMOUSE"}:
-            _active["on"] = False
+            _state["probing"] = False
             return self._end(context, {"CANCELLED"})
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             return self._end(context, {"FINISHED"})
@@ -291,7 +275,7 @@ class LTSH_OT_probe(bpy.types.Operator):
 
     def cancel(self, context):
         """The window was closed."""
-        _active["on"] = False
+        _state["probing"] = False
 
     def _end(self, context, outcome):
         context.window.cursor_modal_restore()
@@ -316,7 +300,7 @@ def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple
 
 def draw_probe(context, result, choice, corners) -> None:
     """A cross at the probed pixel and a table of its values, while the probe is on."""
-    if not _active["on"]:
+    if not _state["probing"]:
         return
     scene, scale = context.scene, context.preferences.system.ui_scale
     left, bottom, right, top = corners
@@ -328,10 +312,10 @@ def draw_probe(context, result, choice, corners) -> None:
     for a, b in ((gap, arm), (-arm, -gap)):
         drawing.draw_rectangle(x + a, y - half, x + b, y + half, drawing.LINE)
         drawing.draw_rectangle(x - half, y + a, x + half, y + b, drawing.LINE)
-    _draw_table(f"{column}, {row}", rows, x + 14.0 * scale, y - 14.0 * scale, scale)
+    _draw_values(f"{column}, {row}", rows, x + 14.0 * scale, y - 14.0 * scale, scale)
 
 
-def _draw_table(title: str, rows, x: float, top: float, scale: float) -> None:
+def _draw_values(title: str, rows, x: float, top: float, scale: float) -> None:
     line, pad = 17.0 * scale, 8.0 * scale
     label = max([drawing.text_width(name, scale) for name, _ in rows] + [drawing.text_width(title, scale)])
     number = drawing.text_width("0000.0000", scale)
@@ -349,14 +333,7 @@ def _draw_table(title: str, rows, x: float, top: float, scale: float) -> None:
             drawing.draw_text(right - drawing.text_width(text, scale), y, text, scale)
 
 
-_register_probe, _unregister_probe = bpy.utils.register_classes_factory((LTSH_OT_probe,))
-
-GRIP_PIXELS = 12.0
-HANDLE_PIXELS = 9.0
-_wiped = {"handle": None}
-
-
-def _shown(context):
+def _compared_in(context):
     """Result and choice where the space of `context` shows the comparison of its scene, else None."""
     space, scene = context.space_data, context.scene
     if space is None or space.type != "IMAGE_EDITOR" or not is_viewer(space.image):
@@ -412,7 +389,7 @@ class LTSH_GGT_wipe(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _shown(context) is not None
+        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _compared_in(context) is not None
 
     def setup(self, context):
         self.gizmos.new(LTSH_GT_wipe.bl_idname)
@@ -421,7 +398,7 @@ class LTSH_GGT_wipe(bpy.types.GizmoGroup):
 def _draw() -> None:
     """Called by Blender for every Image Editor."""
     context = bpy.context
-    shown = _shown(context)
+    shown = _compared_in(context)
     if shown is None:
         return
     result, choice = shown
@@ -471,29 +448,25 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     drawing.draw_label(bar + width, below, end, scale)
 
 
-CLASSES = (LTSH_GT_wipe, LTSH_GGT_wipe)
-_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
-
-
-def _register_wipe():
-    _register()
-    _wiped["handle"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
-
-
-def _unregister_wipe():
-    bpy.types.SpaceImageEditor.draw_handler_remove(_wiped["handle"], "WINDOW")
-    _unregister()
+_add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe))
+HANDLERS = (("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore))
 
 
 def register() -> None:
-    """Add all of it to Blender."""
-    _register_viewer()
-    _register_probe()
-    _register_wipe()
+    """Add the probe, the line and what files need before and after they are saved."""
+    for name, function in HANDLERS:
+        getattr(bpy.app.handlers, name).append(function)
+    _add_classes()
+    _state["drawing"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
 
 
 def unregister() -> None:
     """Remove what `register` added."""
-    _unregister_wipe()
-    _unregister_probe()
-    _unregister_viewer()
+    bpy.types.SpaceImageEditor.draw_handler_remove(_state["drawing"], "WINDOW")
+    _remove_classes()
+    if bpy.app.timers.is_registered(settle):
+        bpy.app.timers.unregister(settle)
+    for name, function in HANDLERS:
+        handlers = getattr(bpy.app.handlers, name)
+        if function in handlers:
+            handlers.remove(function)

@@ -250,15 +250,6 @@ class _Output:
         draw_text(row, context, str(output_folder(context.scene, "").parent))
 
 
-MAIN = in_both_places(_Main, "main")
-PARTS = (
-    *in_both_places(_Bake, "bake", "main"),
-    *in_both_places(_Lights, "lights", "main"),
-    *in_both_places(_Materials, "materials", "main"),
-    *in_both_places(_Output, "output", "main"),
-)
-_register_main, _unregister_main = bpy.utils.register_classes_factory((*MAIN, *PARTS))
-
 FIGURES = (("relative_l2", "L2 %"), ("bias", "Bias %"), ("flip", "FLIP"))
 TABLE_PIXELS = 270.0  # below, there is a sentence for each technique
 
@@ -406,17 +397,13 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
                 row.prop_enum(settings, key, name)
 
 
-CLASSES = (*in_both_places(_Results, "results", "main"), LTSH_PT_IMAGE_results)
-_register_image, _unregister_image = bpy.utils.register_classes_factory(CLASSES)
-
-
-def register() -> None:
-    """Add all of it to Blender."""
-    _register_main()
-    _register_image()
-
-
-def unregister() -> None:
-    """Remove what `register` added."""
-    _unregister_image()
-    _unregister_main()
+CLASSES = (
+    *in_both_places(_Main, "main"),
+    *in_both_places(_Bake, "bake", "main"),
+    *in_both_places(_Lights, "lights", "main"),
+    *in_both_places(_Materials, "materials", "main"),
+    *in_both_places(_Output, "output", "main"),
+    *in_both_places(_Results, "results", "main"),
+    LTSH_PT_IMAGE_results,
+)
+register, unregister = bpy.utils.register_classes_factory(CLASSES)

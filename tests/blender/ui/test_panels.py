@@ -14,7 +14,7 @@ from ltsh_addon.blender.ui.job import Job, Plan, Step
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.pipeline import display_layers
 
-MAIN_3D, MAIN_RENDER = panels.MAIN
+MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[:10]
 JOBS = ("ltsh.shade", "ltsh.compare")
 
 
@@ -161,7 +161,7 @@ def test_sentences_are_broken_into_lines_that_fit(scene, width):
 
 def test_both_places_show_the_same(scene):
     assert drawn(MAIN_3D) == drawn(MAIN_RENDER)
-    for first, second in zip(panels.PARTS[::2], panels.PARTS[1::2], strict=True):
+    for first, second in zip(PARTS[::2], PARTS[1::2], strict=True):
         assert drawn(first) == drawn(second)
         assert (first.bl_space_type, second.bl_space_type) == ("VIEW_3D", "PROPERTIES")
 
@@ -186,7 +186,7 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
     shown = drawn(MAIN_3D)
     assert "OpenEXR cannot be imported" in texts(shown)
     assert buttons(shown) == dict.fromkeys(JOBS, False) | {"ltsh.preview": True}
-    bake = drawn(panels.PARTS[0])
+    bake = drawn(PARTS[0])
     assert "OpenEXR cannot be imported" in texts(bake) and buttons(bake) == {"ltsh.bake": False}
     for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
         with pytest.raises(RuntimeError, match="OpenEXR cannot be imported"):
@@ -213,12 +213,12 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
     glass, _ = parts.bsdf_material("ShaderNodeBsdfHairPrincipled", "Fur")
     parts.add_plane(glass, name="Fur")
     bpy.context.view_layer.update()
-    shown = drawn(panels.PARTS[2])
+    shown = drawn(PARTS[2])
     signs = {item.what: item.icon for item in shown if item.icon}
     assert signs["Light"] == "CHECKMARK" and signs["Torn"] == "CANCEL"
-    header = drawn(panels.PARTS[2], "draw_header_preset")
+    header = drawn(PARTS[2], "draw_header_preset")
     assert [item.what for item in header] == ["2", "1"]
-    signs = {item.what: item.icon for item in drawn(panels.PARTS[4]) if item.icon}
+    signs = {item.what: item.icon for item in drawn(PARTS[4]) if item.icon}
     assert signs["Floor"] == "CHECKMARK" and signs["Fur"] == "CANCEL"
 
 

@@ -1,4 +1,4 @@
-"""Bakes: the texels of objects, block by block."""
+"""Bakes: the texels of objects, block by block, into the files of `bake_files`."""
 
 from __future__ import annotations
 
@@ -23,6 +23,91 @@ from .tasks import Records, contents_digest, file_stems, options_digest
 
 # Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
 BLOCK_TEXELS = 1 << 18
+# Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
+NOTED_SHARE_OUTSIDE = 0.01
+
+
+def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
+    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json and
+    timing.json; return the report with the times as "seconds".
+
+    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
+    but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
+    """
+    made = bake_objects(options, progress)
+    document = made.report
+    if options.apply and document["objects"]:
+        document["applied"] = apply_textures(
+            options.scene, options.output, document["objects"], applied_layer(options), progress
+        )
+    imaging.write_json(options.output / "report.json", document)
+    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
+    return {**document, "seconds": made.seconds}
+
+
+def bake_objects(
+    options: BakeOptions,
+    progress: Progress | None = None,
+    *,
+    tile: int | None = None,
+    following: tuple[str, ...] = (),
+) -> TaskResult:
+    """Bake the objects and write their files, but no report.json; `tile` is the one UDIM tile that is wanted.
+
+    In `kept_blender` the scene stays open for the next call with the same options: for objects that are named here, or
+    announced as `following`. Raises as `bake_scene` does.
+    """
+    from ..blender.process import client
+
+    start = time.perf_counter()
+    _check(options)
+    tables = picture.prepare(options)
+    client.check_readable(options.scene)
+    finished = TileRecords(options)
+    with client.temporary_folder() as folder:
+        manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
+        names = [record["name"] for record in manifest["objects"]]
+        found = file_stems(names) if options.name is None else [options.name]
+        records, files, seconds = [], [], {"blender": manifest["seconds"]}
+        for record, stem in zip(manifest["objects"], found, strict=True):
+            if record["problem"] is None:
+                (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
+                baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"])
+                made = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                records.append(made.report)
+                files += made.files
+                seconds |= made.seconds
+                shutil.rmtree(folder / record["folder"])
+    document = _report(options, manifest, records)
+    seconds["total"] = time.perf_counter() - start
+    return TaskResult(document, seconds, tuple(files))
+
+
+def _check(options: BakeOptions) -> None:
+    for side in (options.width, options.height):
+        if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
+            limits = "{} to {}".format(*TEXTURE_SIDES)
+            raise ValueError(f"size is {options.width}x{options.height}, expected {limits} each")
+    if options.margin_type not in MARGIN_TYPES:
+        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
+    unknown = [name for name in options.passes if name not in BAKE_PASSES]
+    if unknown or not options.passes:
+        raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+
+
+def _job(options, finished, tile, following):
+    from ..blender.process import client
+
+    return child_job(
+        client.BakeJob,
+        options,
+        block_rows=block_rows(options),
+        cycles_samples=options.cycles_samples if options.error else 0,
+        passes=tuple(name for name in PASSES if name in shaded_passes(options)),
+        finished=tuple(finished),
+        tile=tile,
+        following=following,
+    )
 
 
 def block_rows(options) -> int:
@@ -39,33 +124,34 @@ def shaded_passes(options) -> set[str]:
 
 
 class ObjectBaker:
-    """Bakes all tiles of one object, or only `tile`, block of rows by block of rows from the top."""
+    """Bakes the tiles of one object, `record` of the `manifest`, block of rows by block of rows from the top."""
 
-    def __init__(self, options, tables, lights, manifest, record, folder, tile=None):
+    def __init__(self, options, tables, manifest, record, folder):
         from ..cycles import uv
         from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
 
-        self.options, self.tables, self.lights, self.record, self.folder = options, tables, lights, record, folder
+        self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
+        self.lights = tuple(AreaLight(**light) for light in manifest["lights"])
         self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
-        self.manifest = manifest
-        self.groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
+        self.groups = tuple(dict.fromkeys(light.group for light in self.lights)) or ("",)
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
-        self.wanted = self.tiles if tile is None else [tile]
         self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
         if not options.error:
             self.compared = ()
         self._sample, self._raster = texel_samples, uv.UvTriangles
         self._seams = uv.UvSeams.of
 
-    def bake(self, stem: str, records, files: list[str], seconds: dict, progress) -> dict:
-        """Write the files of the object that are not finished according to `records` (bake.TileRecords), add all to
-        `files`; the object's record for the report."""
-        name = self.record["name"]
+    def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
+        """Write the files of `tiles` (empty: of all) that are not finished according to `records`.
+
+        The report of the result is the object's part of the report.
+        """
+        name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
-        for tile in self.wanted:
+        for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
             record = records.take(name, tile, file)
@@ -79,7 +165,7 @@ class ObjectBaker:
             if self.area > 0.0:
                 baked = found["covered_times"] / (self.options.width * self.options.height)
                 result["outside"] = max(0.0, 1.0 - baked / self.area)
-        return result
+        return TaskResult(result, seconds, tuple(files))
 
     def _suffix(self, tile) -> str:
         return "" if len(self.tiles) == 1 else f".{tile}"
@@ -257,12 +343,6 @@ def _in_order(function, items, threads: int):
                 future.cancel()
 
 
-def applied_layer(options) -> str:
-    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
-    pass_name = "combined" if "combined" in options.passes else options.passes[0]
-    return f"{next(iter(picture.technique_names(options.techniques)))}.{pass_name}"
-
-
 def _put(values: dict, layer: str, pixels) -> None:
     """Add the channels of a layer (Q, 3)."""
     for channel, letter in enumerate("RGB"):
@@ -275,64 +355,6 @@ def _summed(radiance, texel, count):
         return radiance
     first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
     return np.add.reduceat(radiance, first, axis=1)
-
-
-# Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
-NOTED_SHARE_OUTSIDE = 0.01
-
-
-def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
-    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json and
-    timing.json; return the report with the times as "seconds".
-
-    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
-    but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
-    """
-    made = bake_objects(options, progress)
-    document = made.report
-    if options.apply and document["objects"]:
-        document["applied"] = apply_textures(
-            options.scene, options.output, document["objects"], applied_layer(options), progress
-        )
-    imaging.write_json(options.output / "report.json", document)
-    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
-    return {**document, "seconds": made.seconds}
-
-
-def bake_objects(
-    options: BakeOptions,
-    progress: Progress | None = None,
-    *,
-    tile: int | None = None,
-    following: tuple[str, ...] = (),
-) -> TaskResult:
-    """Bake the objects and write their files, but no report.json; `tile` is the one UDIM tile that is wanted.
-
-    In `kept_blender` the scene stays open for the next call with the same options: for objects that are named here, or
-    announced as `following`. Raises as `bake_scene` does.
-    """
-    from ..blender.process import client
-
-    start = time.perf_counter()
-    _check(options)
-    tables = picture.prepare(options)
-    client.check_readable(options.scene)
-    tiles = TileRecords(options)
-    with client.temporary_folder() as folder:
-        manifest = client.extract_bake(_job(options, tiles.finished, tile, following), folder, progress=progress)
-        lights = tuple(AreaLight(**record) for record in manifest["lights"])
-        names = [record["name"] for record in manifest["objects"]]
-        found = file_stems(names) if options.name is None else [options.name]
-        records, files, seconds = [], [], {"blender": manifest["seconds"]}
-        for record, stem in zip(manifest["objects"], found, strict=True):
-            if record["problem"] is None:
-                (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
-                baker = ObjectBaker(options, tables, lights, manifest, record, folder / record["folder"], tile)
-                records.append(baker.bake(stem, tiles, files, seconds, progress))
-                shutil.rmtree(folder / record["folder"])
-    document = _report(options, manifest, records)
-    seconds["total"] = time.perf_counter() - start
-    return TaskResult(document, seconds, tuple(files))
 
 
 class TileRecords:
@@ -358,31 +380,10 @@ class TileRecords:
         return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
 
 
-def _check(options: BakeOptions) -> None:
-    for side in (options.width, options.height):
-        if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
-            limits = "{} to {}".format(*TEXTURE_SIDES)
-            raise ValueError(f"size is {options.width}x{options.height}, expected {limits} each")
-    if options.margin_type not in MARGIN_TYPES:
-        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
-    unknown = [name for name in options.passes if name not in BAKE_PASSES]
-    if unknown or not options.passes:
-        raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
-
-
-def _job(options, finished, tile, following):
-    from ..blender.process import client
-
-    return child_job(
-        client.BakeJob,
-        options,
-        block_rows=block_rows(options),
-        cycles_samples=options.cycles_samples if options.error else 0,
-        passes=tuple(name for name in PASSES if name in shaded_passes(options)),
-        finished=tuple(finished),
-        tile=tile,
-        following=following,
-    )
+def applied_layer(options) -> str:
+    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
+    pass_name = "combined" if "combined" in options.passes else options.passes[0]
+    return f"{next(iter(picture.technique_names(options.techniques)))}.{pass_name}"
 
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:

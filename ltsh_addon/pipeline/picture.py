@@ -18,15 +18,24 @@ from ..scene import REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, F
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
-
-
-@dataclass(frozen=True)
-class Result:
-    """One technique on the samples, or on a subset (Q,) of them: radiance per pass (G, Q, 3), time per pass."""
-
-    shading: shading.Shading
-    seconds: dict[str, float]
-    subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
+# Layers of the G-buffer: field of SurfaceSamples and its channel letters.
+SAMPLE_LAYERS = {
+    "position": "XYZ",
+    "view": "XYZ",
+    "normal": "XYZ",
+    "diffuse_normal": "XYZ",
+    "geometric_normal": "XYZ",
+    "smooth_normal": "XYZ",
+    "bump_alpha2": "V",
+    "roughness": "V",
+    "specular_f0": "RGB",
+    "specular_f90": "RGB",
+    "specular_dip": "RGB",
+    "dielectric": "RGB",
+    "ior": "V",
+    "diffuse_albedo": "RGB",
+    "receiver": "V",
+}
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,16 @@ def prepare(options: PictureOptions) -> dict[str, str | shading.LookupTable]:
     tables = load_tables(options.techniques)
     _make_writable(Path(options.output))
     return tables
+
+
+def _make_writable(path: Path) -> None:
+    """Make the output folder and prove that it takes files."""
+    from ..files import check_takes_files
+
+    try:
+        check_takes_files(path)
+    except OSError as error:
+        raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
 
 
 def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
@@ -128,14 +147,13 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     return TaskResult(report, seconds, tuple(files))
 
 
-def _make_writable(path: Path) -> None:
-    """Make the output folder and prove that it takes files."""
-    from ..files import check_takes_files
+@dataclass(frozen=True)
+class Result:
+    """One technique on the samples, or on a subset (Q,) of them: radiance per pass (G, Q, 3), time per pass."""
 
-    try:
-        check_takes_files(path)
-    except OSError as error:
-        raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
+    shading: shading.Shading
+    seconds: dict[str, float]
+    subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
 
 
 def _evaluate(name, table, extraction, options, progress) -> Result:
@@ -199,73 +217,6 @@ def versions(blender_version: str) -> dict[str, str]:
         "numpy": np.__version__,
         "OpenEXR": getattr(OpenEXR, "__version__", "unknown"),
     }
-
-
-def _title(name: str) -> str:
-    """What a technique is called on sheets and by progress; a table of the user by its name."""
-    return TECHNIQUES[name].title if name in TECHNIQUES else name
-
-
-def percent(value) -> str:
-    """A share as text."""
-    return "-" if value is None else f"{100.0 * value:.2f} %"
-
-
-def unbiased(figures: dict) -> str:
-    """The error against two noisy halves; its square is negative where the noise is all there is to see."""
-    squared = figures.get("unbiased_squared_error")
-    return "in noise" if squared is not None and squared < 0.0 else percent(figures.get("unbiased_relative_error"))
-
-
-def summary_lines(report: dict, seconds: dict) -> list[str]:
-    """A table of one picture: errors and seconds per pass and technique."""
-    found = []
-    for pass_name, figures in report["passes"].items():
-        noise = f", noise of Cycles {percent(figures['noise'])}" if "noise" in figures else ""
-        found.append(f"{pass_name}{noise}")
-        heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
-        found.append(f"  {'technique':<12}{heads}")
-        for name, row in figures["techniques"].items():
-            reference = row.get("against_reference", {})
-            classes = [percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
-            cycles, truth = unbiased(row.get("against_cycles", {})), percent(reference.get("relative_l2"))
-            errors = f"{cycles:>12}{truth:>14}{classes[0]:>10}{classes[1]:>13}"
-            took = seconds.get("techniques", {}).get(name, {}).get(pass_name)
-            found.append(f"  {name:<12}{errors}" + (f"{took:>8.2f}" if took is not None else f"{'-':>8}"))
-    return found
-
-
-def short_summary(report: dict) -> list[str]:
-    """A line for a picture: the errors of one pass, against Cycles where there is one."""
-    passes = report["passes"]
-    pass_name = "specular" if "specular" in passes else next(iter(passes))
-    errors = []
-    for name, row in passes[pass_name]["techniques"].items():
-        if "against_cycles" in row:
-            errors.append(f"{name} {unbiased(row['against_cycles'])}")
-        elif "against_reference" in row:
-            errors.append(f"{name} {percent(row['against_reference']['relative_l2'])}")
-    return [f"{report['name']:<32}" + (f" {pass_name}: " + ", ".join(errors) if errors else "")]
-
-
-# Layers of the G-buffer: field of SurfaceSamples and its channel letters.
-SAMPLE_LAYERS = {
-    "position": "XYZ",
-    "view": "XYZ",
-    "normal": "XYZ",
-    "diffuse_normal": "XYZ",
-    "geometric_normal": "XYZ",
-    "smooth_normal": "XYZ",
-    "bump_alpha2": "V",
-    "roughness": "V",
-    "specular_f0": "RGB",
-    "specular_f90": "RGB",
-    "specular_dip": "RGB",
-    "dielectric": "RGB",
-    "ior": "V",
-    "diffuse_albedo": "RGB",
-    "receiver": "V",
-}
 
 
 @dataclass(frozen=True)
@@ -499,3 +450,50 @@ def _light_report(light) -> dict:
         "radiance": light.radiance.tolist(),
         "patches": len(light.patches),
     }
+
+
+def _title(name: str) -> str:
+    """What a technique is called on sheets and by progress; a table of the user by its name."""
+    return TECHNIQUES[name].title if name in TECHNIQUES else name
+
+
+def percent(value) -> str:
+    """A share as text."""
+    return "-" if value is None else f"{100.0 * value:.2f} %"
+
+
+def unbiased(figures: dict) -> str:
+    """The error against two noisy halves; its square is negative where the noise is all there is to see."""
+    squared = figures.get("unbiased_squared_error")
+    return "in noise" if squared is not None and squared < 0.0 else percent(figures.get("unbiased_relative_error"))
+
+
+def summary_lines(report: dict, seconds: dict) -> list[str]:
+    """A table of one picture: errors and seconds per pass and technique."""
+    found = []
+    for pass_name, figures in report["passes"].items():
+        noise = f", noise of Cycles {percent(figures['noise'])}" if "noise" in figures else ""
+        found.append(f"{pass_name}{noise}")
+        heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
+        found.append(f"  {'technique':<12}{heads}")
+        for name, row in figures["techniques"].items():
+            reference = row.get("against_reference", {})
+            classes = [percent(reference.get(label, {}).get("relative_l2")) for label in ("metals", "dielectrics")]
+            cycles, truth = unbiased(row.get("against_cycles", {})), percent(reference.get("relative_l2"))
+            errors = f"{cycles:>12}{truth:>14}{classes[0]:>10}{classes[1]:>13}"
+            took = seconds.get("techniques", {}).get(name, {}).get(pass_name)
+            found.append(f"  {name:<12}{errors}" + (f"{took:>8.2f}" if took is not None else f"{'-':>8}"))
+    return found
+
+
+def short_summary(report: dict) -> list[str]:
+    """A line for a picture: the errors of one pass, against Cycles where there is one."""
+    passes = report["passes"]
+    pass_name = "specular" if "specular" in passes else next(iter(passes))
+    errors = []
+    for name, row in passes[pass_name]["techniques"].items():
+        if "against_cycles" in row:
+            errors.append(f"{name} {unbiased(row['against_cycles'])}")
+        elif "against_reference" in row:
+            errors.append(f"{name} {percent(row['against_reference']['relative_l2'])}")
+    return [f"{report['name']:<32}" + (f" {pass_name}: " + ", ".join(errors) if errors else "")]

@@ -16,137 +16,10 @@ from ..imaging import write_json
 from ..scene import VERSION
 from .options import what_matters
 
-LONGEST_STEM = 100
-
-
-class NameClash(ValueError):
-    """Two tasks would write the same file."""
-
-
-def file_stems(names: Iterable[str]) -> list[str]:
-    """A file name for each of `names`: only letters that every file system takes, each once, in any case."""
-    stems, taken = [], set()
-    for name in names:
-        stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
-        candidate, number = stem[:LONGEST_STEM], 1
-        while candidate.casefold() in taken:
-            number += 1
-            candidate = f"{stem[:LONGEST_STEM]}_{number}"
-        taken.add(candidate.casefold())
-        stems.append(candidate)
-    return stems
-
-
-def fields_of(pattern: str) -> set[str]:
-    """The fields that a pattern has."""
-    return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
-
-
-def default_pattern(first: str, varying: Iterable[str]) -> str:
-    """`first` alone, or followed by the fields of which there are several: compare, compare_{frame:04d}."""
-    parts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
-    return "_".join([first, *(text for name, text in parts.items() if name in set(varying))])
-
-
-_digests: dict[tuple, str] = {}
-
 FOLDER = ".ltsh"
 FORMAT = 1
-
-
-def contents_digest(options) -> str:
-    """Digest of the files that a task reads: the scene and tables. Libraries and textures of the scene do not count."""
-    tables = [Path(name) for name in options.techniques if name.endswith(".npz")]
-    return " ".join(_known_digest(path) for path in (Path(options.scene), *tables))
-
-
-def _known_digest(path: Path) -> str:
-    """`file_digest`, computed again only where the file has changed: it is asked for every object of a bake."""
-    status = path.stat()
-    key = str(path.absolute()), status.st_mtime_ns, status.st_size, status.st_ino
-    if key not in _digests:
-        _digests[key] = file_digest(path)
-    return _digests[key]
-
-
-def options_digest(command: str, options, contents: str) -> str:
-    """Digest of the options of a task on which its results depend, the version and `contents_digest`."""
-    found = [VERSION, command, what_matters(options), contents]
-    return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-class Records:
-    """Records of one kind ("tasks", "tiles") in the folder `output`."""
-
-    def __init__(self, output: Path, kind: str):
-        self.output, self._folder = Path(output), Path(output) / FOLDER / kind
-
-    def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
-        """Write the record `name`: the task's `files`, by names below the folder, are there; returns it.
-
-        What was `found` is stored with it, "report" or "problem".
-        """
-        digests = {}
-        for file in sorted(files):
-            path = self.output / file
-            digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
-        path = self._path(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, record)
-        # As it will be read: numbers and letters are what JSON makes of them.
-        return json.loads(path.read_text(encoding="utf-8"))
-
-    def read(self, name: str) -> dict | None:
-        """The record `name`, or None where there is none that can be read."""
-        return _read(self._path(name))
-
-    def whole(self, name: str, key: str | None) -> dict | None:
-        """The record `name` if its key is `key` (None: any) and all of its files are as they were written."""
-        record = self.read(name)
-        if record is None or (key is not None and record["key"] != key) or not self.has_files(record):
-            return None
-        return record
-
-    def has_files(self, record: dict) -> bool:
-        """True where the files are there, with the sizes and digests of the record."""
-        try:
-            return all(
-                (self.output / file).stat().st_size == facts["bytes"]
-                and file_digest(self.output / file) == facts["sha256"]
-                for file, facts in record["files"].items()
-            )
-        except OSError:
-            return False
-
-    def all_whole(self, key: str, stems: Iterable[str] | None = None) -> list[dict]:
-        """All records with that key whose files are whole, or those that are named "<stem>.<anything>"."""
-        if stems is None:
-            paths = sorted(self._folder.rglob("*.json"))
-        else:
-            # A name may hold anything that a pattern would take for more.
-            found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
-            paths = sorted(path for group in found for path in group)
-        records = map(_read, paths)
-        return [record for record in records if record and record["key"] == key and self.has_files(record)]
-
-    def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.json"
-
-
-def _read(path: Path) -> dict | None:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None  # absent, or not ours: the task is done again
-    known = isinstance(record, dict) and record.get("format") == FORMAT
-    return record if known and isinstance(record.get("files"), dict) and "key" in record else None
+LONGEST_STEM = 100
+_digests: dict[tuple, str] = {}
 
 
 @dataclass(frozen=True)
@@ -213,6 +86,10 @@ class Task:
         if self.object is not None:
             return replace(options, objects=(self.object,), name=self.stem)
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
+
+
+class NameClash(ValueError):
+    """Two tasks would write the same file."""
 
 
 def tasks_of(job: Job, progress=None) -> list[Task]:
@@ -285,3 +162,123 @@ def _check_names(job, tasks) -> None:
             missing = [f"{{{name}}}" for name in missing if name not in fields_of(job.pattern)]
             hint = f"; add {' or '.join(missing)}" if missing else ""
             raise NameClash(f"name {job.pattern!r} gives several tasks the same name {task.name!r}{hint}")
+
+
+def file_stems(names: Iterable[str]) -> list[str]:
+    """A file name for each of `names`: only letters that every file system takes, each once, in any case."""
+    stems, taken = [], set()
+    for name in names:
+        stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
+        candidate, number = stem[:LONGEST_STEM], 1
+        while candidate.casefold() in taken:
+            number += 1
+            candidate = f"{stem[:LONGEST_STEM]}_{number}"
+        taken.add(candidate.casefold())
+        stems.append(candidate)
+    return stems
+
+
+def fields_of(pattern: str) -> set[str]:
+    """The fields that a pattern has."""
+    return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
+
+
+def default_pattern(first: str, varying: Iterable[str]) -> str:
+    """`first` alone, or followed by the fields of which there are several: compare, compare_{frame:04d}."""
+    parts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
+    return "_".join([first, *(text for name, text in parts.items() if name in set(varying))])
+
+
+class Records:
+    """Records of one kind ("tasks", "tiles") in the folder `output`."""
+
+    def __init__(self, output: Path, kind: str):
+        self.output, self._folder = Path(output), Path(output) / FOLDER / kind
+
+    def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
+        """Write the record `name`: the task's `files`, by names below the folder, are there; returns it.
+
+        What was `found` is stored with it, "report" or "problem".
+        """
+        digests = {}
+        for file in sorted(files):
+            path = self.output / file
+            digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
+        record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
+        path = self._path(name)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, record)
+        # As it will be read: numbers and letters are what JSON makes of them.
+        return json.loads(path.read_text(encoding="utf-8"))
+
+    def read(self, name: str) -> dict | None:
+        """The record `name`, or None where there is none that can be read."""
+        return _read(self._path(name))
+
+    def whole(self, name: str, key: str | None) -> dict | None:
+        """The record `name` if its key is `key` (None: any) and all of its files are as they were written."""
+        record = self.read(name)
+        if record is None or (key is not None and record["key"] != key) or not self.has_files(record):
+            return None
+        return record
+
+    def has_files(self, record: dict) -> bool:
+        """True where the files are there, with the sizes and digests of the record."""
+        try:
+            return all(
+                (self.output / file).stat().st_size == facts["bytes"]
+                and file_digest(self.output / file) == facts["sha256"]
+                for file, facts in record["files"].items()
+            )
+        except OSError:
+            return False
+
+    def all_whole(self, key: str, stems: Iterable[str] | None = None) -> list[dict]:
+        """All records with that key whose files are whole, or those that are named "<stem>.<anything>"."""
+        if stems is None:
+            paths = sorted(self._folder.rglob("*.json"))
+        else:
+            # A name may hold anything that a pattern would take for more.
+            found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
+            paths = sorted(path for group in found for path in group)
+        records = map(_read, paths)
+        return [record for record in records if record and record["key"] == key and self.has_files(record)]
+
+    def _path(self, name: str) -> Path:
+        return self._folder / f"{name}.json"
+
+
+def _read(path: Path) -> dict | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None  # absent, or not ours: the task is done again
+    known = isinstance(record, dict) and record.get("format") == FORMAT
+    return record if known and isinstance(record.get("files"), dict) and "key" in record else None
+
+
+def options_digest(command: str, options, contents: str) -> str:
+    """Digest of the options of a task on which its results depend, the version and `contents_digest`."""
+    found = [VERSION, command, what_matters(options), contents]
+    return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def contents_digest(options) -> str:
+    """Digest of the files that a task reads: the scene and tables. Libraries and textures of the scene do not count."""
+    tables = [Path(name) for name in options.techniques if name.endswith(".npz")]
+    return " ".join(_known_digest(path) for path in (Path(options.scene), *tables))
+
+
+def _known_digest(path: Path) -> str:
+    """`file_digest`, computed again only where the file has changed: it is asked for every object of a bake."""
+    status = path.stat()
+    key = str(path.absolute()), status.st_mtime_ns, status.st_size, status.st_ino
+    if key not in _digests:
+        _digests[key] = file_digest(path)
+    return _digests[key]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

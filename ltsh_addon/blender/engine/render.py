@@ -24,196 +24,11 @@ from ..ui.preview import ENGINE
 from . import view
 from .view import EngineView
 
-_current: dict = {}
-
-
-@persistent
-def _take(*_) -> None:
-    """Save a copy where a scene of the file has our engine."""
-    _drop()
-    if all(scene.render.engine != ENGINE for scene in bpy.data.scenes):
-        return
-    folder = tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True)
-    _current["folder"] = folder
-    path = Path(folder.name) / "scene.blend"
-    try:
-        save_working_copy(path, keep_engine=True)
-    except RuntimeError as error:
-        _current["error"] = error_line(error).removeprefix("Error: ")
-
-
-@persistent
-def _drop(*_) -> None:
-    """Delete the copy."""
-    folder = _current.pop("folder", None)
-    _current.clear()
-    if folder is not None:
-        folder.cleanup()
-
-
-def saved_copy() -> Path:
-    """The copy of the file as it was when the render started. Raises SceneError."""
-    if "error" in _current:
-        raise SceneError(f"a copy of the open file could not be saved for the render: {_current['error']}")
-    if "folder" not in _current:
-        raise SceneError("no copy of the open file was saved for the render; start the render again")
-    return Path(_current["folder"].name) / "scene.blend"
-
-
-HANDLERS = (("render_init", _take), ("render_complete", _drop), ("render_cancel", _drop))
-
-
-ASK_SECONDS = 0.05
-
-
-def stoppable(work: Callable[[Progress], object], progress: Progress):
-    """What `work(report)` returns; it runs in a thread of its own and must not use bpy.
-
-    `progress(stage, fraction)` gets what the work reported last, again and again, in the thread of the caller. Raises
-    what the work raises, and Cancelled as soon as `progress` returns False: the work then ends at its next report.
-    """
-    state: dict = {"last": ("", 0.0)}
-    stop = threading.Event()
-
-    def report(stage: str, fraction: float) -> bool:
-        state["last"] = stage, fraction
-        return not stop.is_set()
-
-    def run() -> None:
-        try:
-            state["result"] = work(report)
-        except BaseException as error:
-            state["error"] = error
-
-    thread = threading.Thread(target=run, name="LTSH work", daemon=True)
-    thread.start()
-    try:
-        while thread.is_alive():
-            if progress(*state["last"]) is False:
-                raise Cancelled(f"cancelled at {state['last'][0] or 'the start'}")
-            thread.join(ASK_SECONDS)
-    finally:
-        stop.set()
-    if "error" in state:
-        raise state["error"]
-    return state["result"]
-
-
 # Share of the progress bar that taking the samples gets.
 EXTRACTION_SHARE = 0.7
 PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
 EMISSION = "LTSH Emission"
-
-
-@dataclass(frozen=True)
-class FinalJob:
-    """What the render of one view layer needs to know of the scene."""
-
-    scene: str
-    view_layer: str
-    frame: int | None  # None: as in the copy of the file
-    sub_samples: int
-    technique: str
-    shown: str  # combined, specular or diffuse
-    other_techniques: tuple[str, ...] = ()  # with passes of their own
-    background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
-
-    def shaded_as(self) -> dict[str, str]:
-        """Names of passes start with -> technique."""
-        return {"LTSH": self.technique, **{TECHNIQUES[name].label: name for name in self.other_techniques}}
-
-
-def pass_names(prefixes) -> list[str]:
-    """Names of the render passes beside Combined."""
-    return [*(f"{prefix} {label}" for prefix in prefixes for label in PASS_LABELS.values()), EMISSION]
-
-
-@dataclass(frozen=True)
-class FinalPicture:
-    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, 3) by name."""
-
-    combined: np.ndarray
-    passes: dict[str, np.ndarray]
-    warnings: tuple[str, ...]
-
-
-def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
-    """Take samples of the .blend `scene_file` and shade them. Uses no bpy.
-
-    `progress(stage, fraction of the whole)` returns False to stop. Raises SceneError, TableError, Cancelled, OSError.
-    """
-    options = client.ExtractOptions(
-        scene=scene_file,
-        sub_samples=job.sub_samples,
-        frame=job.frame,
-        scene_name=job.scene,
-        view_layer=job.view_layer,
-        emission=True,
-    )
-    extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
-    names = list(dict.fromkeys(job.shaded_as().values()))
-    share = (1.0 - EXTRACTION_SHARE) / len(names)
-    images = {
-        name: _images(extraction, name, _part(progress, EXTRACTION_SHARE + index * share, share))
-        for index, name in enumerate(names)
-    }
-    passes = {
-        f"{prefix} {label}": images[name][part]
-        for prefix, name in job.shaded_as().items()
-        for part, label in PASS_LABELS.items()
-    }
-    emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
-    passes[EMISSION] = emission
-    shown = PASSES if job.shown == "combined" else (job.shown,)
-    color = sum(images[job.technique][part] for part in shown)
-    if job.shown == "combined":
-        color = color + emission
-    coverage = inside_border(extraction.film.coverage(), extraction.border)
-    return FinalPicture(_over_background(color, coverage, job, extraction.exposure), passes, extraction.warnings)
-
-
-def _part(progress: Progress, start: float, share: float) -> Progress:
-    """A progress callback for a stage that takes `share` of the whole from `start` on."""
-    return lambda stage, fraction: progress(stage, start + share * fraction)
-
-
-def _images(extraction, technique: str, progress: Progress) -> dict[str, np.ndarray]:
-    """Radiance (H, W, 3) of each pass times the film's exposure."""
-    images = {}
-    for index, name in enumerate(PASSES):
-        part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
-        shaded = shading.shade(
-            extraction.samples,
-            extraction.lights,
-            technique,
-            passes=(name,),
-            progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
-        )
-        image = extraction.film.image(extraction.exposure * shaded.combined)
-        images[name] = inside_border(image, extraction.border)
-    return images
-
-
-def _over_background(color: np.ndarray, coverage: np.ndarray, job: FinalJob, exposure: float) -> np.ndarray:
-    """RGBA (H, W, 4) of `color`."""
-    if job.background is None:
-        return np.concatenate([color, coverage[..., None]], axis=-1)
-    behind = exposure * job.background * (1.0 - coverage)[..., None]
-    return np.concatenate([color + behind, np.ones((*coverage.shape, 1))], axis=-1)
-
-
-def inside_border(image: np.ndarray, border) -> np.ndarray:
-    """The part of `image` (H, W, ...) inside the render region: what Blender takes from engines, cropped or not."""
-    if border is None or border.cropped:
-        return image
-    return image[border.top : border.top + border.height, border.left : border.left + border.width]
-
-
-def blender_pixels(image: np.ndarray) -> np.ndarray:
-    """`image` (H, W, C), row 0 on top, as Blender's flat float32 list that starts at the bottom left."""
-    return np.ascontiguousarray(image[::-1], dtype=np.float32).ravel()
-
-
+ASK_SECONDS = 0.05
 # Blender redraws its status bar as often as it is told something.
 REPORT_SECONDS = 0.1
 _logger = logging.getLogger(__name__)
@@ -327,6 +142,187 @@ def _job_of(engine, depsgraph) -> FinalJob:
     )
 
 
+@dataclass(frozen=True)
+class FinalJob:
+    """What the render of one view layer needs to know of the scene."""
+
+    scene: str
+    view_layer: str
+    frame: int | None  # None: as in the copy of the file
+    sub_samples: int
+    technique: str
+    shown: str  # combined, specular or diffuse
+    other_techniques: tuple[str, ...] = ()  # with passes of their own
+    background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
+
+    def shaded_as(self) -> dict[str, str]:
+        """Names of passes start with -> technique."""
+        return {"LTSH": self.technique, **{TECHNIQUES[name].label: name for name in self.other_techniques}}
+
+
+def pass_names(prefixes) -> list[str]:
+    """Names of the render passes beside Combined."""
+    return [*(f"{prefix} {label}" for prefix in prefixes for label in PASS_LABELS.values()), EMISSION]
+
+
+@dataclass(frozen=True)
+class FinalPicture:
+    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, 3) by name."""
+
+    combined: np.ndarray
+    passes: dict[str, np.ndarray]
+    warnings: tuple[str, ...]
+
+
+def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
+    """Take samples of the .blend `scene_file` and shade them. Uses no bpy.
+
+    `progress(stage, fraction of the whole)` returns False to stop. Raises SceneError, TableError, Cancelled, OSError.
+    """
+    options = client.ExtractOptions(
+        scene=scene_file,
+        sub_samples=job.sub_samples,
+        frame=job.frame,
+        scene_name=job.scene,
+        view_layer=job.view_layer,
+        emission=True,
+    )
+    extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
+    names = list(dict.fromkeys(job.shaded_as().values()))
+    share = (1.0 - EXTRACTION_SHARE) / len(names)
+    images = {
+        name: _images(extraction, name, _part(progress, EXTRACTION_SHARE + index * share, share))
+        for index, name in enumerate(names)
+    }
+    passes = {
+        f"{prefix} {label}": images[name][part]
+        for prefix, name in job.shaded_as().items()
+        for part, label in PASS_LABELS.items()
+    }
+    emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
+    passes[EMISSION] = emission
+    shown = PASSES if job.shown == "combined" else (job.shown,)
+    color = sum(images[job.technique][part] for part in shown)
+    if job.shown == "combined":
+        color = color + emission
+    coverage = inside_border(extraction.film.coverage(), extraction.border)
+    return FinalPicture(_over_background(color, coverage, job, extraction.exposure), passes, extraction.warnings)
+
+
+def _part(progress: Progress, start: float, share: float) -> Progress:
+    """A progress callback for a stage that takes `share` of the whole from `start` on."""
+    return lambda stage, fraction: progress(stage, start + share * fraction)
+
+
+def _images(extraction, technique: str, progress: Progress) -> dict[str, np.ndarray]:
+    """Radiance (H, W, 3) of each pass times the film's exposure."""
+    images = {}
+    for index, name in enumerate(PASSES):
+        part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
+        shaded = shading.shade(
+            extraction.samples,
+            extraction.lights,
+            technique,
+            passes=(name,),
+            progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
+        )
+        image = extraction.film.image(extraction.exposure * shaded.combined)
+        images[name] = inside_border(image, extraction.border)
+    return images
+
+
+def _over_background(color: np.ndarray, coverage: np.ndarray, job: FinalJob, exposure: float) -> np.ndarray:
+    """RGBA (H, W, 4) of `color`."""
+    if job.background is None:
+        return np.concatenate([color, coverage[..., None]], axis=-1)
+    behind = exposure * job.background * (1.0 - coverage)[..., None]
+    return np.concatenate([color + behind, np.ones((*coverage.shape, 1))], axis=-1)
+
+
+def inside_border(image: np.ndarray, border) -> np.ndarray:
+    """The part of `image` (H, W, ...) inside the render region: what Blender takes from engines, cropped or not."""
+    if border is None or border.cropped:
+        return image
+    return image[border.top : border.top + border.height, border.left : border.left + border.width]
+
+
+def blender_pixels(image: np.ndarray) -> np.ndarray:
+    """`image` (H, W, C), row 0 on top, as Blender's flat float32 list that starts at the bottom left."""
+    return np.ascontiguousarray(image[::-1], dtype=np.float32).ravel()
+
+
+def stoppable(work: Callable[[Progress], object], progress: Progress):
+    """What `work(report)` returns; it runs in a thread of its own and must not use bpy.
+
+    `progress(stage, fraction)` gets what the work reported last, again and again, in the thread of the caller. Raises
+    what the work raises, and Cancelled as soon as `progress` returns False: the work then ends at its next report.
+    """
+    state: dict = {"last": ("", 0.0)}
+    stop = threading.Event()
+
+    def report(stage: str, fraction: float) -> bool:
+        state["last"] = stage, fraction
+        return not stop.is_set()
+
+    def run() -> None:
+        try:
+            state["result"] = work(report)
+        except BaseException as error:
+            state["error"] = error
+
+    thread = threading.Thread(target=run, name="LTSH work", daemon=True)
+    thread.start()
+    try:
+        while thread.is_alive():
+            if progress(*state["last"]) is False:
+                raise Cancelled(f"cancelled at {state['last'][0] or 'the start'}")
+            thread.join(ASK_SECONDS)
+    finally:
+        stop.set()
+    if "error" in state:
+        raise state["error"]
+    return state["result"]
+
+
+_copy: dict = {}
+
+
+@persistent
+def _save_copy(*_) -> None:
+    """Save a copy where a scene of the file has our engine."""
+    _delete_copy()
+    if all(scene.render.engine != ENGINE for scene in bpy.data.scenes):
+        return
+    folder = tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True)
+    _copy["folder"] = folder
+    path = Path(folder.name) / "scene.blend"
+    try:
+        save_working_copy(path, keep_engine=True)
+    except RuntimeError as error:
+        _copy["error"] = error_line(error).removeprefix("Error: ")
+
+
+@persistent
+def _delete_copy(*_) -> None:
+    """Delete the copy."""
+    folder = _copy.pop("folder", None)
+    _copy.clear()
+    if folder is not None:
+        folder.cleanup()
+
+
+def saved_copy() -> Path:
+    """The copy of the file as it was when the render started. Raises SceneError."""
+    if "error" in _copy:
+        raise SceneError(f"a copy of the open file could not be saved for the render: {_copy['error']}")
+    if "folder" not in _copy:
+        raise SceneError("no copy of the open file was saved for the render; start the render again")
+    return Path(_copy["folder"].name) / "scene.blend"
+
+
+HANDLERS = (("render_init", _save_copy), ("render_complete", _delete_copy), ("render_cancel", _delete_copy))
+
+
 def register() -> None:
     """Add the engine and what its renders and views need."""
     bpy.utils.register_class(LTSH_RenderEngine)
@@ -342,5 +338,5 @@ def unregister() -> None:
         functions = getattr(bpy.app.handlers, name)
         if function in functions:
             functions.remove(function)
-    _drop()
+    _delete_copy()
     bpy.utils.unregister_class(LTSH_RenderEngine)

@@ -25,6 +25,11 @@ from ..viewport.renderer import ShownPicture, ViewRenderer
 from ..viewport.surfaces import View
 from ..viewport.textures import float_texture, look_values
 
+# Width of the line of the split view in pixels of an unscaled interface.
+LINE_WIDTH = 2.0
+NO_LIGHTS = "No area light and no glowing mesh shines here: add an area light"
+# Shares by which the shapes of two pictures may differ: sizes are whole pixels.
+SAME_SHAPE = 0.01
 MOST_NOTES = 4
 FEWEST_LETTERS = 20  # no line is broken into shorter ones
 TEXT_SIZE = 11.0
@@ -32,9 +37,248 @@ CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
 NOTE_COLOR = (0.95, 0.85, 0.45, 0.95)
-
 CAPTION_COLOR = (1.0, 1.0, 1.0, 0.95)
 BRIGHTER_COLOR, DARKER_COLOR = (1.0, 0.45, 0.4, 1.0), (0.5, 0.6, 1.0, 1.0)
+_logger = logging.getLogger(__name__)
+
+
+class EngineView:
+    """One 3D view with the engine."""
+
+    def __init__(self):
+        self.mirror = SceneMirror()
+        self._renderer: ViewRenderer | None = None
+        self._reference = ReferenceTexture()
+        self._error = ""
+        self._content: tuple[tuple, str] | None = None
+
+    def update(self, context, depsgraph) -> None:
+        """Take over what has changed in the scene."""
+        try:
+            self.mirror.sync(depsgraph, context.space_data)
+            self._error = ""
+        except Exception as error:
+            self._note(error)
+            # What was taken over half is read again as a whole.
+            self.mirror = SceneMirror()
+
+    def draw(self, context, depsgraph) -> None:
+        """Draw into the region of `context`."""
+        frame_buffer = gpu.state.active_framebuffer_get()
+        region = context.region
+        error, notes, captions = self._error, [], Captions()
+        try:
+            if self._renderer is None:
+                self._renderer = ViewRenderer()
+            region_data = context.region_data
+            view = View.of(region_data.view_matrix, region_data.window_matrix, not region_data.is_perspective)
+            settings, size = depsgraph.scene.ltsh_view, (region.width, region.height)
+            mode, reference = settings.mode, None
+            if mode != "single" and settings.second_technique == CYCLES:
+                mode, reference, notes = self._beside_cycles(context, depsgraph, view, mode)
+            shown = _shown(depsgraph.scene, mode, reference, context.preferences.system.ui_scale)
+            self._renderer.draw(self.mirror, view, size, shown, frame_buffer)
+            captions = _captions(settings, mode)
+        except Exception as problem:
+            error = self._note(problem)
+            with frame_buffer.bind():
+                frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
+        if not error and not self.mirror.lights:
+            notes = [NO_LIGHTS, *notes]
+        show(region, error, [*notes, *self.mirror.notes], captions)
+
+    def _beside_cycles(self, context, depsgraph, view: View, mode: str):
+        """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""
+        # What is asked of the original scene may read files and results.
+        scene = depsgraph.scene.original
+        reference = reference_of(context, scene, depsgraph.scene.ltsh_view.shown, view.projection)
+        if isinstance(reference, str):
+            return "single", None, [reference]
+        region = context.region
+        texture = self._reference.of(reference, (region.width, region.height))
+        changed = "The scene has changed since the Cycles picture was made: press Compare with Cycles"
+        return mode, texture, [changed] if is_outdated(reference, self._current_content()) else []
+
+    def _current_content(self) -> str:
+        """The `content` of the mirror, taken again when that has changed."""
+        mirror = self.mirror
+        state = mirror, mirror.surfaces_version, mirror.lights
+        if self._content is None or any(new is not old for new, old in zip(state, self._content[0], strict=True)):
+            self._content = state, content(mirror)
+        return self._content[1]
+
+    def _note(self, error: Exception) -> str:
+        """Keep what went wrong for the view; the console gets it once."""
+        text = error_line(error)
+        if text != self._error:
+            _logger.exception("the viewport could not be drawn")
+        self._error = text
+        return text
+
+
+def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:
+    settings = scene.ltsh_view
+    return ShownPicture(
+        technique=settings.technique,
+        passes=settings.shown,
+        mode=mode,
+        second_technique=settings.second_technique,
+        second_picture=reference,
+        split=settings.split_position,
+        difference_scale=settings.difference_scale,
+        exposure=cycles_setting(scene, "film_exposure"),
+        transparent=scene.render.film_transparent,
+        line_width=LINE_WIDTH * ui_scale,
+        white=2.0**-scene.view_settings.exposure,
+    )
+
+
+def _captions(settings, mode: str) -> Captions:
+    """What stands at the upper end of the view."""
+    first = TECHNIQUES[settings.technique].label
+    second = "Cycles" if settings.second_technique == CYCLES else TECHNIQUES[settings.second_technique].label
+    if mode == "split":
+        return Captions(first, second, settings.split_position)
+    if mode == "difference":
+        return Captions(middle=f"{first} − {second}", scale=settings.difference_scale)
+    return Captions()
+
+
+Rectangle = tuple[float, float, float, float]  # left, bottom, right, top in pixels of the region
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A Cycles picture: `pixels` (H, W, 3) in W m^-2 sr^-1, row 0 on top, in `frame` of the region."""
+
+    pixels: np.ndarray
+    frame: Rectangle
+    stamp: tuple  # changes when the picture is made again
+
+
+def reference_of(context, scene, passes: str, projection: np.ndarray) -> Reference | str:
+    """The Cycles picture of what the region of `context` shows, or why there is none."""
+    result = _comparison_of(scene)
+    if result is None:
+        return "There is no Cycles picture of this scene: press Compare with Cycles"
+    space, report = context.space_data, result.report
+    camera = space.camera if space.use_local_camera else scene.camera
+    if camera is None or context.region_data.view_perspective != "CAMERA":
+        return "The Cycles picture is the camera's: look through the camera"
+    if camera.name != report.get("camera"):
+        return f"The Cycles picture is that of camera {report.get('camera')!r}, this is {camera.name!r}"
+    if scene.frame_current != report.get("frame"):
+        return f"The Cycles picture is that of frame {report.get('frame')}, this is {scene.frame_current}"
+    files = result.groups[""]["files"]
+    layer = f"{CYCLES}.{passes}"
+    if layer not in files:
+        return f"The Cycles picture has no {passes} pass: compare with that pass"
+    region = context.region
+    frame = camera_frame(camera, scene, projection, (region.width, region.height))
+    width, height = report["resolution"]
+    aspect = width * report["pixel_aspect"] / height
+    if report["border"] is not None or abs(aspect * (frame[3] - frame[1]) / (frame[2] - frame[0]) - 1.0) > SAME_SHAPE:
+        return "The Cycles picture does not fill the camera's frame: compare again without render region"
+    pixels = _pixels(result.folder / files[layer]) / report["exposure"]
+    return Reference(pixels, frame, (str(result.folder), *index_stamp(result.folder)))
+
+
+def _comparison_of(scene) -> results.Result | None:
+    """The results with a Cycles picture: those that are shown, or the last ones of the command."""
+    last = str(output_folder(scene, "compare") / "images")
+    for result in (results.result_of(scene), results.result_in(last)):
+        if result is not None and "" in result.groups and CYCLES in result.groups[""]["names"]:
+            return result
+    return None
+
+
+_read: dict = {}
+
+
+def _pixels(path) -> np.ndarray:
+    """The picture in the file `path`; read again when it has changed. Raises OSError, ValueError."""
+    key = str(path), path.stat().st_mtime_ns
+    if _read.get("key") != key:
+        channels = read_channels(path)
+        _read.update(key=key, pixels=np.stack([channels[letter] for letter in "RGB"], axis=-1))
+    return _read["pixels"]
+
+
+def camera_frame(camera, scene, projection: np.ndarray, size: tuple[int, int]) -> Rectangle:
+    """Where what `camera` renders is seen in a region of `size` whose `projection` (4, 4) is from the world."""
+    corners = [camera.matrix_world @ corner for corner in camera.data.view_frame(scene=scene)]
+    clip = np.array([projection @ [*corner, 1.0] for corner in corners])
+    x, y = ((0.5 + 0.5 * clip[:, axis] / clip[:, 3]) * size[axis] for axis in (0, 1))
+    return x.min(), y.min(), x.max(), y.max()
+
+
+def averaged(image: np.ndarray, frame: Rectangle, size: tuple[int, int]) -> np.ndarray:
+    """`image` (H, W, C), row 0 on top, stretched over `frame`: (height, width, C + 1) of pixels of the size `size`
+    (width, height), row 0 at the bottom.
+
+    Each pixel has the mean of `image` over the pixel's area; the last channel is 1 inside the frame and 0 outside.
+    """
+    left, bottom, right, top = frame
+    whole = np.concatenate([image[::-1], np.ones((*image.shape[:2], 1))], axis=-1)
+    for axis, (start, end, count) in enumerate(((bottom, top, size[1]), (left, right, size[0]))):
+        edges = (np.arange(count + 1) - start) / (end - start) * whole.shape[axis]
+        whole = _mean_between(whole, edges, axis)
+    # Pixels that the frame cuts would be too dark.
+    whole[whole[..., -1] < 1.0 - 1e-6] = 0.0
+    whole[..., -1] = np.rint(whole[..., -1])
+    return whole
+
+
+def _mean_between(values: np.ndarray, edges: np.ndarray, axis: int) -> np.ndarray:
+    """Means of the steps `values` along `axis` between neighbors of `edges`; outside the values it is zero."""
+    values = np.moveaxis(values, axis, 0)
+    count = len(values)
+    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
+    inside = np.clip(edges, 0.0, count)
+    lower = np.minimum(inside.astype(int), count - 1)
+    share = (inside - lower).reshape(-1, *([1] * (values.ndim - 1)))
+    at_edges = sums[lower] + share * values[lower]
+    width = np.diff(edges).reshape(-1, *([1] * (values.ndim - 1)))
+    return np.moveaxis(np.diff(at_edges, axis=0) / width, 0, axis)
+
+
+class ReferenceTexture:
+    """The texture of a reference in one view; made again when view or picture change."""
+
+    def __init__(self):
+        self._made, self._texture = None, None
+
+    def of(self, reference: Reference, size: tuple[int, int]) -> gpu.types.GPUTexture:
+        """RGBA of `size` pixels, alpha 0 outside the camera's frame; needs an active GPU context."""
+        made = id(reference.pixels), reference.frame, size
+        if made != self._made:
+            self._texture = float_texture(averaged(reference.pixels, reference.frame, size))
+            self._made = made
+        return self._texture
+
+
+# Stamp of a reference -> content of the scene when it was first shown.
+_content: dict[tuple, str] = {}
+
+
+def content(mirror) -> str:
+    """A digest of what the scene mirror `mirror` shows: lights, places, sizes and materials."""
+    digest = hashlib.blake2b(digest_size=16)
+    for light in mirror.lights:
+        for value in vars(light).values():
+            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    for instance in mirror.instances:
+        digest.update(np.array(instance.model).tobytes())
+        digest.update(repr((instance.mesh.triangles, instance.receiver)).encode())
+        digest.update(instance.mesh.middle.tobytes())
+        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
+            digest.update(look_values(lobe).tobytes())
+    return digest.hexdigest()
+
+
+def is_outdated(reference: Reference, now: str) -> bool:
+    """Is the `content` of the scene `now` another one than when `reference` was first shown?"""
+    return _content.setdefault(reference.stamp, now) != now
 
 
 @dataclass(frozen=True)
@@ -148,251 +392,3 @@ def unregister() -> None:
     while _handle:
         bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
     _texts.clear()
-
-
-# Shares by which the shapes of two pictures may differ: sizes are whole pixels.
-SAME_SHAPE = 0.01
-
-Rectangle = tuple[float, float, float, float]  # left, bottom, right, top in pixels of the region
-
-
-@dataclass(frozen=True)
-class Reference:
-    """A Cycles picture: `pixels` (H, W, 3) in W m^-2 sr^-1, row 0 on top, in `frame` of the region."""
-
-    pixels: np.ndarray
-    frame: Rectangle
-    stamp: tuple  # changes when the picture is made again
-
-
-def camera_frame(camera, scene, projection: np.ndarray, size: tuple[int, int]) -> Rectangle:
-    """Where what `camera` renders is seen in a region of `size` whose `projection` (4, 4) is from the world."""
-    corners = [camera.matrix_world @ corner for corner in camera.data.view_frame(scene=scene)]
-    clip = np.array([projection @ [*corner, 1.0] for corner in corners])
-    x, y = ((0.5 + 0.5 * clip[:, axis] / clip[:, 3]) * size[axis] for axis in (0, 1))
-    return x.min(), y.min(), x.max(), y.max()
-
-
-def averaged(image: np.ndarray, frame: Rectangle, size: tuple[int, int]) -> np.ndarray:
-    """`image` (H, W, C), row 0 on top, stretched over `frame`: (height, width, C + 1) of pixels of the size `size`
-    (width, height), row 0 at the bottom.
-
-    Each pixel has the mean of `image` over the pixel's area; the last channel is 1 inside the frame and 0 outside.
-    """
-    left, bottom, right, top = frame
-    whole = np.concatenate([image[::-1], np.ones((*image.shape[:2], 1))], axis=-1)
-    for axis, (start, end, count) in enumerate(((bottom, top, size[1]), (left, right, size[0]))):
-        edges = (np.arange(count + 1) - start) / (end - start) * whole.shape[axis]
-        whole = _mean_between(whole, edges, axis)
-    # Pixels that the frame cuts would be too dark.
-    whole[whole[..., -1] < 1.0 - 1e-6] = 0.0
-    whole[..., -1] = np.rint(whole[..., -1])
-    return whole
-
-
-def _mean_between(values: np.ndarray, edges: np.ndarray, axis: int) -> np.ndarray:
-    """Means of the steps `values` along `axis` between neighbors of `edges`; outside the values it is zero."""
-    values = np.moveaxis(values, axis, 0)
-    count = len(values)
-    sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)])
-    inside = np.clip(edges, 0.0, count)
-    lower = np.minimum(inside.astype(int), count - 1)
-    share = (inside - lower).reshape(-1, *([1] * (values.ndim - 1)))
-    at_edges = sums[lower] + share * values[lower]
-    width = np.diff(edges).reshape(-1, *([1] * (values.ndim - 1)))
-    return np.moveaxis(np.diff(at_edges, axis=0) / width, 0, axis)
-
-
-def reference_of(context, scene, passes: str, projection: np.ndarray) -> Reference | str:
-    """The Cycles picture of what the region of `context` shows, or why there is none."""
-    result = _comparison_of(scene)
-    if result is None:
-        return "There is no Cycles picture of this scene: press Compare with Cycles"
-    space, report = context.space_data, result.report
-    camera = space.camera if space.use_local_camera else scene.camera
-    if camera is None or context.region_data.view_perspective != "CAMERA":
-        return "The Cycles picture is the camera's: look through the camera"
-    if camera.name != report.get("camera"):
-        return f"The Cycles picture is that of camera {report.get('camera')!r}, this is {camera.name!r}"
-    if scene.frame_current != report.get("frame"):
-        return f"The Cycles picture is that of frame {report.get('frame')}, this is {scene.frame_current}"
-    files = result.groups[""]["files"]
-    layer = f"{CYCLES}.{passes}"
-    if layer not in files:
-        return f"The Cycles picture has no {passes} pass: compare with that pass"
-    region = context.region
-    frame = camera_frame(camera, scene, projection, (region.width, region.height))
-    width, height = report["resolution"]
-    aspect = width * report["pixel_aspect"] / height
-    if report["border"] is not None or abs(aspect * (frame[3] - frame[1]) / (frame[2] - frame[0]) - 1.0) > SAME_SHAPE:
-        return "The Cycles picture does not fill the camera's frame: compare again without render region"
-    pixels = _pixels(result.folder / files[layer]) / report["exposure"]
-    return Reference(pixels, frame, (str(result.folder), *index_stamp(result.folder)))
-
-
-def _comparison_of(scene) -> results.Result | None:
-    """The results with a Cycles picture: those that are shown, or the last ones of the command."""
-    last = str(output_folder(scene, "compare") / "images")
-    for result in (results.result_of(scene), results.result_in(last)):
-        if result is not None and "" in result.groups and CYCLES in result.groups[""]["names"]:
-            return result
-    return None
-
-
-_read: dict = {}
-
-
-def _pixels(path) -> np.ndarray:
-    """The picture in the file `path`; read again when it has changed. Raises OSError, ValueError."""
-    key = str(path), path.stat().st_mtime_ns
-    if _read.get("key") != key:
-        channels = read_channels(path)
-        _read.update(key=key, pixels=np.stack([channels[letter] for letter in "RGB"], axis=-1))
-    return _read["pixels"]
-
-
-# Stamp of a reference -> content of the scene when it was first shown.
-_content: dict[tuple, str] = {}
-
-
-def content(mirror) -> str:
-    """A digest of what the scene mirror `mirror` shows: lights, places, sizes and materials."""
-    digest = hashlib.blake2b(digest_size=16)
-    for light in mirror.lights:
-        for value in vars(light).values():
-            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    for instance in mirror.instances:
-        digest.update(np.array(instance.model).tobytes())
-        digest.update(repr((instance.mesh.triangles, instance.receiver)).encode())
-        digest.update(instance.mesh.middle.tobytes())
-        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
-            digest.update(look_values(lobe).tobytes())
-    return digest.hexdigest()
-
-
-def is_outdated(reference: Reference, now: str) -> bool:
-    """Is the `content` of the scene `now` another one than when `reference` was first shown?"""
-    return _content.setdefault(reference.stamp, now) != now
-
-
-class ReferenceTexture:
-    """The texture of a reference in one view; made again when view or picture change."""
-
-    def __init__(self):
-        self._made, self._texture = None, None
-
-    def of(self, reference: Reference, size: tuple[int, int]) -> gpu.types.GPUTexture:
-        """RGBA of `size` pixels, alpha 0 outside the camera's frame; needs an active GPU context."""
-        made = id(reference.pixels), reference.frame, size
-        if made != self._made:
-            self._texture = float_texture(averaged(reference.pixels, reference.frame, size))
-            self._made = made
-        return self._texture
-
-
-_logger = logging.getLogger(__name__)
-# Width of the line of the split view in pixels of an unscaled interface.
-LINE_WIDTH = 2.0
-NO_LIGHTS = "No area light and no glowing mesh shines here: add an area light"
-
-
-class EngineView:
-    """One 3D view with the engine."""
-
-    def __init__(self):
-        self.mirror = SceneMirror()
-        self._renderer: ViewRenderer | None = None
-        self._reference = ReferenceTexture()
-        self._error = ""
-        self._content: tuple[tuple, str] | None = None
-
-    def update(self, context, depsgraph) -> None:
-        """Take over what has changed in the scene."""
-        try:
-            self.mirror.sync(depsgraph, context.space_data)
-            self._error = ""
-        except Exception as error:
-            self._note(error)
-            # What was taken over half is read again as a whole.
-            self.mirror = SceneMirror()
-
-    def draw(self, context, depsgraph) -> None:
-        """Draw into the region of `context`."""
-        frame_buffer = gpu.state.active_framebuffer_get()
-        region = context.region
-        error, notes, captions = self._error, [], Captions()
-        try:
-            if self._renderer is None:
-                self._renderer = ViewRenderer()
-            region_data = context.region_data
-            view = View.of(region_data.view_matrix, region_data.window_matrix, not region_data.is_perspective)
-            settings, size = depsgraph.scene.ltsh_view, (region.width, region.height)
-            mode, reference = settings.mode, None
-            if mode != "single" and settings.second_technique == CYCLES:
-                mode, reference, notes = self._beside_cycles(context, depsgraph, view, mode)
-            shown = _shown(depsgraph.scene, mode, reference, context.preferences.system.ui_scale)
-            self._renderer.draw(self.mirror, view, size, shown, frame_buffer)
-            captions = _captions(settings, mode)
-        except Exception as problem:
-            error = self._note(problem)
-            with frame_buffer.bind():
-                frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
-        if not error and not self.mirror.lights:
-            notes = [NO_LIGHTS, *notes]
-        show(region, error, [*notes, *self.mirror.notes], captions)
-
-    def _beside_cycles(self, context, depsgraph, view: View, mode: str):
-        """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""
-        # What is asked of the original scene may read files and results.
-        scene = depsgraph.scene.original
-        reference = reference_of(context, scene, depsgraph.scene.ltsh_view.shown, view.projection)
-        if isinstance(reference, str):
-            return "single", None, [reference]
-        region = context.region
-        texture = self._reference.of(reference, (region.width, region.height))
-        changed = "The scene has changed since the Cycles picture was made: press Compare with Cycles"
-        return mode, texture, [changed] if is_outdated(reference, self._current_content()) else []
-
-    def _current_content(self) -> str:
-        """The `content` of the mirror, taken again when that has changed."""
-        mirror = self.mirror
-        state = mirror, mirror.surfaces_version, mirror.lights
-        if self._content is None or any(new is not old for new, old in zip(state, self._content[0], strict=True)):
-            self._content = state, content(mirror)
-        return self._content[1]
-
-    def _note(self, error: Exception) -> str:
-        """Keep what went wrong for the view; the console gets it once."""
-        text = error_line(error)
-        if text != self._error:
-            _logger.exception("the viewport could not be drawn")
-        self._error = text
-        return text
-
-
-def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:
-    settings = scene.ltsh_view
-    return ShownPicture(
-        technique=settings.technique,
-        passes=settings.shown,
-        mode=mode,
-        second_technique=settings.second_technique,
-        second_picture=reference,
-        split=settings.split_position,
-        difference_scale=settings.difference_scale,
-        exposure=cycles_setting(scene, "film_exposure"),
-        transparent=scene.render.film_transparent,
-        line_width=LINE_WIDTH * ui_scale,
-        white=2.0**-scene.view_settings.exposure,
-    )
-
-
-def _captions(settings, mode: str) -> Captions:
-    """What stands at the upper end of the view."""
-    first = TECHNIQUES[settings.technique].label
-    second = "Cycles" if settings.second_technique == CYCLES else TECHNIQUES[settings.second_technique].label
-    if mode == "split":
-        return Captions(first, second, settings.split_position)
-    if mode == "difference":
-        return Captions(middle=f"{first} − {second}", scale=settings.difference_scale)
-    return Captions()

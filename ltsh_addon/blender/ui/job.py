@@ -25,12 +25,103 @@ from ..process import blender_process
 from . import preflight
 from .settings import preferences
 
+STARTING = "Starting"
+SURE_SECONDS = 3.0  # before, nobody knows how long it will take
+SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
+MESSAGE = "LTSH "
+ENDING_SECONDS = 10.0
+NO_CYCLES = "Not complete: without Cycles"
+# What stages of the command line are called there and here; others keep their names.
+STAGE_TITLES = {
+    "open scene": "Open Scene",
+    "samples": "Sample Surfaces",
+    "Cycles A": "Cycles, First Half",
+    "Cycles B": "Cycles, Second Half",
+    **{technique.title: technique.label for technique in TECHNIQUES.values()},
+    "write": "Write Files",
+    "images": "Make Pictures",
+}
 # Costs count as if so many seconds had been measured.
 PRIOR_SECONDS = 5.0
 # Below, what a stage reports says too little about its length.
 LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
 # An end that is not reported is not shown.
 MOST = 0.99
+# Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
+START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
+SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
+SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
+REFERENCE_POINTS = 0.15
+
+
+def runs(context, command: str, scene_file: Path) -> list[dict]:
+    """The command lines of a job (see `panel_job.perform`)."""
+    if command == "bake":
+        return [_run(command, bake_options(context, scene_file))]
+    wanted = picture_options(context.scene, command, scene_file)
+    if command == "shade":
+        return [_run(command, wanted)]
+    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
+    first = tuple(name for name in wanted.techniques if name != REFERENCE)
+    early = replace(picture_options(context.scene, "shade", scene_file), techniques=first)
+    return [*([_run("shade", early, NO_CYCLES)] if first else []), _run(command, wanted)]
+
+
+def _run(command: str, options, partial: str = "") -> dict:
+    return {"arguments": [command, *command_line(options)], "output": str(options.output), "partial": partial}
+
+
+def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
+    """What "shade" or "compare" is asked for."""
+    settings = scene.ltsh
+    samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
+    return PictureOptions(
+        scene=scene_file,
+        output=output_folder(scene, command),
+        techniques=chosen(settings, "techniques"),
+        passes=chosen(settings, "passes"),
+        resolution=preflight.picture_of(scene),
+        sub_samples=settings.anti_aliasing,
+        **samples,
+    )
+
+
+def bake_options(context, scene_file: Path) -> BakeOptions:
+    """What "bake" is asked for: the selected objects that can be baked."""
+    settings = context.scene.ltsh
+    side = int(settings.bake_size)
+    return BakeOptions(
+        scene=scene_file,
+        output=output_folder(context.scene, "bake"),
+        objects=tuple(ob.name for ob in preflight.bake_objects(context)[0]),
+        uv=settings.bake_uv_map or None,
+        size=(side, side),
+        margin=settings.bake_margin,
+        view=settings.bake_view,
+        techniques=chosen(settings, "techniques"),
+        passes=chosen(settings, "bake_passes"),
+        error=settings.bake_error,
+        cycles_samples=settings.cycles_samples,
+    )
+
+
+def chosen(settings, key: str) -> tuple[str, ...]:
+    """The members of a set of choices, in the order in which they are offered."""
+    items = settings.bl_rna.properties[key].enum_items.keys()
+    return tuple(name for name in items if name in getattr(settings, key))
+
+
+def output_folder(scene, command: str) -> Path:
+    """Where `command` writes: the folder of the settings, or that of the preferences where it is empty or where the
+    .blend that it is relative to is not saved."""
+    folder = scene.ltsh.output_folder.strip()
+    if folder and (bpy.data.filepath or not folder.startswith("//")):
+        root = Path(bpy.path.abspath(folder))
+    else:
+        root = preferences(bpy.context).output_folder / (Path(bpy.data.filepath).stem or "untitled")
+    if len(bpy.data.scenes) > 1:
+        root /= bpy.path.clean_name(scene.name)
+    return root / command
 
 
 @dataclass(frozen=True)
@@ -39,6 +130,50 @@ class Step:
 
     stage: str
     cost: float
+
+
+def steps(context, command: str) -> list[Step]:
+    """What a job goes through, in order."""
+    starting = Step(STARTING, START_SECONDS)
+    if command == "bake":
+        return [starting, *_bake(context)]
+    names = chosen(context.scene.ltsh, "techniques")
+    if command == "shade":
+        return [starting, *_picture(context.scene, names, False)]
+    first = [name for name in names if name != REFERENCE]
+    early = _picture(context.scene, first, False) if first else []
+    return [starting, *early, *_picture(context.scene, names, True)]
+
+
+def _picture(scene, techniques: list[str], with_cycles: bool) -> list[Step]:
+    settings, (width, height) = scene.ltsh, preflight.picture_of(scene)
+    pixels, points = 1e-6 * width * height, 1e-6 * width * height * settings.anti_aliasing
+    rendered = RENDER_SECONDS * settings.anti_aliasing
+    half = Step("", rendered + SAMPLE_SECONDS * pixels * max(settings.cycles_samples // 2, settings.anti_aliasing))
+    return [
+        Step("open scene", OPEN_SECONDS),
+        Step("samples", rendered + SAMPLE_SECONDS * points),
+        *(Step(f"Cycles {name}", half.cost) for name in ("A", "B") if with_cycles),
+        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques),
+        Step("write", FILE_SECONDS * pixels),
+        Step("images", FILE_SECONDS * pixels),
+    ]
+
+
+def _bake(context) -> list[Step]:
+    settings = context.scene.ltsh
+    texels = 1e-6 * int(settings.bake_size) ** 2
+    samples = settings.cycles_samples * len(settings.bake_passes) if settings.bake_error else 1
+    shading = sum(_shading(name, texels) for name in chosen(settings, "techniques"))
+    found = [Step("open scene", OPEN_SECONDS)]
+    for ob in preflight.bake_objects(context)[0]:
+        found.append(Step(f"bake {ob.name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
+        found.append(Step(f"shade {ob.name}", shading + FILE_SECONDS * texels))
+    return [*found, Step("images", FILE_SECONDS * texels * len(found))]
+
+
+def _shading(technique: str, points: float) -> float:
+    return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
 
 
 class Plan:
@@ -102,13 +237,6 @@ class Plan:
         else:
             rest, since = self._expected(self._steps[self._at]), self._stage_started
         return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
-
-
-SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
-MESSAGE = "LTSH "
-ENDING_SECONDS = 10.0
-STARTING = "Starting"
-SURE_SECONDS = 3.0  # before, nobody knows how long it will take
 
 
 @dataclass
@@ -235,6 +363,12 @@ def new_folder() -> Path:
     return Path(tempfile.mkdtemp(prefix="ltsh-"))
 
 
+def _library_folders() -> list[str]:
+    """Where the process finds what this Blender got with the extension."""
+    spec = importlib.util.find_spec("OpenEXR")
+    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
+
+
 def parsed(line: str) -> dict | None:
     """The message that `line` carries, or None for anything else that a process prints."""
     if not line.startswith(MESSAGE):
@@ -251,146 +385,6 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
-
-
-def _library_folders() -> list[str]:
-    """Where the process finds what this Blender got with the extension."""
-    spec = importlib.util.find_spec("OpenEXR")
-    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
-
-
-NO_CYCLES = "Not complete: without Cycles"
-
-
-def runs(context, command: str, scene_file: Path) -> list[dict]:
-    """The command lines of a job (see `panel_job.perform`)."""
-    if command == "bake":
-        return [_run(command, bake_options(context, scene_file))]
-    wanted = picture_options(context.scene, command, scene_file)
-    if command == "shade":
-        return [_run(command, wanted)]
-    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
-    first = tuple(name for name in wanted.techniques if name != REFERENCE)
-    early = replace(picture_options(context.scene, "shade", scene_file), techniques=first)
-    return [*([_run("shade", early, NO_CYCLES)] if first else []), _run(command, wanted)]
-
-
-def _run(command: str, options, partial: str = "") -> dict:
-    return {"arguments": [command, *command_line(options)], "output": str(options.output), "partial": partial}
-
-
-def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
-    """What "shade" or "compare" is asked for."""
-    settings = scene.ltsh
-    samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
-    return PictureOptions(
-        scene=scene_file,
-        output=output_folder(scene, command),
-        techniques=chosen(settings, "techniques"),
-        passes=chosen(settings, "passes"),
-        resolution=preflight.picture_of(scene),
-        sub_samples=settings.anti_aliasing,
-        **samples,
-    )
-
-
-def bake_options(context, scene_file: Path) -> BakeOptions:
-    """What "bake" is asked for: the selected objects that can be baked."""
-    settings = context.scene.ltsh
-    side = int(settings.bake_size)
-    return BakeOptions(
-        scene=scene_file,
-        output=output_folder(context.scene, "bake"),
-        objects=tuple(ob.name for ob in preflight.bake_objects(context)[0]),
-        uv=settings.bake_uv_map or None,
-        size=(side, side),
-        margin=settings.bake_margin,
-        view=settings.bake_view,
-        techniques=chosen(settings, "techniques"),
-        passes=chosen(settings, "bake_passes"),
-        error=settings.bake_error,
-        cycles_samples=settings.cycles_samples,
-    )
-
-
-def chosen(settings, key: str) -> tuple[str, ...]:
-    """The members of a set of choices, in the order in which they are offered."""
-    items = settings.bl_rna.properties[key].enum_items.keys()
-    return tuple(name for name in items if name in getattr(settings, key))
-
-
-def output_folder(scene, command: str) -> Path:
-    """Where `command` writes: the folder of the settings, or that of the preferences where it is empty or where the
-    .blend that it is relative to is not saved."""
-    folder = scene.ltsh.output_folder.strip()
-    if folder and (bpy.data.filepath or not folder.startswith("//")):
-        root = Path(bpy.path.abspath(folder))
-    else:
-        root = preferences(bpy.context).output_folder / (Path(bpy.data.filepath).stem or "untitled")
-    if len(bpy.data.scenes) > 1:
-        root /= bpy.path.clean_name(scene.name)
-    return root / command
-
-
-# What stages of the command line are called there and here; others keep their names.
-STAGE_TITLES = {
-    "open scene": "Open Scene",
-    "samples": "Sample Surfaces",
-    "Cycles A": "Cycles, First Half",
-    "Cycles B": "Cycles, Second Half",
-    **{technique.title: technique.label for technique in TECHNIQUES.values()},
-    "write": "Write Files",
-    "images": "Make Pictures",
-}
-# Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
-START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
-SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
-SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
-REFERENCE_POINTS = 0.15
-
-
-def steps(context, command: str) -> list[Step]:
-    """What a job goes through, in order."""
-    starting = Step(STARTING, START_SECONDS)
-    if command == "bake":
-        return [starting, *_bake(context)]
-    names = chosen(context.scene.ltsh, "techniques")
-    if command == "shade":
-        return [starting, *_picture(context.scene, names, False)]
-    first = [name for name in names if name != REFERENCE]
-    early = _picture(context.scene, first, False) if first else []
-    return [starting, *early, *_picture(context.scene, names, True)]
-
-
-def _picture(scene, techniques: list[str], with_cycles: bool) -> list[Step]:
-    settings, (width, height) = scene.ltsh, preflight.picture_of(scene)
-    pixels, points = 1e-6 * width * height, 1e-6 * width * height * settings.anti_aliasing
-    rendered = RENDER_SECONDS * settings.anti_aliasing
-    half = Step("", rendered + SAMPLE_SECONDS * pixels * max(settings.cycles_samples // 2, settings.anti_aliasing))
-    return [
-        Step("open scene", OPEN_SECONDS),
-        Step("samples", rendered + SAMPLE_SECONDS * points),
-        *(Step(f"Cycles {name}", half.cost) for name in ("A", "B") if with_cycles),
-        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques),
-        Step("write", FILE_SECONDS * pixels),
-        Step("images", FILE_SECONDS * pixels),
-    ]
-
-
-def _bake(context) -> list[Step]:
-    settings = context.scene.ltsh
-    texels = 1e-6 * int(settings.bake_size) ** 2
-    samples = settings.cycles_samples * len(settings.bake_passes) if settings.bake_error else 1
-    shading = sum(_shading(name, texels) for name in chosen(settings, "techniques"))
-    found = [Step("open scene", OPEN_SECONDS)]
-    for ob in preflight.bake_objects(context)[0]:
-        found.append(Step(f"bake {ob.name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
-        found.append(Step(f"shade {ob.name}", shading + FILE_SECONDS * texels))
-    return [*found, Step("images", FILE_SECONDS * texels * len(found))]
-
-
-def _shading(technique: str, points: float) -> float:
-    return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
 
 
 def stage_title(job: Job) -> str:

@@ -159,7 +159,7 @@ def test_a_scene_without_lights_fails_with_its_reason(addon, tmp_path):
     addon.render.engine = "LTSH"
     with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
         render(addon, tmp_path / "dark.exr")
-    assert not render_module._current
+    assert not render_module._copy
 
 
 def test_only_the_render_region_is_handed_to_blender():

@@ -133,7 +133,7 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
     monkeypatch.setattr(render_module.LTSH_RenderEngine, "_fail", lambda self, error: failures.append(error))
     bpy.ops.render.render()
     assert asked and not failures
-    assert not render_module._current
+    assert not render_module._copy
     # The work ends, and with it its temporary folders, after the render.
     end = time.monotonic() + 60
     while leftovers(tmp_path) and time.monotonic() < end:

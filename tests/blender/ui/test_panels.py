@@ -224,17 +224,17 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
 
 def test_numbers_are_those_of_the_report(scene, tmp_path):
     add_results(scene, tmp_path)
-    shown = drawn(panels.CLASSES[0])
+    shown = drawn(panels.CLASSES[10])
     for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
-    narrow = texts(drawn(panels.CLASSES[0], width=220)).replace("\u00a0", " ")
+    narrow = texts(drawn(panels.CLASSES[10], width=220)).replace("\u00a0", " ")
     assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
 
 
 def test_results_that_are_partial_say_so(scene, tmp_path):
     add_results(scene, tmp_path, "Not complete: without Cycles", ("ltc", "ltsh4"))
-    assert "Not complete: without Cycles" in texts(drawn(panels.CLASSES[0]))
+    assert "Not complete: without Cycles" in texts(drawn(panels.CLASSES[10]))
 
 
 def test_the_image_editor_offers_the_pictures_that_are_there(scene, tmp_path):

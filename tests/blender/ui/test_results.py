@@ -237,7 +237,7 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
 
 
 def preset_files():
-    return sorted(Path(settings_module.FOLDER, "presets", "ltsh").glob("*.py"))
+    return sorted(Path(settings_module.PRESETS_PARENT, "presets", "ltsh").glob("*.py"))
 
 
 def test_presets_of_ours_set_everything_they_name(scene):

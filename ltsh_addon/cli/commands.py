@@ -125,11 +125,11 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
     """The job that the arguments of demo, compare, shade or bake describe. Raises Misuse."""
     kind = BakeOptions if arguments.command == "bake" else PictureOptions
     command = "compare" if arguments.command == "demo" else arguments.command
-    cameras = tuple(dict.fromkeys(arguments.cameras or ()))
-    if command == "bake" and arguments.apply and (len(cameras) > 1 or len(arguments.frames) > 1):
+    cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
+    if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
     options = options_from(kind, vars(arguments), scene=scenes[0])
-    return Job(command, options, scenes, cameras, arguments.frames, arguments.pattern)
+    return Job(command, options, scenes, cameras, frames, arguments.pattern)
 
 
 def _printed(arguments, document: dict, code: int) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shutil
 import time
 from collections import deque
@@ -84,10 +85,11 @@ def bake_objects(
 
 
 def _check(options: BakeOptions) -> None:
-    for side in (options.width, options.height):
+    width, height = options.size
+    for side in options.size:
         if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
             limits = "{} to {}".format(*TEXTURE_SIDES)
-            raise ValueError(f"size is {options.width}x{options.height}, expected {limits} each")
+            raise ValueError(f"size is {width}x{height}, expected {limits} each")
     if options.margin_type not in MARGIN_TYPES:
         raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
@@ -101,6 +103,8 @@ def _job(options, finished, tile, following):
     return child_job(
         client.BakeJob,
         options,
+        width=options.size[0],
+        height=options.size[1],
         block_rows=block_rows(options),
         cycles_samples=options.cycles_samples if options.error else 0,
         passes=tuple(name for name in PASSES if name in shaded_passes(options)),
@@ -112,7 +116,8 @@ def _job(options, finished, tile, following):
 
 def block_rows(options) -> int:
     """Rows of texels that are baked at a time."""
-    return max(1, min(options.height, BLOCK_TEXELS // options.width))
+    width, height = options.size
+    return max(1, min(height, BLOCK_TEXELS // width))
 
 
 def shaded_passes(options) -> set[str]:
@@ -163,7 +168,7 @@ class ObjectBaker:
             found = record["report"]
             result["tiles"][str(tile)] = {"file": file, **found}
             if self.area > 0.0:
-                baked = found["covered_times"] / (self.options.width * self.options.height)
+                baked = found["covered_times"] / math.prod(self.options.size)
                 result["outside"] = max(0.0, 1.0 - baked / self.area)
         return TaskResult(result, seconds, tuple(files))
 
@@ -179,8 +184,7 @@ class ObjectBaker:
             record = self._shade(tile, planes, errors, progress)
             pictures = None
             if self.compared:
-                size = options.width, options.height
-                pictures = ErrorPictures(*size, path, list(self.tables), list(self.compared))
+                pictures = ErrorPictures(*options.size, path, list(self.tables), list(self.compared))
                 named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
                 record |= {"pictures": named, "errors": errors.report()}
                 written += named
@@ -195,27 +199,26 @@ class ObjectBaker:
 
     def _planes(self, tile) -> Planes:
         options, seams = self.options, None
-        size = options.width, options.height
         if options.margin_type == "adjacent" and options.margin > 0:
-            seams = self._seams(self.mesh.uv, self.mesh.vertices, *size, _place(tile))
-        return Planes(self.folder / f"planes_{tile}", self.channels(), *size, seams)
+            seams = self._seams(self.mesh.uv, self.mesh.vertices, *options.size, _place(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; how many texels there were."""
         options, covered, covers, overlaps = self.options, 0, 0, 0
-        rows = block_rows(options)
-        triangles = self._raster.in_tile(self.mesh.uv, options.width, options.height, _place(tile))
+        rows, height = block_rows(options), options.size[1]
+        triangles = self._raster.in_tile(self.mesh.uv, *options.size, _place(tile))
 
         def shaded(first):
-            texels = triangles.texels(first, min(rows, options.height - first), options.conservative)
+            texels = triangles.texels(first, min(rows, height - first), options.conservative)
             return first, texels, *self._block(tile, first, texels)
 
-        firsts = range(0, options.height, rows)
+        firsts = range(0, height, rows)
         for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
             covered += len(texels.index)
             covers += texels.covers
             overlaps += texels.overlaps
-            planes.put(first, min(rows, options.height - first), texels, values)
+            planes.put(first, min(rows, height - first), texels, values)
             self._sum_up(errors, values, halves)
             share = (number + 1) / len(firsts)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
@@ -421,7 +424,7 @@ def _report(options, manifest, records) -> dict:
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],
-        "size": [options.width, options.height],
+        "size": list(options.size),
         "view": manifest["view"],
         "objects": records,
         "problems": problems,

@@ -9,11 +9,11 @@ from __future__ import annotations
 import re
 import string
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ..scene import BAKE_PASSES, PASSES, REFERENCE, SHIPPED_TABLES, TECHNIQUES
+from ..scene import BAKE_PASSES, PASSES, SHIPPED_TABLES, TECHNIQUES
 
 # Blender's own limits: of a side of the picture in pixels, and of frames.
 PICTURE_SIDES = (4, 65536)
@@ -213,65 +213,73 @@ class Argument:
     keywords: dict[str, Any]
 
 
-def option(*arguments: Argument, matters: bool = True, **settings) -> Any:
-    """A field with arguments, of which one may be given; `matters` is False where results do not depend on it."""
-    return field(kw_only="default" in settings, metadata={"arguments": arguments, "matters": matters}, **settings)
+def argument(*flags: str, **keywords) -> Argument:
+    """An argument; `type` turns its text into a value."""
+    return Argument(flags, keywords)
 
 
-def argument(*flags: str, parse: Callable[[str], Any] | None = None, **keywords) -> Argument:
-    """An argument whose text `parse` turns into a value."""
-    return Argument(flags, keywords if parse is None else {"type": parse, **keywords})
+def option(
+    *flags: str, either: tuple[Argument, ...] = (), matters: bool = True, default: Any = MISSING, **keywords
+) -> Any:
+    """A field with one argument, or several of which one may be given (`either`), or none.
+
+    `matters` is False where results do not depend on it. Only a field without a `default` may be given by position.
+    """
+    arguments = (argument(*flags, **keywords),) if flags else either
+    metadata = {"arguments": arguments, "matters": matters}
+    return field(default=default, kw_only=default is not MISSING, metadata=metadata)
 
 
-def _scene(text: str) -> Any:
-    return option(argument("scenes", nargs="*", metavar="SCENE.blend", help=text), matters=False)
+def flag(name: str, meaning: str) -> Any:
+    """A field that is True where the flag is given."""
+    return option(name, default=False, action="store_true", help=meaning)
+
+
+def _scene(meaning: str) -> Any:
+    return option("scenes", matters=False, nargs="*", metavar="SCENE.blend", help=meaning)
 
 
 def _output() -> Any:
-    named = argument("-o", dest="output", parse=folder, required=True, metavar="OUT", help="folder for the results")
-    return option(named, matters=False)
+    meaning = "folder for the results"
+    return option("-o", matters=False, dest="output", type=folder, required=True, metavar="OUT", help=meaning)
 
 
 def _techniques(default: tuple[str, ...]) -> Any:
-    known = ", ".join(SHIPPED_TABLES)
-    text = f"{known}, {REFERENCE} or paths of tables (.npz), separated by commas (default: {','.join(default)})"
-    return option(argument("--techniques", parse=techniques, metavar="T", help=text), default=default)
+    meaning = f"{', '.join(TECHNIQUES)} or paths of tables (.npz), separated by commas (default: {','.join(default)})"
+    return option("--techniques", default=default, type=techniques, metavar="T", help=meaning)
 
 
-def _passes_field(known: tuple[str, ...], parse, default: str) -> Any:
-    text = f"some of {','.join(known)} (default: {default})"
-    return option(argument("--passes", parse=parse, metavar="P", help=text), default=PASSES)
+def _passes_of(known: tuple[str, ...], parse: Callable, default: str) -> Any:
+    meaning = f"some of {','.join(known)} (default: {default})"
+    return option("--passes", default=PASSES, type=parse, metavar="P", help=meaning)
 
 
 def _frame() -> Any:
-    text = "such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one"
-    named = argument("--frames", "--frame", dest="frames", parse=frames, default=(), metavar="F", help=text)
-    return option(named, default=None)
+    meaning = "such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one"
+    # The command line takes several: each is a task, of which this is the one.
+    return option("--frames", "--frame", default=None, dest="frames", type=frames, metavar="F", help=meaning)
 
 
 def _camera() -> Any:
-    text = "may be given several times; default: the scene's camera"
-    return option(argument("--camera", dest="cameras", action="append", metavar="NAME", help=text), default=None)
+    meaning = "may be given several times; default: the scene's camera"
+    return option("--camera", default=None, dest="cameras", action="append", metavar="NAME", help=meaning)
 
 
-def _stem(parse) -> Any:
-    text = (
+def _stem(parse: Callable) -> Any:
+    meaning = (
         "of files, such as {scene}_{camera}_{frame:04d}; default: the command, or {object} of a bake, followed by "
         "those of scene, camera and frame of which there are several"
     )
-    return option(
-        argument("--name", dest="pattern", parse=parse, metavar="PATTERN", help=text), default=None, matters=False
-    )
+    return option("--name", matters=False, default=None, dest="pattern", type=parse, metavar="PATTERN", help=meaning)
 
 
 def _cycles_samples(what: str, default: int) -> Any:
-    text = f"of both halves of {what} together (default: %(default)s)"
-    return option(argument("--cycles-samples", parse=cycles_samples, metavar="N", help=text), default=default)
+    meaning = f"of both halves of {what} together (default: %(default)s)"
+    return option("--cycles-samples", default=default, type=cycles_samples, metavar="N", help=meaning)
 
 
 def _scripts() -> Any:
-    text = "run the scripts and Python drivers in the .blend, which is not done otherwise"
-    return option(argument("--enable-autoexec", action="store_true", help=text), default=False)
+    return flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, which is not done otherwise")
 
 
 @dataclass(frozen=True)
@@ -284,36 +292,20 @@ class PictureOptions:
     name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
     output: Path = _output()
     techniques: tuple[str, ...] = _techniques(tuple(TECHNIQUES))
-    passes: tuple[str, ...] = _passes_field(PASSES, passes, "both")
+    passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
     resolution: tuple[int, int] | None = option(
-        argument("--resolution", parse=resolution, metavar="WxH", help="default: as in the file"), default=None
+        "--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file"
     )
     sub_samples: int = option(
-        argument("--aa", parse=positive, metavar="N", help="points per pixel, drawn from its filter; 1: pixel centers"),
-        default=1,
+        "--aa", default=1, type=positive, metavar="N", help="points per pixel, drawn from its filter; 1: pixel centers"
     )
     reference_samples: int = option(
-        argument(
-            "--reference-samples",
-            parse=positive,
-            metavar="N",
-            help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
-        ),
-        default=150_000,
-    )
+        "--reference-samples", default=150_000, type=positive, metavar="N",
+        help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
+    )  # fmt: skip
     cycles_samples: int = _cycles_samples("the Cycles reference", 512)
     scripts: bool = _scripts()
     page: str = option(default="report.html", matters=False)  # of a comparison
-
-    @property
-    def width(self) -> int | None:
-        """In pixels."""
-        return None if self.resolution is None else self.resolution[0]
-
-    @property
-    def height(self) -> int | None:
-        """In pixels."""
-        return None if self.resolution is None else self.resolution[1]
 
 
 @dataclass(frozen=True)
@@ -323,71 +315,40 @@ class BakeOptions:
     scene: Path = _scene("left out when Blender has a file open")
     output: Path = _output()
     objects: tuple[str, ...] | str = option(  # names, "selected" or "all"
-        argument("--object", action="append", metavar="NAME", help="may be given several times; default: --all"),
-        argument(
-            "--selected", action="store_const", const="selected", help="the objects that are selected in the file"
-        ),
-        argument("--all", action="store_const", const="all", help="all meshes that render"),
         default="all",
         matters=False,
+        either=(
+            argument("--object", action="append", metavar="NAME", help="may be given several times; default: --all"),
+            argument(
+                "--selected", action="store_const", const="selected", help="the objects that are selected in the file"
+            ),
+            argument("--all", action="store_const", const="all", help="all meshes that render"),
+        ),
     )
-    uv: str | None = option(argument("--uv", metavar="NAME", help="UV map; default: the active one"), default=None)
+    uv: str | None = option("--uv", default=None, metavar="NAME", help="UV map; default: the active one")
     size: tuple[int, int] = option(
-        argument("--size", parse=size, metavar="N", help="N or WxH in texels (default: 1024)"), default=(1024, 1024)
+        "--size", default=(1024, 1024), type=size, metavar="N", help="N or WxH in texels (default: 1024)"
     )
-    margin: int = option(
-        argument("--margin", parse=margin, metavar="PX", help="in texels (default: %(default)s)"), default=16
-    )
+    margin: int = option("--margin", default=16, type=margin, metavar="PX", help="in texels (default: %(default)s)")
     margin_type: str = option(
-        argument(
-            "--margin-type",
-            choices=MARGIN_TYPES,
-            help="the margin repeats the nearest texel, or shows the adjacent face (default: %(default)s)",
-        ),
-        default="extend",
-    )
-    conservative: bool = option(
-        argument("--conservative", action="store_true", help="bake every texel that a face touches"), default=False
-    )
+        "--margin-type", default="extend", choices=MARGIN_TYPES,
+        help="the margin repeats the nearest texel, or shows the adjacent face (default: %(default)s)",
+    )  # fmt: skip
+    conservative: bool = flag("--conservative", "bake every texel that a face touches")
     view: tuple[float, float, float] | str = option(
-        argument(
-            "--view",
-            parse=view,
-            metavar="V",
-            help="camera, above (along the normals) or a position X,Y,Z in m (default: %(default)s)",
-        ),
-        default="camera",
-    )
+        "--view", default="camera", type=view, metavar="V",
+        help="camera, above (along the normals) or a position X,Y,Z in m (default: %(default)s)",
+    )  # fmt: skip
     techniques: tuple[str, ...] = _techniques(("ltsh4",))
-    passes: tuple[str, ...] = _passes_field(BAKE_PASSES, bake_passes, ",".join(PASSES))
+    passes: tuple[str, ...] = _passes_of(BAKE_PASSES, bake_passes, ",".join(PASSES))
     frame: int | None = _frame()
     camera: str | None = _camera()
     name: str | None = _stem(bake_name)  # of the file of the only object, without suffix, below `output`
-    error: bool = option(
-        argument("--error", action="store_true", help="beside Cycles' bake: signed errors, also as pictures"),
-        default=False,
-    )
+    error: bool = flag("--error", "beside Cycles' bake: signed errors, also as pictures")
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
-    apply: bool = option(
-        argument(
-            "--apply",
-            action="store_true",
-            help="also a texture of each object, and a copy of the .blend whose materials show it",
-        ),
-        default=False,
-    )
+    apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
-
-    @property
-    def width(self) -> int:
-        """In texels."""
-        return self.size[0]
-
-    @property
-    def height(self) -> int:
-        """In texels."""
-        return self.size[1]
 
 
 # -- what follows from the declarations -----------------------------------------------------------------------------

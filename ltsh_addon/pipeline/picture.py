@@ -133,10 +133,10 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
     start = time.perf_counter()
     tables = prepare(options)
-    extraction = client.extract(
-        child_job(client.ExtractOptions, options, cycles_samples=options.cycles_samples if with_cycles else 0),
-        progress=progress,
-    )
+    width, height = options.resolution or (None, None)
+    samples = options.cycles_samples if with_cycles else 0
+    job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples)
+    extraction = client.extract(job, progress=progress)
     results = {name: _evaluate(name, table, extraction, options, progress) for name, table in tables.items()}
 
     comparison = Comparison(options, extraction, results)

@@ -1,0 +1,81 @@
+"""Options are declared once: the command line, job files, digests and the second Blender's job follow."""
+
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from ltsh_addon.blender.process import client
+from ltsh_addon.cli import commands, job_file
+from ltsh_addon.pipeline import BakeOptions, PictureOptions
+from ltsh_addon.pipeline.options import arguments_of, child_job, command_line, what_matters
+
+SCENE, OUT = Path("room.blend"), Path("out")
+# A value that is not the default, for every option but scene and output.
+PICTURE = {
+    "techniques": ("ltc", "mine.npz"), "passes": ("diffuse",), "resolution": (640, 360), "sub_samples": 4,
+    "reference_samples": 7, "cycles_samples": 32, "scripts": True,
+}  # fmt: skip
+BAKE = {
+    "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "margin": 3, "margin_type": "adjacent",
+    "conservative": True, "view": (-1.0, 2.5, 0.0), "techniques": ("reference",), "passes": ("diffuse_light",),
+    "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
+}  # fmt: skip
+OF_A_TASK = {"scene", "output", "frame", "camera", "name"}
+KINDS = pytest.mark.parametrize(
+    ("command", "kind", "values"), [("compare", PictureOptions, PICTURE), ("bake", BakeOptions, BAKE)]
+)
+
+
+def parsed(command, words):
+    parser = commands.job_parsers()[command]
+    return commands.job_of(parser.parse_args(words), (SCENE,)).options
+
+
+@KINDS
+def test_the_command_line_gives_every_option_back(command, kind, values):
+    assert set(values) == set(arguments_of(kind)) - OF_A_TASK
+    plain = kind(SCENE, OUT)
+    assert parsed(command, command_line(plain)) == plain and len(command_line(plain)) == 3
+    for wanted in (kind(SCENE, OUT, **values), *(replace(plain, **{name: value}) for name, value in values.items())):
+        assert parsed(command, command_line(wanted)) == wanted
+
+
+@pytest.mark.parametrize("objects", ["selected", "all"])
+def test_objects_may_be_chosen_without_names(objects):
+    assert parsed("bake", command_line(BakeOptions(SCENE, OUT, objects=objects))).objects == objects
+
+
+@KINDS
+def test_job_files_have_the_options_of_the_command_line(command, kind, values):
+    declared = {flag.lstrip("-") for _, arguments in arguments_of(kind).values() for item in arguments
+                for flag in item.flags} - {"scenes", "o"}  # fmt: skip
+    baseline = {"baseline", "tolerance"} if command == "compare" else set()
+    assert set(job_file._options(commands.job_parsers()[command])) == declared | baseline
+
+
+@KINDS
+def test_a_digest_holds_what_results_depend_on(command, kind, values):
+    plain = kind(SCENE, OUT)
+    for name, value in values.items():
+        changed = what_matters(replace(plain, **{name: value})) != what_matters(plain)
+        assert changed is (name != "objects"), name  # each object is a task of its own
+    for name in ("scene", "output"):
+        assert what_matters(replace(plain, **{name: Path("other")})) == what_matters(plain)
+
+
+def test_the_second_blender_gets_the_options_that_it_knows():
+    options = PictureOptions(SCENE, OUT, camera="Side", frame=3, **PICTURE)
+    job = child_job(client.ExtractOptions, options, width=1, cycles_samples=0)
+    assert (job.scene, job.camera, job.frame, job.sub_samples, job.scripts) == (SCENE, "Side", 3, 4, True)
+    assert (job.width, job.cycles_samples) == (1, 0)
+    shared = {item.name for item in fields(PictureOptions)} & {item.name for item in fields(client.ExtractOptions)}
+    assert shared == {"scene", "camera", "frame", "sub_samples", "cycles_samples", "scripts"}
+
+
+def test_the_public_names_need_no_blender_to_be_imported():
+    code = "import sys, ltsh_addon.pipeline as p; print(sorted(p.__all__), {'bpy', 'OpenEXR'} & set(sys.modules))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "compare_scene" in found and found.rstrip().endswith("set()")

@@ -34,7 +34,8 @@ class RunLog:
 
 
 BAR_WIDTH = 28
-LOG_INTERVAL = 10.0  # seconds
+# Seconds between two drawings of the bar, and between two lines of a log that tell that a long stage goes on.
+BAR_INTERVAL, LOG_INTERVAL = 0.1, 10.0
 
 
 class ProgressBar:
@@ -61,7 +62,7 @@ class ProgressBar:
             return True
         now = time.monotonic()
         if self._tasks > 1:
-            if self._terminal and now - self._last_shown > 0.1:
+            if self._terminal and now - self._last_shown > BAR_INTERVAL:
                 self._last_shown = now
                 self._draw(f"{self._task} of {self._tasks} {stage}", (self._task - 1) / self._tasks, now)
             return True
@@ -71,14 +72,12 @@ class ProgressBar:
             self.finish()
             self._stage, self._stage_start, self._last_shown = stage, now, -1e9
         self._fraction = fraction
-        ended = fraction >= 1.0
-        if self._terminal:
-            if ended or now - self._last_shown > 0.1:
-                self._last_shown = now
-                self._draw(stage, fraction, now)
-        elif ended or now - self._last_shown > LOG_INTERVAL:
+        if fraction >= 1.0 or now - self._last_shown > (BAR_INTERVAL if self._terminal else LOG_INTERVAL):
             self._last_shown = now
-            print(f"{stage}: {100.0 * fraction:.0f} % {self._remaining(fraction, now)}".rstrip(), file=self._stream)
+            if self._terminal:
+                self._draw(stage, fraction, now)
+            else:
+                print(f"{stage}: {100.0 * fraction:.0f} % {self._remaining(fraction, now)}".rstrip(), file=self._stream)
         return True
 
     def begin_job(self, label: str) -> None:

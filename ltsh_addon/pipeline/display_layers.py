@@ -11,6 +11,7 @@ from ..imaging.exr import write_channels
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES
+from .picture import against_cycles
 
 FOLDER = "images"
 ERROR = "error_"
@@ -112,18 +113,14 @@ def _figures(layers, names, passes, report) -> dict:
 
 
 def _measured(layers, names, pass_name) -> dict:
-    halves = [layers[f"cycles_{half}.{pass_name}"] for half in "AB"]
-    hit, mean = layers["coverage.hit"] > 0.0, layers[f"{CYCLES}.{pass_name}"]
-    rows = {}
+    halves = np.stack([layers[f"cycles_{half}.{pass_name}"] for half in "AB"])
+    hit, rows = layers["coverage.hit"] > 0.0, {}
     for name in names:
-        if name == CYCLES:
-            continue
-        picture = layers[f"{name}.{pass_name}"]
-        # The reference may stand for a part of the pixels only, the others are black.
-        mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
-        statistics = imaging.noisy_error_statistics(picture, *halves, mask).to_dict()
-        flip = imaging.mean_flip(mean, np.where(mask[..., None], picture, mean), mask)
-        rows[name] = {**statistics, "flip": flip}
+        if name != CYCLES:
+            picture = layers[f"{name}.{pass_name}"]
+            # The reference may stand for a part of the pixels only, the others are black.
+            mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
+            rows[name] = against_cycles(picture, halves, mask)
     return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
 
 

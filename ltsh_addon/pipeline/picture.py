@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import imaging, shading
+from ..files import check_takes_files
 from ..scene import REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, Film, Progress, SurfaceSamples
 from .options import PictureOptions, child_job
 
@@ -61,48 +62,39 @@ def compare_scene(options: PictureOptions, progress: Progress | None = None) -> 
 
 
 def _with_report(options, with_cycles, progress):
-    from .. import imaging
-
     picture = make_picture(options, with_cycles, progress)
     imaging.write_json(Path(options.output) / "report.json", picture.report)
     imaging.write_json(Path(options.output) / "timing.json", {"seconds": picture.seconds})
     return {**picture.report, "seconds": picture.seconds}
 
 
-def prepare(options: PictureOptions) -> dict[str, str | shading.LookupTable]:
+def prepare(options) -> dict[str, str | shading.LookupTable]:
     """Tables by the names under which techniques appear in results; proves that the output folder takes files.
 
     Done before anything takes long. Raises TableError, OSError.
     """
     tables = load_tables(options.techniques)
-    _make_writable(Path(options.output))
-    return tables
-
-
-def _make_writable(path: Path) -> None:
-    """Make the output folder and prove that it takes files."""
-    from ..files import check_takes_files
-
     try:
-        check_takes_files(path)
+        check_takes_files(Path(options.output))
     except OSError as error:
-        raise OSError(f"output folder {path}: cannot be written ({error.strerror}); choose another with -o") from error
+        problem = f"cannot be written ({error.strerror}); choose another with -o"
+        raise OSError(f"output folder {options.output}: {problem}") from error
+    return tables
 
 
 def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
     """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
-    names = technique_names(techniques)
-    return {name: given if given == REFERENCE else _table(given) for name, given in names.items()}
+    return {name: _table(given) for name, given in technique_names(techniques).items()}
 
 
-def _table(given: str) -> shading.LookupTable:
+def _table(given: str) -> str | shading.LookupTable:
+    if given == REFERENCE:
+        return given
+    # A job of many frames needs the shipped ones for each; a table of the user may change meanwhile.
     return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
 
 
-@cache
-def _shipped_table(name: str) -> shading.LookupTable:
-    """Read once: a job of many frames needs it for each."""
-    return shading.load_table(name)
+_shipped_table = cache(shading.load_table)
 
 
 def technique_names(techniques: Sequence[str]) -> dict[str, str]:
@@ -318,15 +310,8 @@ class Comparison:
         result = self.results[name]
         report = {}
         if self.cycles:
-            halves = self.cycles[pass_name]
-            statistics = imaging.noisy_error_statistics(
-                self.images[name, pass_name], halves[0], halves[1], self._mask(result)
-            )
-            # Only pixels that the technique has shaded may differ.
-            shaded = np.where(self._mask(result)[..., None], self.images[name, pass_name], halves.mean(axis=0))
-            rec709, mask = self.extraction.color_space.rec709, self._mask(result)
-            difference = imaging.mean_flip(rec709(halves.mean(axis=0)), rec709(shaded), mask)
-            report["against_cycles"] = {**statistics.to_dict(), "flip": difference}
+            image, rec709 = self.images[name, pass_name], self.extraction.color_space.rec709
+            report["against_cycles"] = against_cycles(image, self.cycles[pass_name], self._mask(result), rec709)
         reference = self.results.get(REFERENCE)
         if reference is not None and name != REFERENCE:
             report["against_reference"] = self._against_reference(result, reference, pass_name)
@@ -424,6 +409,13 @@ class Comparison:
         if notice := self._subset_notice():
             notes.append(notice)
         return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
+
+
+def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:
+    """Figures of an image (H, W, 3) beside the halves (2, H, W, 3) of Cycles, where `mask` (H, W) says it is shaded."""
+    statistics, mean = imaging.noisy_error_statistics(image, *halves, mask), halves.mean(axis=0)
+    shaded = np.where(mask[..., None], image, mean)
+    return {**statistics.to_dict(), "flip": imaging.mean_flip(rec709(mean), rec709(shaded), mask)}
 
 
 def _group_names(groups) -> list[str]:

@@ -47,37 +47,21 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         name="Mode", description="One technique or two", items=MODES, default="single", update=_redraw
     )
     second_technique: bpy.props.EnumProperty(
-        name="Second",
-        description="What the technique is put beside",
-        items=SECOND_ITEMS,
-        default="ltc",
-        update=_redraw,
+        name="Second", description="What the technique is put beside", items=SECOND_ITEMS, default="ltc", update=_redraw
     )
     split_position: bpy.props.FloatProperty(
-        name="Split",
-        description="Where the line stands between the left edge and the right one",
-        min=0.0,
-        max=1.0,
-        default=0.5,
-        subtype="FACTOR",
-        update=_redraw,
-    )
+        name="Split", description="Where the line stands between the left edge and the right one",
+        min=0.0, max=1.0, default=0.5, subtype="FACTOR", update=_redraw,
+    )  # fmt: skip
     difference_scale: bpy.props.FloatProperty(
-        name="Scale",
-        description="Difference of radiance that gets the full color",
-        min=1e-4,
-        soft_max=10.0,
-        default=0.25,
-        precision=3,
-        update=_redraw,
-    )
+        name="Scale", description="Difference of radiance that gets the full color",
+        min=1e-4, soft_max=10.0, default=0.25, precision=3, update=_redraw,
+    )  # fmt: skip
     render_samples: bpy.props.IntProperty(
         name="Render Samples",
         description="Points per pixel of final renders, drawn from the pixel filter; 1 takes pixel centers",
-        min=1,
-        soft_max=64,
-        default=4,
-    )
+        min=1, soft_max=64, default=4,
+    )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
         name="Passes of All Techniques",
         description="Final renders also have a specular and a diffuse pass of every technique",

@@ -16,6 +16,7 @@ from ...scene import error_line
 from ..extract.bake import ObjectError, check_object
 from ..lights.emission import emission_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
+from .preview import view_of
 
 
 @functools.cache
@@ -51,7 +52,8 @@ class Problem:
 def problems(context, command: str) -> list[Problem]:
     """What stands in the way of "shade", "compare" or "bake" (`blocks`), and what is good to know."""
     scene, settings = context.scene, context.scene.ltsh
-    found = _packages()
+    missing = missing_libraries()
+    found = [Problem(missing)] if missing else []
     if not settings.techniques:
         found.append(Problem("No technique is chosen: choose at least one"))
     if not (settings.bake_passes if command == "bake" else settings.passes):
@@ -116,11 +118,6 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
 
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
-
-
-def _packages() -> list[Problem]:
-    missing = missing_libraries()
-    return [Problem(missing)] if missing else []
 
 
 def _camera(scene) -> list[Problem]:
@@ -198,9 +195,9 @@ class LTSH_OT_add_camera(bpy.types.Operator):
         camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
         context.collection.objects.link(camera)
         context.scene.camera = camera
-        view = _viewport(context)
+        view = view_of(context)
         if view is not None:
-            camera.matrix_world = view.view_matrix.inverted()
+            camera.matrix_world = view.region_3d.view_matrix.inverted()
         else:
             camera.location, camera.rotation_euler = (0.0, -6.0, 3.0), (math.radians(65.0), 0.0, 0.0)
         return {"FINISHED"}
@@ -313,15 +310,6 @@ class LTSH_OT_pack_image(bpy.types.Operator):
             return {"CANCELLED"}
         image.pack()
         return {"FINISHED"}
-
-
-def _viewport(context):
-    """The view of some 3D viewport of the window, None where there is none."""
-    screen = context.screen or (context.window.screen if context.window else None)
-    for area in screen.areas if screen is not None else ():
-        if area.type == "VIEW_3D":
-            return area.spaces.active.region_3d
-    return None
 
 
 CLASSES = (

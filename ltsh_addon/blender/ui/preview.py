@@ -34,7 +34,7 @@ class LTSH_OT_preview(bpy.types.Operator):
         if is_previewing(scene):
             stop_preview(scene)
             return {"FINISHED"}
-        space = _view(context)
+        space = view_of(context)
         if scene.render.engine != ENGINE:
             if space is not None:
                 _lent_views[space.as_pointer()] = (scene.session_uid, space.shading.type)
@@ -50,11 +50,11 @@ class LTSH_OT_preview(bpy.types.Operator):
 _lent_views: dict[int, tuple[int, str]] = {}
 
 
-def _view(context):
+def view_of(context):
     """The 3D view of `context`, or the window's first one."""
     space = context.space_data
     if space is None or space.type != "VIEW_3D":
-        screen = context.screen
+        screen = context.screen or (context.window.screen if context.window else None)
         areas = screen.areas if screen is not None else ()
         space = next((area.spaces.active for area in areas if area.type == "VIEW_3D"), None)
     return space

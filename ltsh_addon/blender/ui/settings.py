@@ -80,8 +80,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
         subtype="DIR_PATH", default="",
     )  # fmt: skip
     log_level: bpy.props.EnumProperty(
-        name="Log",
-        description="What the add-on writes to the console that Blender was started from",
+        name="Log", description="What the add-on writes to the console that Blender was started from",
         items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=lambda self, context: apply(context),
     )  # fmt: skip
 
@@ -157,42 +156,26 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     techniques: EnumProperty(
         name="Techniques",
         description="How the glossy lobe is integrated over the lights. Shift-click to choose several",
-        items=TECHNIQUE_ITEMS,
-        options={"ENUM_FLAG"},
-        default={"ltc", "ltsh4"},
-    )
+        items=TECHNIQUE_ITEMS, options={"ENUM_FLAG"}, default={"ltc", "ltsh4"},
+    )  # fmt: skip
     passes: EnumProperty(
-        name="Passes",
-        description="Parts of the reflected light. Shift-click to choose several",
-        items=PASS_ITEMS,
-        options={"ENUM_FLAG"},
-        default={"specular", "diffuse"},
-    )
+        name="Passes", description="Parts of the reflected light. Shift-click to choose several",
+        items=PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
+    )  # fmt: skip
     resolution_percentage: IntProperty(
-        name="Resolution",
-        description="Percentage of the scene's render resolution",
-        subtype="PERCENTAGE",
-        min=1,
-        max=400,
-        soft_max=100,
-        default=100,
-    )
+        name="Resolution", description="Percentage of the scene's render resolution",
+        subtype="PERCENTAGE", min=1, max=400, soft_max=100, default=100,
+    )  # fmt: skip
     anti_aliasing: IntProperty(
         name="Anti-Aliasing",
         description="Points per pixel, drawn from the scene's pixel filter; 1 takes the centers of pixels",
-        min=1,
-        max=256,
-        soft_max=64,
-        default=1,
-    )
+        min=1, max=256, soft_max=64, default=1,
+    )  # fmt: skip
     cycles_samples: IntProperty(
         name="Cycles Samples",
         description="Samples per pixel of the Cycles reference; its noise falls with their square root",
-        min=2,
-        max=1 << 20,
-        soft_max=8192,
-        default=256,
-    )
+        min=2, max=1 << 20, soft_max=8192, default=256,
+    )  # fmt: skip
     output_folder: StringProperty(
         name="Output",
         description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
@@ -203,37 +186,26 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )
     bake_size: EnumProperty(name="Size", description="Texels on each side of the texture", items=SIZES, default="1024")
     bake_margin: IntProperty(
-        name="Margin",
-        description="How far colors go on beyond the borders of UV islands, in texels",
-        subtype="PIXEL",
-        min=0,
-        max=256,
-        soft_max=64,
-        default=16,
-    )
+        name="Margin", description="How far colors go on beyond the borders of UV islands, in texels",
+        subtype="PIXEL", min=0, max=256, soft_max=64, default=16,
+    )  # fmt: skip
     bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
     bake_uv_map: StringProperty(
         name="UV Map",
         description="Name of the UV map to bake into; empty for the one that is active for rendering",
     )
     bake_passes: EnumProperty(
-        name="Bake Passes",
-        description="Parts of the reflected light. Shift-click to choose several",
-        items=BAKE_PASS_ITEMS,
-        options={"ENUM_FLAG"},
-        default={"specular", "diffuse"},
-    )
+        name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",
+        items=BAKE_PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
+    )  # fmt: skip
     bake_error: BoolProperty(
-        name="Compare with Cycles",
-        description="Bake the same texels with Cycles too and measure the signed error",
+        name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
-    )
+    )  # fmt: skip
     result_folder: StringProperty(
-        name="Results",
-        description="Folder of the pictures that are shown",
-        subtype="DIR_PATH",
-        options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
-    )
+        name="Results", description="Folder of the pictures that are shown",
+        subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
+    )  # fmt: skip
     # -- what the Image Editor shows of it ----------------------------------------------------------------------------
     mode: EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
@@ -241,48 +213,29 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     groups: CollectionProperty(type=bpy.types.PropertyGroup)
     group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
     first: EnumProperty(
-        name="A",
-        description="The first picture, left of the line",
-        items=PICTURE_ITEMS,
-        default="ltsh4",
-        update=changed,
-    )
+        name="A", description="The first picture, left of the line",
+        items=PICTURE_ITEMS, default="ltsh4", update=changed,
+    )  # fmt: skip
     second: EnumProperty(
-        name="B",
-        description="The second picture, right of the line",
-        items=PICTURE_ITEMS,
-        default=CYCLES,
-        update=changed,
-    )
+        name="B", description="The second picture, right of the line",
+        items=PICTURE_ITEMS, default=CYCLES, update=changed,
+    )  # fmt: skip
     pass_name: EnumProperty(
         name="Pass", description="Which part of the light is shown", items=BAKE_PASS_ITEMS, default="combined",
         update=changed,
     )  # fmt: skip
     split: FloatProperty(
-        name="Split",
-        description="Where the line between the two pictures is; it can also be dragged in the image",
-        subtype="FACTOR",
-        min=0.0,
-        max=1.0,
-        default=0.5,
-        update=changed,
-    )
+        name="Split", description="Where the line between the two pictures is; it can also be dragged in the image",
+        subtype="FACTOR", min=0.0, max=1.0, default=0.5, update=changed,
+    )  # fmt: skip
     error_scale: FloatProperty(
-        name="Scale",
-        description="Difference in radiance at which the colors end; 0 takes the one of the report",
-        min=0.0,
-        soft_max=10.0,
-        precision=4,
-        default=0.0,
-        update=changed,
-    )
+        name="Scale", description="Difference in radiance at which the colors end; 0 takes the one of the report",
+        min=0.0, soft_max=10.0, precision=4, default=0.0, update=changed,
+    )  # fmt: skip
     probe: FloatVectorProperty(
-        name="Probe",
-        description="Where the pixel probe was last, from the lower left corner",
-        size=2,
-        default=(0.5, 0.5),
-        options={"HIDDEN"},
-    )
+        name="Probe", description="Where the pixel probe was last, from the lower left corner",
+        size=2, default=(0.5, 0.5), options={"HIDDEN"},
+    )  # fmt: skip
 
 
 SUBFOLDER = "ltsh"

@@ -54,21 +54,31 @@ SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
 REFERENCE_POINTS = 0.15
 
 
-def runs(context, command: str, scene_file: Path) -> list[dict]:
-    """The command lines of a job (see `panel_job.perform`)."""
+@dataclass(frozen=True)
+class Run:
+    """One command of a job; `partial` says what its pictures lack, where a later one of the job has more."""
+
+    command: str
+    options: PictureOptions | BakeOptions
+    partial: str = ""
+
+    def to_dict(self) -> dict:
+        """As `panel_job.perform` takes it."""
+        arguments = [self.command, *command_line(self.options)]
+        return {"arguments": arguments, "output": str(self.options.output), "partial": self.partial}
+
+
+def runs_of(context, command: str, scene_file: Path) -> list[Run]:
+    """The commands of a job."""
     if command == "bake":
-        return [_run(command, bake_options(context, scene_file))]
+        return [Run(command, bake_options(context, scene_file))]
     wanted = picture_options(context.scene, command, scene_file)
-    if command == "shade":
-        return [_run(command, wanted)]
-    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
     first = tuple(name for name in wanted.techniques if name != REFERENCE)
+    if command == "shade" or not first:
+        return [Run(command, wanted)]
+    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
     early = replace(picture_options(context.scene, "shade", scene_file), techniques=first)
-    return [*([_run("shade", early, NO_CYCLES)] if first else []), _run(command, wanted)]
-
-
-def _run(command: str, options, partial: str = "") -> dict:
-    return {"arguments": [command, *command_line(options)], "output": str(options.output), "partial": partial}
+    return [Run("shade", early, NO_CYCLES), Run(command, wanted)]
 
 
 def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
@@ -132,43 +142,36 @@ class Step:
     cost: float
 
 
-def steps(context, command: str) -> list[Step]:
+def steps(runs: list[Run]) -> list[Step]:
     """What a job goes through, in order."""
-    starting = Step(STARTING, START_SECONDS)
-    if command == "bake":
-        return [starting, *_bake(context)]
-    names = chosen(context.scene.ltsh, "techniques")
-    if command == "shade":
-        return [starting, *_picture(context.scene, names, False)]
-    first = [name for name in names if name != REFERENCE]
-    early = _picture(context.scene, first, False) if first else []
-    return [starting, *early, *_picture(context.scene, names, True)]
+    found = [Step(STARTING, START_SECONDS)]
+    for run in runs:
+        found += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
+    return found
 
 
-def _picture(scene, techniques: list[str], with_cycles: bool) -> list[Step]:
-    settings, (width, height) = scene.ltsh, preflight.picture_of(scene)
-    pixels, points = 1e-6 * width * height, 1e-6 * width * height * settings.anti_aliasing
-    rendered = RENDER_SECONDS * settings.anti_aliasing
-    half = Step("", rendered + SAMPLE_SECONDS * pixels * max(settings.cycles_samples // 2, settings.anti_aliasing))
+def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
+    pixels = 1e-6 * math.prod(options.resolution)
+    points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
+    half = rendered + SAMPLE_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
     return [
         Step("open scene", OPEN_SECONDS),
         Step("samples", rendered + SAMPLE_SECONDS * points),
-        *(Step(f"Cycles {name}", half.cost) for name in ("A", "B") if with_cycles),
-        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques),
+        *(Step(f"Cycles {name}", half) for name in ("A", "B") if with_cycles),
+        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in options.techniques),
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
     ]
 
 
-def _bake(context) -> list[Step]:
-    settings = context.scene.ltsh
-    texels = 1e-6 * int(settings.bake_size) ** 2
-    samples = settings.cycles_samples * len(settings.bake_passes) if settings.bake_error else 1
-    shading = sum(_shading(name, texels) for name in chosen(settings, "techniques"))
+def _bake(options: BakeOptions) -> list[Step]:
+    texels = 1e-6 * math.prod(options.size)
+    samples = options.cycles_samples * len(options.passes) if options.error else 1
+    shading = sum(_shading(name, texels) for name in options.techniques)
     found = [Step("open scene", OPEN_SECONDS)]
-    for ob in preflight.bake_objects(context)[0]:
-        found.append(Step(f"bake {ob.name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
-        found.append(Step(f"shade {ob.name}", shading + FILE_SECONDS * texels))
+    for name in options.objects:
+        found.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
+        found.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
     return [*found, Step("images", FILE_SECONDS * texels * len(found))]
 
 
@@ -262,8 +265,10 @@ class Job:
     started: float = field(default_factory=time.monotonic)
 
     def start(self, runs: list[dict], *, background: bool) -> None:
-        """Start the process on command lines (see `panel_job.perform`); one in the `background` comes after this one.
-        Raises SceneError and OSError."""
+        """Start the process on `Run`s as dictionaries; in the `background` this process comes first.
+
+        Raises SceneError and OSError.
+        """
         job = self.folder / "job.json"
         document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")

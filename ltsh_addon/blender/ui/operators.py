@@ -12,8 +12,7 @@ from bpy.app.translations import pgettext_iface as translated
 from ...scene import SceneError, error_line
 from ..saving import save_working_copy
 from . import comparison, preflight, results
-from . import job as job_module
-from .job import Job, Plan, clock, new_folder, output_folder, progress_text, stage_title, steps
+from .job import Job, Plan, clock, new_folder, progress_text, runs_of, stage_title, steps
 
 
 def save_scene_copy(path: Path) -> None:
@@ -110,14 +109,13 @@ class _JobOperator:
             self.report({"ERROR"}, reason)
             return False
         folder = new_folder()
-        plan = Plan(steps(context, self.command))
-        job = Job(self.bl_label, plan, folder, self.command, context.scene.session_uid)
+        copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
+        runs = runs_of(context, self.command, copy)
+        job = Job(self.bl_label, Plan(steps(runs)), folder, self.command, context.scene.session_uid)
+        job.output = runs[-1].options.output
         try:
-            copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
             save_scene_copy(copy)
-            job.output = output_folder(context.scene, self.command)
-            runs = job_module.runs(context, self.command, copy)
-            job.start(runs, background=not bpy.app.background)
+            job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
             self.report({"ERROR"}, error_line(error))

@@ -117,7 +117,7 @@ def test_opening_another_file_ends_the_job(never_ends, tmp_path):
 @pytest.mark.parametrize("end", ["killed", "quit"])
 def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends, tmp_path, end):
     """The job belongs to another process here, which stands for that Blender."""
-    runs = job_module.runs(bpy.context, "compare", tmp_path / "room.blend")
+    runs = [run.to_dict() for run in job_module.runs_of(bpy.context, "compare", tmp_path / "room.blend")]
     command = programs.python(OWNER.format(runs=json.dumps(runs), end=end))
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True) as owner:
         line = next(line for line in owner.stdout if line.startswith("OWNER "))

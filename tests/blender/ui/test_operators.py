@@ -35,7 +35,7 @@ def reported(monkeypatch):
 
 
 def planned(command):
-    return [step.stage for step in job.steps(bpy.context, command)]
+    return [step.stage for step in job.steps(job.runs_of(bpy.context, command, Path("room.blend")))]
 
 
 def command_line(*arguments):

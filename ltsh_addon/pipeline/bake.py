@@ -97,7 +97,7 @@ def _check(options: BakeOptions) -> None:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
 
 
-def _job(options, finished, tile, following):
+def _job(options, finished, tile=None, following=()):
     from ..blender.process import client
 
     return child_job(
@@ -214,12 +214,15 @@ class ObjectBaker:
             return first, texels, *self._block(tile, first, texels)
 
         firsts = range(0, height, rows)
-        for number, (first, texels, values, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
+        for number, (first, texels, layers, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
             covered += len(texels.index)
             covers += texels.covers
             overlaps += texels.overlaps
-            planes.put(first, min(rows, height - first), texels, values)
-            self._sum_up(errors, values, halves)
+            planes.put(first, min(rows, height - first), texels, _channels(layers))
+            for pass_name, (a, b) in halves.items():
+                errors.add_halves(pass_name, a, b)
+                for name in self.tables:
+                    errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
             share = (number + 1) / len(firsts)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
@@ -241,7 +244,7 @@ class ObjectBaker:
         return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
 
     def _block(self, tile, first, texels) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Values (Q,) of the channels at the texels (Q) of a block, and Cycles' halves (2, Q, 3) by pass."""
+        """Layers (Q, 3) at the texels (Q) of a block, and Cycles' halves (2, Q, 3) by pass."""
         maps = None
         if self.record["maps"]:
             maps = np.load(self.folder / f"maps_{tile}_{first}.npy")
@@ -251,44 +254,29 @@ class ObjectBaker:
 
         receiver = self.record["receiver"]
         samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
-        values = {}
+        layers = {}
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table).items():
-                groups = [("", radiance.sum(axis=0))]
+                layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
                 if len(self.groups) > 1:
-                    groups += [
-                        (f"@{group or 'ungrouped'}", part) for group, part in zip(self.groups, radiance, strict=True)
-                    ]
-                for suffix, image in groups:
-                    _put(values, f"{name}.{pass_name}{suffix}", image)
-        return values, self._compare(tile, first, texels, values)
+                    for group, part in zip(self.groups, radiance, strict=True):
+                        layers[f"{name}.{pass_name}@{group or 'ungrouped'}"] = part
+        halves = self._halves(tile, first, texels)
+        for pass_name, (a, b) in halves.items():
+            mean = 0.5 * (a + b)
+            layers |= {f"cycles.{pass_name}": mean, f"cycles_A.{pass_name}": a, f"cycles_B.{pass_name}": b}
+            layers |= {f"error_{name}.{pass_name}": layers[f"{name}.{pass_name}"] - mean for name in self.tables}
+        return layers, halves
 
-    def _compare(self, tile, first, texels, values) -> dict[str, np.ndarray]:
-        """Add Cycles' bake of the same texels, and what the techniques have more than it; the halves."""
+    def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
+        """Cycles' bake of the texels by compared pass: two independent halves (2, Q, 3)."""
         halves = {}
         for pass_name in shaded_passes(self.options) if self.compared else ():
             baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
             halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
         if "combined" in self.compared:
             halves["combined"] = halves["specular"] + halves["diffuse"]
-        for pass_name in self.compared:
-            a, b = halves[pass_name]
-            mean = 0.5 * (a + b)
-            for image, pixels in (("cycles", mean), ("cycles_A", a), ("cycles_B", b)):
-                _put(values, f"{image}.{pass_name}", pixels)
-            for name in self.tables:
-                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
-                _put(values, f"error_{name}.{pass_name}", shaded - mean)
-
-        return halves
-
-    def _sum_up(self, errors, values, halves) -> None:
-        """Add a block to the sums that errors follow from."""
-        for pass_name in self.compared:
-            errors.add_halves(pass_name, *halves[pass_name])
-            for name in self.tables:
-                shaded = np.stack([values[f"{name}.{pass_name}.{letter}"] for letter in "RGB"], axis=-1)
-                errors.add(name, pass_name, shaded, *halves[pass_name])
+        return {name: halves[name] for name in self.compared}
 
     def _passes(self, samples: SurfaceSamples, texel, count, table) -> dict[str, np.ndarray]:
         """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
@@ -346,10 +334,9 @@ def _in_order(function, items, threads: int):
                 future.cancel()
 
 
-def _put(values: dict, layer: str, pixels) -> None:
-    """Add the channels of a layer (Q, 3)."""
-    for channel, letter in enumerate("RGB"):
-        values[f"{layer}.{letter}"] = pixels[:, channel]
+def _channels(layers) -> dict[str, np.ndarray]:
+    """Values (Q,) by the names of channels, of layers (Q, 3)."""
+    return {f"{name}.{letter}": pixels[:, n] for name, pixels in layers.items() for n, letter in enumerate("RGB")}
 
 
 def _summed(radiance, texel, count):

@@ -78,7 +78,7 @@ OPERATIONS = {
     "shade": (lambda path: shade_scene(options(path)), None),
     "compare": (lambda path: compare_scene(options(path)), None),
     "another frame, camera and size": (
-        lambda path: shade_scene(options(path, frame=9, camera="Camera", width=20, height=12)),
+        lambda path: shade_scene(options(path, frame=9, camera="Camera", resolution=(20, 12))),
         None,
     ),
     "command line": (run_command, None),

@@ -28,7 +28,7 @@ from .arguments import (
     scenes_of,
     with_examples,
 )
-from .job_file import Wanted, read_jobs
+from .job_file import FileJob, read_jobs
 from .output import baseline_of, do_job, merge_job, print_json
 from .progress import say
 
@@ -225,7 +225,7 @@ def job_parsers() -> dict[str, argparse.ArgumentParser]:
     return found
 
 
-def _for_each(jobs: list[Wanted], do, arguments, bar) -> int:
+def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
     """Call do(job, settings, baseline) for every job; what is wrong with one does not keep the others from it."""
     baselines = [baseline_of(wanted.arguments) for wanted in jobs]
     documents, worst = [], 0

@@ -23,7 +23,7 @@ JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], Job]
 
 
 @dataclass(frozen=True)
-class Wanted:
+class FileJob:
     """One job of a file: the job, and its options as of a command line."""
 
     job: Job
@@ -41,7 +41,7 @@ class Mistakes(Misuse):
         self.lines, self.of_the_world = lines, of_the_world
 
 
-def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: JobOf) -> list[Wanted]:
+def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: JobOf) -> list[FileJob]:
     """The jobs of a file, by the parsers of commands and what makes a job of parsed arguments and scenes.
 
     Raises Mistakes with all that is wrong in the file, OSError where it cannot be read.
@@ -70,7 +70,7 @@ class _Reader:
         self.mistakes: list[str] = []
         self.of_the_world = True
 
-    def read(self, document) -> list[Wanted]:
+    def read(self, document) -> list[FileJob]:
         """The jobs that are right."""
         for key in document:
             if key not in ("defaults", "job"):
@@ -89,7 +89,7 @@ class _Reader:
         self._check_outputs(jobs)
         return [job for job in wanted if job is not None]
 
-    def _job(self, where, job, defaults) -> Wanted | None:
+    def _job(self, where, job, defaults) -> FileJob | None:
         before = len(self.mistakes)
         command = job.get("command")
         parser = self.parsers.get(command) if isinstance(command, str) else None
@@ -107,7 +107,7 @@ class _Reader:
             words += self._words("defaults", key, defaults[key], options[key])
         return self._checked(where, parser, words, scenes) if len(self.mistakes) == before else None
 
-    def _checked(self, where, parser, words, scenes) -> Wanted | None:
+    def _checked(self, where, parser, words, scenes) -> FileJob | None:
         """The job, if its options make sense together and its files are there."""
         from ..blender.process.client import check_readable
 
@@ -117,7 +117,7 @@ class _Reader:
             for scene in scenes:
                 check_readable(scene)
             picture.load_tables(arguments.techniques)
-            return Wanted(job, arguments)
+            return FileJob(job, arguments)
         except Misuse as error:
             self._complain(where, str(error))
         except (SceneError, TableError) as error:

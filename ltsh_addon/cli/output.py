@@ -87,9 +87,9 @@ def _summary(merged: Merged, output) -> str:
 
     tables = bake if merged.command == "bake" else picture
     if merged.single and "reports" not in merged.report:
-        lines = tables.summary_lines(merged.report, merged.seconds)
+        lines = tables.summary(merged.report, merged.seconds)
     else:
-        lines = [line for report in merged.report["reports"] for line in tables.short_summary(report)]
+        lines = [line for report in merged.report["reports"] for line in tables.brief(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])
 
 

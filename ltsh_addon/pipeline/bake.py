@@ -420,7 +420,7 @@ def _report(options, manifest, records) -> dict:
     }
 
 
-def summary_lines(report: dict, seconds: dict) -> list[str]:
+def summary(report: dict, seconds: dict) -> list[str]:
     """Of one scene, camera and frame: a line per file, and errors where there are any."""
     found = []
     for record in report["objects"]:
@@ -435,6 +435,6 @@ def summary_lines(report: dict, seconds: dict) -> list[str]:
     return found
 
 
-def short_summary(report: dict) -> list[str]:
+def brief(report: dict) -> list[str]:
     """The same without times, for one of several."""
-    return [f"{report['name']}:", *(f"  {line}" for line in summary_lines(report, {}))]
+    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

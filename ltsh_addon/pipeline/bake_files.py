@@ -16,6 +16,11 @@ from ..imaging.margin import nearest_covered
 WRITTEN_TEXELS = 1 << 18
 COVERAGE = "coverage.hit.V"
 _OWNER = "owner"  # 1 + the number of the island, 0 where nothing is covered
+LARGEST_PICTURE = 2048
+# The darkest and brightest colors stand for this share of what Cycles' brightest texels show.
+PICTURE_SCALE = 0.1
+PICTURE_PERCENTILE = 99.0
+EMPTY_COLOR = 0.55
 
 
 class Planes:
@@ -129,13 +134,6 @@ class Planes:
         total = weights.sum(axis=1)
         found = np.flatnonzero(total > 1e-3)
         return which[found], index[found], weights[found] / total[found, None]
-
-
-LARGEST_PICTURE = 2048
-# The darkest and brightest colors stand for this share of what Cycles' brightest texels show.
-PICTURE_SCALE = 0.1
-PICTURE_PERCENTILE = 99.0
-EMPTY_COLOR = 0.55
 
 
 class ErrorSums:

@@ -5,20 +5,20 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
 from ..imaging import write_json, write_overview
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture
-from .tasks import FOLDER, FORMAT, Job, Records, Task, shard_of, tasks_of
+from .tasks import FOLDER, FORMAT, Job, Records, Task, shard_of, tasks_of, write_record
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 
 
 @dataclass(frozen=True)
-class Done:
+class RunResult:
     """How many tasks of the shard were done now, how many were there already, and what was wrong with others."""
 
     tasks: int
@@ -45,7 +45,7 @@ def run_tasks(
     existing: str = OVERWRITE,
     progress: Progress | None = None,
     tell: Callable[[TaskState], None] | None = None,
-) -> Done:
+) -> RunResult:
     """Do the tasks of shard (I, N) of `job`, I from 1 to N.
 
     `existing` says what becomes of tasks that are done already: "overwrite" does them again, "resume" keeps what the
@@ -77,15 +77,15 @@ def run_tasks(
                 if not told:
                     _write_job(job, tasks, existing)
                     told = True
-                _write_timing(job.options.output, task, seconds)
-                records.write(task.name, task.key, task.to_dict(), files, **found)
+                write_record(_timing_path(job.options.output, task), seconds)
+                records.write(task.name, task.key, asdict(task), files, **found)
             except OSError as error:
                 raise OSError(found.get("problem", str(error))) from error
             wrong = [found["problem"]] if "problem" in found else found["report"].get("problems", [])
             problems += wrong
             if tell is not None:
                 tell(TaskState(number, len(wanted), task.name, seconds["total"], "; ".join(wrong) or None))
-    return Done(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
+    return RunResult(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
 
 
 def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
@@ -124,17 +124,9 @@ def _write_job(job, tasks, existing) -> None:
         "single": job.single,
         "any_key": existing == SKIP,
         "applied_layer": bake.applied_layer(job.options) if applied else None,
-        "tasks": [task.to_dict() for task in tasks],
+        "tasks": [asdict(task) for task in tasks],
     }
-    path = Path(job.options.output) / FOLDER / "job.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, document)
-
-
-def _write_timing(output, task, seconds) -> None:
-    path = Path(output) / FOLDER / "timing" / f"{task.name}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(path, seconds)
+    write_record(Path(job.options.output) / FOLDER / "job.json", document)
 
 
 @dataclass(frozen=True)
@@ -245,9 +237,13 @@ def _different_versions(found) -> list[str]:
     return [f"{a} and {b} were made by different versions, {first} and {second}: do one of them again"]
 
 
+def _timing_path(output, task) -> Path:
+    return Path(output) / FOLDER / "timing" / f"{task.name}.json"
+
+
 def _read_seconds(output, task) -> dict:
     try:
-        return json.loads((output / FOLDER / "timing" / f"{task.name}.json").read_text(encoding="utf-8"))
+        return json.loads(_timing_path(output, task).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
 

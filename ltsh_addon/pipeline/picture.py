@@ -460,7 +460,7 @@ def unbiased(figures: dict) -> str:
     return "in noise" if squared is not None and squared < 0.0 else percent(figures.get("unbiased_relative_error"))
 
 
-def summary_lines(report: dict, seconds: dict) -> list[str]:
+def summary(report: dict, seconds: dict) -> list[str]:
     """A table of one picture: errors and seconds per pass and technique."""
     found = []
     for pass_name, figures in report["passes"].items():
@@ -478,7 +478,7 @@ def summary_lines(report: dict, seconds: dict) -> list[str]:
     return found
 
 
-def short_summary(report: dict) -> list[str]:
+def brief(report: dict) -> list[str]:
     """A line for a picture: the errors of one pass, against Cycles where there is one."""
     passes = report["passes"]
     pass_name = "specular" if "specular" in passes else next(iter(passes))

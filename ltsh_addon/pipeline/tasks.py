@@ -7,7 +7,7 @@ import json
 import string
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from glob import escape
 from pathlib import Path, PurePath
 from typing import Any
@@ -75,10 +75,6 @@ class Task:
     def unit(self) -> tuple:
         """What the objects of a bake have in common."""
         return self.scene, self.camera, self.frame
-
-    def to_dict(self) -> dict:
-        """As JSON has it."""
-        return asdict(self)
 
     def options(self, job: Job) -> Any:
         """The job's options for this task."""
@@ -205,19 +201,13 @@ class Records:
             path = self.output / file
             digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
         record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
-        path = self._path(name)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_json(path, record)
+        write_record(self._path(name), record)
         # As it will be read: numbers and letters are what JSON makes of them.
-        return json.loads(path.read_text(encoding="utf-8"))
-
-    def read(self, name: str) -> dict | None:
-        """The record `name`, or None where there is none that can be read."""
-        return _read(self._path(name))
+        return json.loads(self._path(name).read_text(encoding="utf-8"))
 
     def whole(self, name: str, key: str | None) -> dict | None:
         """The record `name` if its key is `key` (None: any) and all of its files are as they were written."""
-        record = self.read(name)
+        record = _read(self._path(name))
         if record is None or (key is not None and record["key"] != key) or not self.has_files(record):
             return None
         return record
@@ -246,6 +236,12 @@ class Records:
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"
+
+
+def write_record(path: Path, document: dict) -> None:
+    """Write `document` into a folder that is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, document)
 
 
 def _read(path: Path) -> dict | None:

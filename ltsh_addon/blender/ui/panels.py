@@ -83,19 +83,26 @@ def draw_job(layout) -> bool:
     column = layout.box().column()
     row = column.row()
     row.label(text=job.title, icon="RENDER_STILL")
-    _draw_right(row, clock(job.seconds()))
+    draw_right(row, clock(job.seconds()))
     column.progress(factor=job.plan.share(), text=progress_text(job))
-    row = column.row()
-    row.active = False
+    row = gray(column)
     row.label(text=stage_title(job), translate=False)
-    _draw_right(row, f"{job.plan.number} / {job.plan.count}")
+    draw_right(row, f"{job.plan.number} / {job.plan.count}")
     column.operator("ltsh.cancel", text="Cancel", icon="X")
     return True
 
 
-def _draw_right(row, text: str) -> None:
-    side = row.row()
-    side.alignment, side.active = "RIGHT", False
+def gray(layout):
+    """A row for what is less important."""
+    row = layout.row()
+    row.active = False
+    return row
+
+
+def draw_right(layout, text: str) -> None:
+    """Gray text at the right end."""
+    side = gray(layout)
+    side.alignment = "RIGHT"
     side.label(text=text, translate=False)
 
 
@@ -148,9 +155,7 @@ class _Main:
         split_names(layout, context)
         column = layout.column(align=True)
         column.prop(settings, "resolution_percentage", slider=True)
-        row = column.row()
-        row.alignment, row.active = "RIGHT", False
-        row.label(text="{} × {} px".format(*preflight.picture_of(context.scene)), translate=False)
+        draw_right(column, "{} × {} px".format(*preflight.picture_of(context.scene)))
         column = layout.column(align=True)
         column.prop(settings, "anti_aliasing")
         column.prop(settings, "cycles_samples")
@@ -184,10 +189,8 @@ class _Bake:
             ready = draw_problems(layout, context, "bake")
             count = len(preflight.bake_objects(context)[0])
             if count:
-                row = layout.row()
-                row.active = False
                 text = translated("1 object") if count == 1 else translated("{} objects").format(count)
-                row.label(text=text, icon="OBJECT_DATA", translate=False)
+                gray(layout).label(text=text, icon="OBJECT_DATA", translate=False)
             draw_button(layout, context, "ltsh.bake", "RENDER_RESULT", ready)
 
 
@@ -200,9 +203,7 @@ class _Entries:
     def draw_header_preset(self, context):
         entries = getattr(overview(context.scene), self.key)
         noted = sum(entry.state != EXACT for entry in entries)
-        row = self.layout.row()
-        row.active = False
-        row.label(text=str(len(entries)), translate=False)
+        gray(self.layout).label(text=str(len(entries)), translate=False)
         if noted:
             self.layout.label(text=str(noted), icon="ERROR", translate=False)
 
@@ -216,13 +217,9 @@ class _Entries:
         for entry in sorted(entries, key=lambda entry: entry.state == EXACT)[:ENTRIES_SHOWN]:
             row = column.row()
             row.label(text=entry.name, icon=STATE_ICONS[entry.state], translate=False)
-            side = row.row()
-            side.alignment, side.active = "RIGHT", False
-            side.label(text=translated(entry.kind.capitalize()), translate=False)
+            draw_right(row, translated(entry.kind.capitalize()))
             for note in entry.notes:
-                notes = column.column()
-                notes.active = False
-                draw_text(notes, context, note, "BLANK1")
+                draw_text(gray(column), context, note, "BLANK1")
         if len(entries) > ENTRIES_SHOWN:
             layout.label(text=translated("and {} more").format(len(entries) - ENTRIES_SHOWN), translate=False)
 
@@ -245,9 +242,7 @@ class _Output:
         layout = self.layout
         split_names(layout, context)
         layout.prop(context.scene.ltsh, "output_folder")
-        row = layout.row()
-        row.active = False
-        draw_text(row, context, str(output_folder(context.scene, "").parent))
+        draw_text(gray(layout), context, str(output_folder(context.scene, "").parent))
 
 
 FIGURES = (("relative_l2", "L2 %"), ("bias", "Bias %"), ("flip", "FLIP"))
@@ -270,26 +265,20 @@ def draw_figures(layout, context, result, choice) -> None:
             named = (f"{name}\u00a0{value}" for name, value in zip(("L2", "bias", "FLIP"), values, strict=True))
             draw_text(column, context, f"{label}: {', '.join(named)}")
     if figures.get("noise") is not None:
-        notes = column.column()
-        notes.active = False
-        draw_text(notes, context, _noise_text(group, figures))
+        draw_text(gray(column), context, _noise_text(group, figures))
 
 
 def _draw_table(layout, rows) -> None:
     split = layout.split(factor=0.34)
     column = split.column(align=True)
-    title = column.row()
-    title.active = False
-    title.label(text="vs Cycles")
+    gray(column).label(text="vs Cycles")
     for label, _ in rows:
         column.label(text=label, translate=False)
     side = split.row()
     for key, title in FIGURES:
         column = side.column(align=True)
         column.alignment = "RIGHT"
-        head = column.row()
-        head.alignment, head.active = "RIGHT", False
-        head.label(text=title)
+        draw_right(column, title)
         for _, row in rows:
             cell = column.row()
             cell.alignment = "RIGHT"

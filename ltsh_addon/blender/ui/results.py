@@ -17,30 +17,13 @@ ERROR = "error_"
 
 @dataclass(frozen=True)
 class Result:
-    """What is in a folder of pictures; `index` is that of `display_layers`."""
+    """What is in a folder of pictures, as `display_layers.write` left it."""
 
     folder: Path
-    index: dict
-
-    @property
-    def command(self) -> str:
-        """The command that made them: shade, compare or bake."""
-        return self.index["command"]
-
-    @property
-    def partial(self) -> str:
-        """What is missing, "" where nothing is."""
-        return self.index["partial"]
-
-    @property
-    def report(self) -> dict:
-        """The report of the command."""
-        return self.index["report"]
-
-    @property
-    def groups(self) -> dict:
-        """Pictures of each baked texture by file name, or of the camera's picture by ""."""
-        return self.index["groups"]
+    command: str  # that made them: shade, compare or bake
+    partial: str  # what is missing, "" where nothing is
+    report: dict  # of the command
+    groups: dict  # pictures of each baked texture by file name, or of the camera's picture by ""
 
     def group(self, name: str) -> tuple[str, dict]:
         """The group `name`, or the first where it is not there."""
@@ -74,10 +57,10 @@ def result_in(folder: str) -> Result | None:
         stamp = index_stamp(path)
         known = _read.get(str(path))
         if known is None or known[0] != stamp:
-            known = stamp, Result(path, read_index(path))
+            known = stamp, Result(path, **read_index(path))
             _read[str(path)] = known
         return known[1]
-    except (OSError, ValueError):
+    except (OSError, ValueError, TypeError):
         return None
 
 

@@ -5,13 +5,13 @@ linear transform turns the lobe into something simple and keeps polygons polygon
 2016), a spherical harmonics expansion in LTSH (Allmenroeder and Peters 2021), which follows the tear shape of grazing
 highlights. Either way the integral has a closed form, so the picture has no noise.
 
-    scene      the shared vocabulary: AreaLight, SurfaceSamples, Film
+    scene      the shared vocabulary: techniques, AreaLight, SurfaceSamples, Film
     files      how files are written, and what dead processes left is deleted
     shading    the paper: lookup table, polygon, edge integrals, `shade`, reference quadrature (numpy only)
     cycles     how Cycles shades: closures, normals, G-buffers, UV rasters (numpy only)
     imaging    EXR, metrics, false color, comparison sheet, report
     blender    .blend to lights and samples, Cycles renders, viewport, panels, render engine (all that knows bpy)
-    pipeline   a .blend in, files out: pictures, bakes, tasks
+    pipeline   a .blend in, files out: options, pictures, bakes, tasks; what scripts call
     cli        the command line
     panel_job  the process that a panel starts
 """

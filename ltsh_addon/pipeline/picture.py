@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import check_takes_files
-from ..scene import REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import CYCLES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, Film, Progress, SurfaceSamples
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
@@ -110,7 +110,7 @@ def _short_name(path: str, taken) -> str:
     """The name of a table's file without folder and dots, which separate the parts of a layer's name."""
     stem = Path(path).stem.replace(".", "_")
     candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
-    reserved = {*TECHNIQUES, "cycles", *taken}
+    reserved = {*TECHNIQUES, CYCLES, *taken}
     return next(name for name in candidates if name not in reserved)
 
 

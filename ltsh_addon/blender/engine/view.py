@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import logging
 import textwrap
@@ -179,7 +180,8 @@ def reference_of(context, scene, passes: str, projection: np.ndarray) -> Referen
     aspect = width * report["pixel_aspect"] / height
     if report["border"] is not None or abs(aspect * (frame[3] - frame[1]) / (frame[2] - frame[0]) - 1.0) > SAME_SHAPE:
         return "The Cycles picture does not fill the camera's frame: compare again without render region"
-    pixels = _pixels(result.folder / files[layer]) / report["exposure"]
+    path = result.folder / files[layer]
+    pixels = _pixels(path, path.stat().st_mtime_ns, report["exposure"])
     return Reference(pixels, frame, (str(result.folder), *index_stamp(result.folder)))
 
 
@@ -192,16 +194,11 @@ def _comparison_of(scene) -> results.Result | None:
     return None
 
 
-_read: dict = {}
-
-
-def _pixels(path) -> np.ndarray:
-    """The picture in the file `path`; read again when it has changed. Raises OSError, ValueError."""
-    key = str(path), path.stat().st_mtime_ns
-    if _read.get("key") != key:
-        channels = read_channels(path)
-        _read.update(key=key, pixels=np.stack([channels[letter] for letter in "RGB"], axis=-1))
-    return _read["pixels"]
+@functools.lru_cache(maxsize=1)
+def _pixels(path, changed: int, exposure: float) -> np.ndarray:
+    """The picture in the file `path`, last `changed` then, without the exposure. Raises OSError, ValueError."""
+    channels = read_channels(path)
+    return np.stack([channels[letter] for letter in "RGB"], axis=-1) / exposure
 
 
 def camera_frame(camera, scene, projection: np.ndarray, size: tuple[int, int]) -> Rectangle:
@@ -246,14 +243,14 @@ class ReferenceTexture:
     """The texture of a reference in one view; made again when view or picture change."""
 
     def __init__(self):
-        self._made, self._texture = None, None
+        self._pixels = self._place = self._texture = None
 
     def of(self, reference: Reference, size: tuple[int, int]) -> gpu.types.GPUTexture:
         """RGBA of `size` pixels, alpha 0 outside the camera's frame; needs an active GPU context."""
-        made = id(reference.pixels), reference.frame, size
-        if made != self._made:
-            self._texture = float_texture(averaged(reference.pixels, reference.frame, size))
-            self._made = made
+        place = reference.frame, size
+        if reference.pixels is not self._pixels or place != self._place:
+            self._texture = float_texture(averaged(reference.pixels, *place))
+            self._pixels, self._place = reference.pixels, place
         return self._texture
 
 

@@ -5,7 +5,6 @@ World space is Blender's: metres, right-handed, z up. Radiance is scene-referred
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -233,15 +232,9 @@ class SurfaceSamples:
         return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
     def save(self, path) -> None:
-        """Write a compressed .npz, complete or not at all; `load` reads it back bit for bit."""
-        path = Path(path)
-        temporary = path.with_name(f".{path.name}.part")
-        try:
-            with temporary.open("wb") as stream:
-                np.savez_compressed(stream, **{field.name: getattr(self, field.name) for field in fields(self)})
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        """Write a compressed .npz, which `load` reads back bit for bit."""
+        with Path(path).open("wb") as stream:
+            np.savez_compressed(stream, **{field.name: getattr(self, field.name) for field in fields(self)})
 
     @classmethod
     def load(cls, path) -> SurfaceSamples:

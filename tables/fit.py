@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from ltsh_addon.files import replacing
 from ltsh_addon.shading.lookup_table import FORMAT_VERSION, roughness_nodes, theta_nodes, warp_entries
 
 from . import projection, refine, walk
@@ -103,15 +103,13 @@ class Checkpoint:
 
 def _write_npz(path, arrays, compress=True):
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-    temporary = path.with_name(path.name + ".part")
-    with zipfile.ZipFile(temporary, "w", method, compresslevel=9) as archive:
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", method, compresslevel=9) as archive:
         for name, array in arrays.items():
             stream = io.BytesIO()
             np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
             entry = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
             entry.compress_type = method
             archive.writestr(entry, stream.getvalue())
-    os.replace(temporary, path)
 
 
 # Beyond 89.4 degrees smooth lobes are cut by the horizon on the scale of alpha; their fits would hide needles.

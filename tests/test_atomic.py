@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.files import check_takes_files, machine, replacing, replacing_by_copy, write_bytes
+from ltsh_addon.files import check_takes_files, replacing, replacing_by_copy, write_bytes
 
 ROOT = Path(__file__).resolve().parents[1]
 # Writes half a file and ends as a killed process does, or waits for a line before it goes on.
@@ -80,15 +80,6 @@ def test_names_as_long_as_may_be_can_be_written(tmp_path):
         write_bytes(tmp_path / name, b"whole")
         assert names(tmp_path) == [name]
         (tmp_path / name).unlink()
-
-
-def test_files_of_similar_names_stay(tmp_path):
-    mark = f"{machine()}-01234567"
-    others = [f".a.{mark[:-1]}.tmp", f".a.{mark}0.tmp", f".b.{mark}.tmp", f"a.{mark}.tmp", ".a.tmp"]
-    for name in others:
-        (tmp_path / name).write_bytes(b"not ours")
-    write_bytes(tmp_path / "a", b"new")
-    assert names(tmp_path) == sorted([*others, "a"])
 
 
 def test_an_exception_leaves_what_was_there(tmp_path):

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.files import PREFIX, locked_folder
+from ltsh_addon.files import RUN_PREFIX, temporary_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 # Makes a folder with a file, and waits for a line or is killed.
 MAKER = """
 import sys
-from ltsh_addon.files import locked_folder
-with locked_folder() as folder:
+from ltsh_addon.files import temporary_folder
+with temporary_folder() as folder:
     (folder / "file").write_bytes(b"x")
     print("made", flush=True)
     sys.stdin.readline()
@@ -39,17 +39,17 @@ def test_folders_of_the_killed_are_removed_and_those_of_the_living_stay(root):
     killed.kill()
     killed.communicate()
     (root / "ltsh-else").mkdir()
-    assert len(list(root.glob(f"{PREFIX}*"))) == 2
-    with locked_folder() as own, locked_folder() as other:
-        (kept,) = set(root.glob(f"{PREFIX}*")) - {own, other}
+    assert len(list(root.glob(f"{RUN_PREFIX}*"))) == 2
+    with temporary_folder() as own, temporary_folder() as other:
+        (kept,) = set(root.glob(f"{RUN_PREFIX}*")) - {own, other}
         assert own != other and (kept / "file").is_file()
-    assert list(root.glob(f"{PREFIX}*")) == [kept]
+    assert list(root.glob(f"{RUN_PREFIX}*")) == [kept]
     living.communicate(b"end\n")
     assert [path.name for path in root.iterdir()] == ["ltsh-else"]
 
 
 def test_an_exception_removes_the_folder(root):
-    with pytest.raises(KeyError), locked_folder() as folder:
+    with pytest.raises(KeyError), temporary_folder() as folder:
         (folder / "file").write_bytes(b"x")
         raise KeyError
     assert list(root.iterdir()) == []

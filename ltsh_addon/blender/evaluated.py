@@ -64,7 +64,7 @@ class EmitterTraits:
 
     @classmethod
     def of(cls, instance) -> EmitterTraits:
-        """Those of a depsgraph instance: as Cycles has it, the outermost instancer may withhold lobes, and its group
+        """The traits of a depsgraph instance. As in Cycles, the outermost instancer may switch lobes off, and its group
         counts where the object itself has none."""
         ob = instance.object
         group, diffuse, glossy = ob.original.lightgroup, ob.visible_diffuse, ob.visible_glossy
@@ -136,14 +136,14 @@ def is_seen_by_cameras(instance) -> bool:
 
 
 def data_pointer(ob) -> int:
-    """What is the same for evaluated objects that share their data."""
+    """A number that evaluated objects have in common when they share their data; 0 without data."""
     return ob.data.as_pointer() if ob.data is not None else 0
 
 
 def mesh_key(instance) -> tuple:
-    """What tells evaluated meshes apart: object, data and instancer, then the evaluated data itself.
+    """Key of an evaluated mesh: its object, original data and instancer, then the address of the evaluated data.
 
-    Blender may use the place of freed data again, but then one of the first three has changed.
+    Blender may use the address of freed data again, but then one of the first three differs.
     """
     ob = instance.object
     data = ob.data

@@ -1,9 +1,7 @@
-"""Cameras, pixel filters and settings of the renders that samples and references come from."""
+"""How samples and references are rendered: camera, size, pixel filter, view layer, and neutral settings."""
 
 from __future__ import annotations
 
-import errno
-import struct
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import bpy
 import mathutils
 import numpy as np
 
+from ..files import check_room_after
 from ..scene import Border, SceneError
 from ..shading.parallel import cores
 from .evaluated import SURFACE_TYPES
@@ -231,55 +230,6 @@ def pinned_pixel_filter(scene):
         cycles.pixel_filter_type, cycles.filter_width = before
 
 
-ZIP_ROWS = 16
-_MULTI_PART = 0x1000
-_HEADERS_BYTES = 1 << 22
-
-
-def is_whole(path: Path) -> bool:
-    """True where every chunk of the scanline EXR `path`, of ZIP compression, is there to its end."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        data = file.read(_HEADERS_BYTES)
-        try:
-            counts, position, several = _headers(data)
-            offsets = struct.unpack_from(f"<{sum(counts)}Q", data, position)
-            if min(offsets) < position:
-                return False
-            file.seek(max(offsets) + (8 if several else 4))
-            return file.tell() + 4 + struct.unpack("<I", file.read(4))[0] <= size
-        except (ValueError, IndexError, KeyError, struct.error):
-            return False
-
-
-def _headers(data: bytes) -> tuple[list[int], int, bool]:
-    """Chunks of every part, where the table of their places begins, and whether there may be several parts."""
-    several = bool(struct.unpack_from("<I", data, 4)[0] & _MULTI_PART)
-    position, counts = 8, []
-    while True:
-        attributes = {}
-        while data[position]:
-            name_end = data.index(0, position)
-            type_end = data.index(0, name_end + 1)
-            (length,) = struct.unpack_from("<I", data, type_end + 1)
-            start = type_end + 5
-            attributes[data[position:name_end]] = data[start : start + length]
-            position = start + length
-        position += 1
-        counts.append(_chunks(attributes))
-        if not several:
-            return counts, position, several
-        if not data[position]:
-            return counts, position + 1, several
-
-
-def _chunks(attributes) -> int:
-    if b"chunkCount" in attributes:
-        return struct.unpack("<I", attributes[b"chunkCount"])[0]
-    _, low, _, high = struct.unpack("<4i", attributes[b"dataWindow"])
-    return -(-(high - low + 1) // ZIP_ROWS)
-
-
 VIEW_LAYER = "ltsh"
 
 
@@ -297,7 +247,7 @@ def choose_view_layer(scene, warnings: list[str], name: str | None = None):
         layer.use = layer == used[0]
     layer = used[0]
     layer.name = VIEW_LAYER
-    # Passes that nobody reads, and that could have the names of those that are read.
+    # Nobody reads these passes, and their names could be those of passes that are read.
     for extra in (layer.aovs, layer.lightgroups):
         for item in list(extra):
             extra.remove(item)
@@ -331,7 +281,7 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     render.use_freestyle = render.use_persistent_data = False
     render.use_file_extension = render.use_overwrite = True
     cycles.device = "CPU"
-    # Multiplied into the result where it is read: the limits of the property and float32 have no say then.
+    # The exposure is multiplied into what is read from the file, free of the property's limits.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
     cycles.use_animated_seed = False
@@ -427,24 +377,13 @@ def render_exr(scene, path: Path) -> None:
     bpy.ops.render.render(write_still=True, scene=scene.name)
     if not path.is_file():
         raise SceneError(f"Blender rendered scene {scene.name!r} but wrote no {path.name}")
-    if not is_whole(path):
-        raise OSError(errno.ENOSPC, f"{path.name} was not written whole")
+    check_room_after(path)
 
 
 def pass_names() -> dict[str, str]:
     """Names of the passes in the EXR, which changed with 5.0."""
-    if bpy.app.version >= (5, 0, 0):
-        return {
-            "specular_light": "Glossy Direct",
-            "specular_color": "Glossy Color",
-            "diffuse_light": "Diffuse Direct",
-            "diffuse_color": "Diffuse Color",
-            "emission": "Emission",
-        }
-    return {
-        "specular_light": "GlossDir",
-        "specular_color": "GlossCol",
-        "diffuse_light": "DiffDir",
-        "diffuse_color": "DiffCol",
-        "emission": "Emit",
-    }
+    names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission")
+    if bpy.app.version < (5, 0, 0):
+        names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit")
+    keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission")
+    return dict(zip(keys, names, strict=True))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import time
+from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
@@ -164,19 +164,15 @@ def say(text: str, stream) -> None:
         print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
 
 
-MESSAGE = "LTSH "
 REPORT_SECONDS = 0.1
 
 
-class LineProgress(ProgressBar):
-    """Progress as messages on a stream, a few per second.
+class MessageProgress(ProgressBar):
+    """Sends progress as {"stage", "fraction"} a few times per second; keeps the commands' other lines as `notes`."""
 
-    `notes` are what the commands had to say besides.
-    """
-
-    def __init__(self, stream):
+    def __init__(self, send: Callable[[dict], None]):
         super().__init__(None)
-        self._messages, self._last = stream, 0.0
+        self._send, self._last = send, 0.0
         self.notes: list[str] = []
 
     def __call__(self, stage: str, fraction: float) -> bool:
@@ -185,14 +181,9 @@ class LineProgress(ProgressBar):
             self._stage, self._last = stage, 0.0
         if fraction >= 1.0 or now - self._last >= REPORT_SECONDS:
             self._last = now
-            self.send({"stage": stage, "fraction": fraction})
+            self._send({"stage": stage, "fraction": fraction})
         return True
 
     def note(self, text: str) -> None:
         """Keep the line."""
         self.notes.append(text)
-
-    def send(self, document: dict) -> None:
-        """One message; all of it or, where the reader is gone, nothing."""
-        self._messages.write(MESSAGE + json.dumps(document) + "\n")
-        self._messages.flush()

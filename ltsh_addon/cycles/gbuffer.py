@@ -6,6 +6,8 @@ per pixel and file, so nothing is averaged across an edge.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from ..scene import FARTHEST, Film, SurfaceSamples
@@ -14,6 +16,10 @@ from .lobes import HIT_AOVS, Hits, lobe_aov, lobe_names, read_aov, read_layer, s
 
 # Arrays of one block stay in the cache.
 HITS_PER_BLOCK = 65536
+# Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
+# on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
+COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
+RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
 
 
 def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tuple[SurfaceSamples, np.ndarray, int]:
@@ -92,3 +98,19 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
     of_hit = np.concatenate(of_hit)
     first = None if of_hit.all() else of_hit
     return joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
+
+
+def coarse_meshes(samples: SurfaceSamples) -> list[str]:
+    """The warning about smooth-shaded meshes so coarse that Cycles' own sampling decides about their light."""
+    cosine = np.abs(np.sum(samples.smooth_normal * samples.geometric_normal, axis=-1))
+    # The geometric normal of ribbons that pretend to be round hair is the view direction.
+    is_ribbon = np.abs(np.sum(samples.view * samples.geometric_normal, axis=-1)) > 1.0 - RIBBON_TOLERANCE
+    count = np.count_nonzero((cosine < math.cos(COARSE_ANGLE)) & ~is_ribbon)
+    if count <= COARSE_SHARE * len(samples):
+        return []
+    degrees = math.degrees(COARSE_ANGLE)
+    return [
+        f"{count} of {len(samples)} samples lie on faces whose smooth normals are more than {degrees:.0f} degrees from "
+        "their own: there it depends on how Cycles samples how much light comes from between both horizons (2 %); "
+        "more faces help"
+    ]

@@ -18,26 +18,3 @@ from .metrics import (
 from .png import write_png
 from .report import write_html, write_json, write_overview
 from .sheet import Tile, comparison_sheet
-
-__all__ = [
-    "ErrorStatistics",
-    "Layer",
-    "Tile",
-    "chromaticities",
-    "comparison_sheet",
-    "error_statistics",
-    "exposure_factor",
-    "mean_flip",
-    "noisy_error_statistics",
-    "read_channels",
-    "read_layers",
-    "reference_noise",
-    "signed_error_colors",
-    "to_srgb8",
-    "unbiased_relative_error",
-    "write_html",
-    "write_json",
-    "write_layers",
-    "write_overview",
-    "write_png",
-]

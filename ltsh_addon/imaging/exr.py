@@ -1,11 +1,14 @@
-"""Multi-layer EXR: whole images, and rows as they come."""
+"""Multi-layer EXR files of 32-bit floats: layers, single channels, and rows as they come.
+
+Files are written as one part of scanlines with ZIP compression. Each of them appears complete or not at all.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +21,10 @@ _DEFAULT_CHANNELS = {1: "V", 3: "RGB", 4: "RGBA"}
 _CHANNEL_ORDERS = ("RGBA", "XYZW", "UVW")
 _BLOCK_VALUES = 1 << 22
 _ZIP_ROWS = 16  # are compressed together
-_LONGEST_NAME = 255  # bytes, OpenEXR's limit for channel and attribute names
+_LONGEST_NAME = 255  # bytes, OpenEXR's limit
+_HEADER_BYTES = 1 << 22  # more than the header of a file with thousands of channels has
+_OF_THE_FORMAT = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
+                  "pixelAspectRatio", "type", "version"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -29,7 +35,7 @@ class Layer:
     channels: str = ""  # "" means V, RGB or RGBA by the number of channels
 
     def planes(self, name: str) -> dict[str, np.ndarray]:
-        """The contiguous float32 planes (H, W) by full channel name; raises ValueError for a wrong shape or type."""
+        """The planes (H, W) by full channel name; raises ValueError for a wrong shape or type."""
         pixels = np.asarray(self.pixels)
         if pixels.ndim not in (2, 3) or 0 in pixels.shape or pixels.dtype.kind not in "fiub":
             raise ValueError(
@@ -41,12 +47,7 @@ class Layer:
         channels = self.channels or _DEFAULT_CHANNELS.get(count, "")
         if len(channels) != count or len(set(channels)) != count or "." in channels:
             raise ValueError(f"layer {name!r}: {count} channels need {count} different letters, found {channels!r}")
-        # The writer ignores strides and types other than its own: it would store wrong numbers or crash.
-        with np.errstate(over="ignore"):
-            return {
-                f"{name}.{letter}": np.ascontiguousarray(pixels[..., index], dtype=np.float32)
-                for index, letter in enumerate(channels)
-            }
+        return {f"{name}.{letter}": pixels[..., index] for index, letter in enumerate(channels)}
 
 
 def write_layers(
@@ -56,75 +57,157 @@ def write_layers(
     chromaticities: Sequence[float] | None = None,
     pixel_aspect: float = 1.0,
 ) -> None:
-    """Write `layers` as one single-part float32 scanline EXR with ZIP compression and channels ``<layer>.<letter>``.
+    """Write `layers` as channels ``<layer>.<letter>``; plain arrays of 1, 3 or 4 channels become V, RGB or RGBA.
 
-    Plain arrays of 1, 3 or 4 channels become V, RGB or RGBA. float32 values are kept bit for bit, NaN and Inf
-    included. `metadata` becomes string attributes of the header, `chromaticities` (xy of red, green, blue and white)
-    the one that tells readers the color space; `pixel_aspect` is width / height of a pixel. The file appears complete
-    or not at all.
-    Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
+    float32 values are kept bit for bit, NaN and Inf included. `metadata` becomes string attributes of the header.
+    `chromaticities` (xy of red, green, blue and white) tell readers the color space; `pixel_aspect` is width / height
+    of a pixel. Raises ValueError for layers that do not fit together, OSError when the file cannot be written.
     """
-    write_channels(path, _planes(layers), metadata, chromaticities, pixel_aspect)
+    planes: dict[str, np.ndarray] = {}
+    for name, layer in layers.items():
+        planes |= (layer if isinstance(layer, Layer) else Layer(layer)).planes(name)
+    write_channels(path, planes, metadata, chromaticities, pixel_aspect)
 
 
-def write_channels(
-    path: str | os.PathLike,
-    channels: Mapping[str, np.ndarray],
-    metadata: Mapping[str, str] | None = None,
-    chromaticities: Sequence[float] | None = None,
-    pixel_aspect: float = 1.0,
-) -> None:
-    """Write `channels` (H, W) by full name, which need not end in a single letter; else as `write_layers`."""
-
+def write_channels(path: str | os.PathLike, channels: Mapping[str, np.ndarray], *header) -> None:
+    """Write `channels` (H, W) by full name, which need not end in a single letter; `header` as in `write_layers`."""
     planes = {name: np.asarray(plane) for name, plane in channels.items()}
     _check_planes(planes)
     height, width = next(iter(planes.values())).shape
     # A block at a time, so that a signal need not wait for a large file.
     rows = max(1, _BLOCK_VALUES // (width * len(planes)) // _ZIP_ROWS) * _ZIP_ROWS
-    with writing_rows(path, list(planes), width, height, metadata, chromaticities, pixel_aspect) as writer:
+    with writing_rows(path, list(planes), width, height, *header) as writer:
         for first in range(0, height, rows):
             writer.write({name: plane[first : first + rows] for name, plane in planes.items()})
 
 
-def reason(error: Exception, temporary: os.PathLike) -> str:
+@contextmanager
+def writing_rows(
+    path: str | os.PathLike,
+    names: Sequence[str],
+    width: int,
+    height: int,
+    metadata: Mapping[str, str] | None = None,
+    chromaticities: Sequence[float] | None = None,
+    pixel_aspect: float = 1.0,
+) -> Iterator[RowWriter]:
+    """Meanwhile a RowWriter for a file with the channels `names`; else as `write_layers`.
+
+    Raises ValueError also where rows are missing at the end of the block.
+    """
+    OpenEXR = _openexr()
+    metadata = {str(key): str(value) for key, value in (metadata or {}).items()}
+    if clash := _OF_THE_FORMAT & metadata.keys():
+        raise ValueError(f"metadata {min(clash)!r}: that name belongs to the EXR format itself, use another one")
+    header = OpenEXR.Header(width, height)
+    header["channels"] = dict.fromkeys(names, header["channels"]["R"])
+    header |= {"type": b"scanlineimage", "pixelAspectRatio": float(pixel_aspect)}
+    header |= {key: value.encode() for key, value in metadata.items()}
+    if chromaticities is not None:
+        import Imath
+
+        if np.shape(chromaticities) != (8,) or not np.isfinite(chromaticities).all():
+            raise ValueError(f"chromaticities {chromaticities!r}: expected xy of red, green, blue and white, 8 numbers")
+        header["chromaticities"] = Imath.Chromaticities(*[Imath.chromaticity(0.0, 0.0)] * 4)
+    with replacing(path) as temporary:
+        try:
+            file = OpenEXR.OutputFile(str(temporary), header)
+        except OSError as error:
+            raise OSError(_reason(error, temporary)) from error
+        writer = RowWriter(file, temporary, tuple(names), (height, width))
+        try:
+            yield writer
+        finally:
+            file.close()
+        if writer.done != height:
+            raise ValueError(f"{writer.done} rows were written, expected {height}")
+        if chromaticities is not None:
+            _put_chromaticities(temporary, np.asarray(chromaticities, dtype="<f4").tobytes())
+
+
+@dataclass
+class RowWriter:
+    """Takes the rows of a file from top to bottom; made by `writing_rows`."""
+
+    file: object
+    path: Path
+    names: tuple[str, ...]
+    shape: tuple[int, int]
+    done: int = 0  # rows
+
+    def write(self, planes: Mapping[str, np.ndarray]) -> None:
+        """The next rows, (R, W) for every channel; raises ValueError for other channels or shapes."""
+        height, width = self.shape
+        rows = len(next(iter(planes.values()))) if planes else 0
+        if set(planes) != set(self.names) or rows == 0 or self.done + rows > height:
+            raise ValueError(
+                f"rows {self.done} to {self.done + rows} of channels {sorted(planes)}, expected rows up to {height} "
+                f"of channels {sorted(self.names)}"
+            )
+        data = {}
+        for name, plane in planes.items():
+            if plane.shape != (rows, width):
+                raise ValueError(f"channel {name!r}: rows have shape {plane.shape}, expected {(rows, width)}")
+            with np.errstate(over="ignore"):
+                # The writer ignores strides and types other than its own: it would store wrong numbers or crash.
+                data[name] = np.ascontiguousarray(plane, dtype=np.float32).tobytes()
+        try:
+            self.file.writePixels(data, rows)
+        except (RuntimeError, OSError) as error:
+            raise OSError(_reason(error, self.path)) from error
+        self.done += rows
+
+
+def _check_planes(planes: Mapping[str, np.ndarray]) -> None:
+    if not planes:
+        raise ValueError("no layers were given, an EXR file needs at least one")
+    first_name, first = next(iter(planes.items()))
+    for name, plane in planes.items():
+        if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME:
+            raise ValueError(f"channel {name!r}: expected a name of 1 to {_LONGEST_NAME} bytes without NUL")
+        if plane.ndim != 2 or 0 in plane.shape:
+            raise ValueError(f"channel {name!r}: an array of shape {plane.shape} was given, expected (height, width)")
+        if plane.shape != first.shape:
+            raise ValueError(
+                f"channel {name!r} is {plane.shape[1]}x{plane.shape[0]}, but {first_name!r} is "
+                f"{first.shape[1]}x{first.shape[0]}; all layers of a file need the same size"
+            )
+
+
+def _put_chromaticities(path: Path, values: bytes) -> None:
+    """Put them into the header of a file: OutputFile writes zeros, whatever it is given (OpenEXR 3.5)."""
+    attribute = b"\0chromaticities\0chromaticities\0" + len(values).to_bytes(4, "little")
+    with path.open("r+b") as file:
+        file.seek(file.read(_HEADER_BYTES).index(attribute) + len(attribute))
+        file.write(values)
+
+
+def _reason(error: Exception, temporary: os.PathLike) -> str:
     """Why OpenEXR could not write: of "Cannot open image file "NAME". Reason." the part without the file's name."""
     return str(error).rpartition(f'"{temporary}". ')[2].strip().rstrip(".")
-
-
-def check_metadata(metadata: Mapping[str, str] | None) -> dict[str, str]:
-    """`metadata` as strings; raises ValueError for names that belong to the format."""
-    header = {str(key): str(value) for key, value in (metadata or {}).items()}
-    reserved = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name",
-                "pixelAspectRatio", "version"}  # fmt: skip
-    if clash := reserved & header.keys():
-        raise ValueError(f"metadata {sorted(clash)[0]!r}: that name belongs to the EXR format itself, use another one")
-    return header
-
-
-def read_metadata(path: str | os.PathLike) -> dict[str, str]:
-    """The string attributes of the header. Raises as `read_channels` does."""
-    with open(path, "rb") as stream:
-        if stream.read(4) != b"\x76\x2f\x31\x01":
-            raise ValueError(f"{path}: is not an OpenEXR file, expected one")
-    try:
-        header = _openexr().File(str(path), header_only=True).header()
-    except (RuntimeError, ValueError, OSError) as error:
-        raise ValueError(f"{path}: is damaged and cannot be read ({error}); write it again") from error
-    return {name: value for name, value in header.items() if isinstance(value, str)}
 
 
 def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """All channels by full name, each (H, W) of the file's type, row 0 on top; of all parts of a multi-part file.
 
-    Blender 4.5 writes one part, Blender 5 one part per pass; both give names like ``ViewLayer.Position.X``. A channel
-    without a layer in a named part gets the part's name in front. Raises OSError when the file is missing or
-    unreadable, ValueError, naming the file, when it is damaged or no EXR.
+    Blender 4.5 writes one part, Blender 5 may write one part per pass; both give names like ``ViewLayer.Position.X``. A
+    channel without a layer in a named part gets the part's name in front. Raises OSError when the file is missing or
+    unreadable, ValueError, naming the file, when it is damaged, incomplete or no EXR.
     """
     with open(path, "rb") as stream:  # the system's own error for a missing or unreadable file
         if stream.read(4) != b"\x76\x2f\x31\x01":
             raise ValueError(f"{path}: is not an OpenEXR file, expected one")
-    channels = {}
-    parts = _read_parts(Path(path))
+    OpenEXR, complaint, channels = _openexr(), io.StringIO(), {}
+    try:
+        # The package prints a warning to stdout and leaves a damaged part out, instead of raising.
+        with contextlib.redirect_stdout(complaint):
+            expected = len(OpenEXR.File(str(path), header_only=True).parts)
+            parts = OpenEXR.File(str(path), separate_channels=True).parts
+    except (RuntimeError, ValueError, OSError, MemoryError) as error:
+        raise ValueError(f"{path}: is damaged and cannot be read ({error}); render or write it again") from error
+    if len(parts) != expected or not parts:
+        reason = complaint.getvalue().strip().rpartition(" - ")[2] or f"{len(parts)} of {expected} parts readable"
+        raise ValueError(f"{path}: is damaged or incomplete ({reason}); render or write it again")
     for part in parts:
         for name, channel in part.channels.items():
             if channel.pixels is None:
@@ -155,47 +238,6 @@ def _channel_rank(letter: str) -> tuple[int, str]:
     return (ranks[0] if ranks else 99, letter)
 
 
-def _planes(layers: Mapping[str, np.ndarray | Layer]) -> dict[str, np.ndarray]:
-    planes: dict[str, np.ndarray] = {}
-    for name, layer in layers.items():
-        if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME - 2:
-            raise ValueError(f"layer {name!r}: expected a name of 1 to {_LONGEST_NAME - 2} bytes without NUL")
-        planes |= (layer if isinstance(layer, Layer) else Layer(layer)).planes(name)
-    return planes
-
-
-def _check_planes(planes: Mapping[str, np.ndarray]) -> None:
-    if not planes:
-        raise ValueError("no layers were given, an EXR file needs at least one")
-    first_name, first = next(iter(planes.items()))
-    for name, plane in planes.items():
-        if not name or "\0" in name or len(name.encode()) > _LONGEST_NAME:
-            raise ValueError(f"channel {name!r}: expected a name of 1 to {_LONGEST_NAME} bytes without NUL")
-        if plane.ndim != 2 or 0 in plane.shape:
-            raise ValueError(f"channel {name!r}: an array of shape {plane.shape} was given, expected (height, width)")
-        if plane.shape != first.shape:
-            raise ValueError(
-                f"channel {name!r} is {plane.shape[1]}x{plane.shape[0]}, but {first_name!r} is "
-                f"{first.shape[1]}x{first.shape[0]}; all layers of a file need the same size"
-            )
-
-
-def _read_parts(path: Path) -> list:
-    OpenEXR = _openexr()
-    complaint = io.StringIO()
-    try:
-        # The package prints a warning to stdout and leaves a damaged part out, instead of raising.
-        with contextlib.redirect_stdout(complaint):
-            expected = len(OpenEXR.File(str(path), header_only=True).parts)
-            parts = OpenEXR.File(str(path), separate_channels=True).parts
-    except (RuntimeError, ValueError, OSError, MemoryError) as error:
-        raise ValueError(f"{path}: is damaged and cannot be read ({error}); render or write it again") from error
-    if len(parts) != expected or not parts:
-        reason = complaint.getvalue().strip().rpartition(" - ")[2] or f"{len(parts)} of {expected} parts readable"
-        raise ValueError(f"{path}: is damaged or incomplete ({reason}); render or write it again")
-    return parts
-
-
 def _openexr():
     try:
         import OpenEXR
@@ -205,103 +247,3 @@ def _openexr():
             "install it with `pip install OpenEXR`"
         ) from error
     return OpenEXR
-
-
-# More than the header of a file with thousands of channels has.
-_HEADER_BYTES = 1 << 22
-
-
-class RowWriter:
-    """Takes the rows of an EXR from top to bottom; made by `writing_rows`."""
-
-    def __init__(self, file, path: os.PathLike, names: Sequence[str], width: int, height: int):
-        self._file, self._path, self._names, self._shape, self._done = file, path, tuple(names), (height, width), 0
-
-    def write(self, planes: Mapping[str, np.ndarray]) -> None:
-        """The next rows, (R, W) for every channel; raises ValueError for other channels or shapes."""
-        height, width = self._shape
-        rows = len(next(iter(planes.values()))) if planes else 0
-        if set(planes) != set(self._names) or rows == 0 or self._done + rows > height:
-            raise ValueError(
-                f"rows {self._done} to {self._done + rows} of channels {sorted(planes)}, expected rows up to {height} "
-                f"of channels {sorted(self._names)}"
-            )
-        data = {}
-        for name, plane in planes.items():
-            if plane.shape != (rows, width):
-                raise ValueError(f"channel {name!r}: rows have shape {plane.shape}, expected {(rows, width)}")
-            data[name] = np.ascontiguousarray(plane, dtype=np.float32).tobytes()
-        try:
-            self._file.writePixels(data, rows)
-        except (RuntimeError, OSError) as error:
-            raise OSError(reason(error, self._path)) from error
-        self._done += rows
-
-    def close(self) -> None:
-        """End the file. Raises ValueError where rows are missing."""
-        self._file.close()
-        if self._done != self._shape[0]:
-            raise ValueError(f"{self._done} rows were written, expected {self._shape[0]}")
-
-
-@contextmanager
-def writing_rows(
-    path: str | os.PathLike,
-    names: Sequence[str],
-    width: int,
-    height: int,
-    metadata: Mapping[str, str] | None = None,
-    chromaticities: Sequence[float] | None = None,
-    pixel_aspect: float = 1.0,
-):
-    """Meanwhile a RowWriter for a float32 EXR with ZIP compression and the channels `names`; else as `write_layers`.
-
-    The file appears complete at the end of the block, or not at all where an exception leaves it. Raises OSError,
-    ValueError for metadata and chromaticities that are none.
-    """
-    OpenEXR = _openexr()
-    header = OpenEXR.Header(width, height)
-    header["pixelAspectRatio"] = float(pixel_aspect)
-    if chromaticities is not None:
-        chromaticities = _chromaticities(chromaticities)
-        header["chromaticities"] = _no_chromaticities()
-    kind = header["channels"]["R"]
-    header["channels"] = dict.fromkeys(names, kind)
-    header["type"] = b"scanlineimage"
-    header |= {key: value.encode() for key, value in check_metadata(metadata).items()}
-    with replacing(path) as temporary:
-        try:
-            file = OpenEXR.OutputFile(str(temporary), header)
-        except OSError as error:
-            raise OSError(reason(error, temporary)) from error
-        writer = RowWriter(file, temporary, names, width, height)
-        try:
-            yield writer
-        except BaseException:
-            file.close()
-            raise
-        writer.close()
-        if chromaticities is not None:
-            _put_chromaticities(temporary, chromaticities)
-
-
-def _chromaticities(values) -> bytes:
-    """As they stand in a file."""
-    if np.shape(values) != (8,) or not np.isfinite(values).all():
-        raise ValueError(f"chromaticities {values!r}: expected xy of red, green, blue and white, 8 numbers")
-    return np.asarray(values, dtype="<f4").tobytes()
-
-
-def _no_chromaticities():
-    import Imath
-
-    return Imath.Chromaticities(*[Imath.chromaticity(0.0, 0.0)] * 4)
-
-
-def _put_chromaticities(path, values: bytes) -> None:
-    """Put them into the header of a file: OutputFile writes zeros, whatever it is given (OpenEXR 3.5)."""
-    attribute = b"\0chromaticities\0chromaticities\0" + len(values).to_bytes(4, "little")
-    with open(path, "r+b") as file:
-        start = file.read(_HEADER_BYTES).index(attribute) + len(attribute)
-        file.seek(start)
-        file.write(values)

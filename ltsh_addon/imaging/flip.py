@@ -29,7 +29,7 @@ _TO_XYZ = np.array(
         [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
     ]
 )  # linear sRGB, D65
-_WHITE = _TO_XYZ.sum(axis=1)
+_TO_RATIO = (_TO_XYZ / _TO_XYZ.sum(axis=1)[:, None]).T  # to XYZ as shares of those of white
 
 
 def flip(reference: np.ndarray, test: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
@@ -40,7 +40,8 @@ def flip(reference: np.ndarray, test: np.ndarray, pixels_per_degree: float = PIX
     reference, test = (np.clip(np.asarray(image, dtype=np.float32), 0.0, 1.0) for image in (reference, test))
     if reference.shape != test.shape or reference.ndim != 3 or reference.shape[2] != 3:
         raise ValueError(f"pictures of shape {reference.shape} and {test.shape}, expected both (height, width, 3)")
-    opponents = [_opponent(image) for image in (reference, test)]
+    # In these filters for contrast sensitivity are linear.
+    opponents = [_opponents(image @ _TO_RATIO.astype(np.float32)) for image in (reference, test)]
     color = _color_difference(*(_filtered(image, pixels_per_degree) for image in opponents))
     lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponents]
     feature = _feature_difference(*lightness, pixels_per_degree)
@@ -57,16 +58,16 @@ def mean_flip(reference: np.ndarray, test: np.ndarray, mask: np.ndarray | None =
     return float(values.mean(dtype=np.float64)) if values.size else None
 
 
-def _opponent(linear: np.ndarray) -> np.ndarray:
-    """The opponent space Y Cx Cz of linear sRGB, in which filters for contrast sensitivity are linear."""
-    x, y, z = np.moveaxis(linear @ (_TO_XYZ / _WHITE[:, None]).T.astype(np.float32), -1, 0)
+def _opponents(ratio: np.ndarray) -> np.ndarray:
+    """Y Cx Cz of shares of the white's XYZ; CIELAB where these were bent before."""
+    x, y, z = np.moveaxis(ratio, -1, 0)
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
-def _linear_of_opponent(opponent: np.ndarray) -> np.ndarray:
-    y = (opponent[..., 0] + 16.0) / 116.0
-    normalized = np.stack([opponent[..., 1] / 500.0 + y, y, y - opponent[..., 2] / 200.0], axis=-1)
-    return normalized @ np.linalg.inv(_TO_XYZ / _WHITE[:, None]).T.astype(np.float32)
+def _linear_of_opponents(opponents: np.ndarray) -> np.ndarray:
+    y = (opponents[..., 0] + 16.0) / 116.0
+    ratio = np.stack([opponents[..., 1] / 500.0 + y, y, y - opponents[..., 2] / 200.0], axis=-1)
+    return ratio @ np.linalg.inv(_TO_RATIO).astype(np.float32)
 
 
 def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
@@ -83,17 +84,15 @@ def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
             for weight, kernel in zip(weights, kernels, strict=True)
         )
         planes.append(sum(parts))
-    linear = np.clip(_linear_of_opponent(np.stack(planes, axis=-1)), 0.0, 1.0)
+    linear = np.clip(_linear_of_opponents(np.stack(planes, axis=-1)), 0.0, 1.0)
     return _hunt(_lab(linear))
 
 
 def _lab(linear: np.ndarray) -> np.ndarray:
     """CIELAB of linear sRGB, white point D65 (CIE 15)."""
-    ratio = linear @ (_TO_XYZ / _WHITE[:, None]).T.astype(np.float32)
+    ratio = linear @ _TO_RATIO.astype(np.float32)
     delta = 6.0 / 29.0
-    bent = np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3.0 * delta**2) + 4.0 / 29.0)
-    x, y, z = np.moveaxis(bent, -1, 0)
-    return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
+    return _opponents(np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3.0 * delta**2) + 4.0 / 29.0))
 
 
 def _hunt(lab: np.ndarray) -> np.ndarray:

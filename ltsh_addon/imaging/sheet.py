@@ -50,17 +50,14 @@ def comparison_sheet(
     pictures = [to_srgb8(exposure * _resized(part)) for part in (image, *(tile.image for tile in techniques))]
     errors = [_to_8bit(signed_error_colors(_resized(tile.error), scale)) for tile in techniques]
     height, width = pictures[0].shape[:2]
-    sheet = _Sheet(title, width, height, count=len(pictures), caption_lines=max(map(_lines, techniques), default=0))
+    lines = max((len(tile.caption) for tile in techniques), default=0)
+    sheet = _Sheet(title, width, height, count=len(pictures), caption_lines=lines)
     legend = [*notes, f"exposure {np.log2(exposure):+.1f} EV"]
     sheet.place(0, label, pictures[0], None, ())
     sheet.legend(legend, scale)
     for index, (tile, picture, error) in enumerate(zip(techniques, pictures[1:], errors, strict=True), start=1):
         sheet.place(index, tile.label, picture, error, tile.caption)
     return sheet.pixels
-
-
-def _lines(tile: Tile) -> int:
-    return len(tile.caption)
 
 
 def common_error_scale(errors, image) -> float:

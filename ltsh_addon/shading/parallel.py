@@ -307,7 +307,7 @@ class _Child:
                 # Nothing here uses BLAS, whose threads take time to start.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 # Ctrl-C goes to the parent alone, which ends the child; no console window on Windows.
-                start_new_session=True,
+                process_group=0,
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:

@@ -1,13 +1,12 @@
 """Command lines behind the panels: a report where there is one, else the line that says what was wrong."""
 
-import io
 import json
 
 import fake_scene
 import pytest
 
 from ltsh_addon import panel_job
-from ltsh_addon.cli.progress import MESSAGE, LineProgress
+from ltsh_addon.cli.progress import MessageProgress
 from ltsh_addon.scene import SceneError
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
@@ -15,11 +14,10 @@ SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
 
 def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, room, tmp_path):
     fake_scene.FakeChild().install(monkeypatch)
-    messages = io.StringIO()
+    sent = []
     arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL]
-    report, _ = panel_job._command(arguments, LineProgress(messages))
+    report, _ = panel_job._command(arguments, MessageProgress(sent.append))
     assert report == json.loads((tmp_path / "out" / "report.json").read_text()) and report["resolution"]
-    sent = [json.loads(line.removeprefix(MESSAGE)) for line in messages.getvalue().splitlines()]
     stages = list(dict.fromkeys(message["stage"] for message in sent))
     assert stages[0] == "samples" and stages[-2:] == ["LTC", "write"] and sent[-1]["fraction"] == 1.0
 
@@ -35,5 +33,5 @@ def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, roo
 def test_a_command_that_fails_gives_the_line_that_says_why(monkeypatch, room, tmp_path, arguments, error, complaint):
     fake_scene.FakeChild(error=error).install(monkeypatch)
     arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL, *arguments]
-    report, line = panel_job._command(arguments, LineProgress(io.StringIO()))
+    report, line = panel_job._command(arguments, MessageProgress([].append))
     assert report is None and line.startswith(complaint)

@@ -68,7 +68,7 @@ def halves(points, some_lights, some_film) -> dict[str, np.ndarray]:
 
 
 class FakeChild:
-    """Stands in for `child.extract` and `child.build_demo`; `asked` and `built` tell how they were called."""
+    """Stands in for `client.extract` and `client.build_demo`; `asked` and `built` tell how they were called."""
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None):
         self.groups, self.empty, self.error = groups, empty, error

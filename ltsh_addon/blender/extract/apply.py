@@ -15,7 +15,7 @@ GROUP_PREFIX = "LTSH Bake"
 
 
 def apply_bake(job: dict, progress) -> dict:
-    """Do the `job` (see `bake_child.apply_bake`): open the scene, give every baked object copies of its materials that
+    """Do the `job` (see `client.apply_bake`): open the scene, give every baked object copies of its materials that
     show the texture, save the file `job["path"]`; the manifest."""
     warnings = []
     progress("open scene", 0.0)

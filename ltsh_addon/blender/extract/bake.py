@@ -1,4 +1,4 @@
-"""Samples, lights and Cycles' own bake of texels (runs in the child)."""
+"""Texels of objects: their surfaces, lights and Cycles' own bake, and what a job asks before (runs in the child)."""
 
 from __future__ import annotations
 
@@ -30,11 +30,10 @@ from ..materials.maps import MaterialPlan, SavedImages
 from ..process.blender_process import listed
 from ..render_settings import working_space
 from . import pixels
-from .pixels import remove_occlusion
+from .pixels import SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
 NOT_BAKED = -1e9
-SEEDS = {"A": 1, "B": 7919}
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
 
 
@@ -181,7 +180,7 @@ class ObjectBake:
         if layer is None:
             raise ObjectError(f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one")
         ob.data.uv_layers.active_index = active
-        # A name in use gets a number.
+        # Blender appends a number to a name in use.
         self.layer_name, self.images = layer.name, {}
         for plan in plans:
             plan.prepare()
@@ -200,7 +199,7 @@ class ObjectBake:
         for number in range(max((plan.count for plan in self.plans), default=0)):
             for plan in self.plans:
                 plan.show(number)
-            # A seed of its own: whatever was baked before, the bytes are the same.
+            # With a fixed seed the bytes do not depend on what was baked before.
             self.scene.cycles.seed, self.scene.cycles.samples = 0, 1
             found.append(self._bake(block, "EMIT", set()))
         return np.array(found)
@@ -261,8 +260,8 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
     return BakeView("point", tuple(wanted), bent)
 
 
-# What may differ between jobs that one open file serves.
-_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images", "watch_parent", "temporary")
+# Keys of a job that may differ while the same file stays open.
+_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images", "temporary")
 
 
 @dataclass(frozen=True)
@@ -312,7 +311,7 @@ _kept: dict[str, tuple] = {}
 
 
 def opened_scene(job: dict, progress) -> BakeScene:
-    """The file of `job` (see `bake_child.BakeJob`), opened unless it is already, as it stands on the disk."""
+    """The file of `job` (see `client.BakeJob`), opened unless it is already, as it stands on the disk."""
     status = Path(job["scene"]).stat()
     key = {name: value for name, value in job.items() if name not in _OF_ONE_JOB}
     key = repr(sorted(key.items())), status.st_mtime_ns, status.st_size, pixels.files_opened()
@@ -430,7 +429,7 @@ def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
 
 
 def extract_bake(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `bake_child.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
     started = time.monotonic()
     opened = opened_scene(job, progress)
     names = opened.names if isinstance(job["objects"], str) else job["objects"]
@@ -505,3 +504,22 @@ def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, i
         for tile in tiles_of(uv)[0]
         for first in range(0, height, block_rows)
     ]
+
+
+def scene_facts(job: dict, progress) -> dict:
+    """Do the `job` (see `client.scene_facts`): what there is to bake in which frame; the manifest."""
+    progress("open scene", 0.0)
+    pixels.open_scene(Path(job["scene"]), [], job["scripts"])
+    scene, facts, tiles = bpy.context.scene, [], {}
+    view_layer = render_settings.choose_view_layer(scene, [])
+    own = scene.frame_current
+    for frame in job["frames"]:
+        render_settings.go_to_frame(scene, own if frame is None else frame)
+        chosen = [] if job["objects"] is None else chosen_objects(scene, view_layer, job["objects"])
+        name = scene.camera.name if scene.camera is not None else None
+        for ob in chosen:
+            if ob.name not in tiles:
+                tiles[ob.name] = tiles_without_modifiers(ob, job["uv"])
+        found = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
+        facts.append({**found, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
+    return {"facts": facts}

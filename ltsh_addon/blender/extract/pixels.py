@@ -84,39 +84,24 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
     with pinned_pixel_filter(scene):
-        if sub_samples == 1:
-            return [_render_half(scene, folder, half, seed, samples, progress) for half, seed in SEEDS.items()]
-        return [_render_shifted(scene, folder, half, seed, offsets, share, progress) for half, seed in SEEDS.items()]
+        return [_render_half(scene, folder, half, offsets, share, progress) for half in SEEDS]
 
 
-def _render_shifted(scene, folder: Path, half: str, seed: int, offsets, share: int, progress) -> list[list]:
-    """One file per sub-sample, each with the next `share` samples of one sequence."""
+def _render_half(scene, folder: Path, half: str, offsets, share: int, progress) -> list[list]:
+    """One file per sub-sample, each with the next `share` samples of one sequence; that of a single one in chunks."""
     cycles = scene.cycles
-    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, share * len(offsets), True
-    files = []
-    for index, offset in enumerate(offsets):
-        progress(f"Cycles {half}", index / len(offsets))
-        cycles.sample_offset, cycles.sample_subset_length = index * share, share
-        files.append([f"cycles_{half}_{index:04d}.exr", share])
-        with shifted_pixels(scene, offset):
-            render_exr(scene, folder / files[-1][0])
-    cycles.use_sample_subset = False
-    return files
-
-
-def _render_half(scene, folder: Path, half: str, seed: int, samples: int, progress) -> list[list]:
-    cycles = scene.cycles
-    cycles.seed, cycles.samples, cycles.use_sample_subset = seed, samples, True
-    files, done, chunk = [], 0, min(FIRST_CHUNK, samples)
+    files, done, samples = [], 0, share * len(offsets)
+    chunk = share if len(offsets) > 1 else min(FIRST_CHUNK, share)
+    cycles.seed, cycles.samples, cycles.use_sample_subset = SEEDS[half], samples, True
     while done < samples:
         progress(f"Cycles {half}", done / samples)
         started = time.monotonic()
         cycles.sample_offset, cycles.sample_subset_length = done, min(chunk, samples - done)
-        name = f"cycles_{half}_{len(files):04d}.exr"
-        render_exr(scene, folder / name)
-        files.append([name, cycles.sample_subset_length])
+        files.append([f"cycles_{half}_{len(files):04d}.exr", cycles.sample_subset_length])
+        with shifted_pixels(scene, offsets[done // share]):
+            render_exr(scene, folder / files[-1][0])
         done += cycles.sample_subset_length
-        if len(files) == 1 and done < samples:
+        if len(offsets) == 1 and len(files) == 1 and done < samples:
             seconds_left = (time.monotonic() - started) * (samples - done) / done
             chunks = min(MAX_CHUNKS, max(1, round(seconds_left / CHUNK_SECONDS)))
             chunk = -(-(samples - done) // chunks)
@@ -143,12 +128,11 @@ _files_opened = 0
 
 
 def files_opened() -> int:
-    """How many times `open_scene` was called: what was read from a file holds until the next time."""
+    """How many times `open_scene` was called; what was read from a file is valid until the next time."""
     return _files_opened
 
 
-# So many of a kind are named in an error.
-NAMED = 5
+NAMED = 5  # of a kind, in an error
 
 
 def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
@@ -216,7 +200,7 @@ def _some(items: list[str], separator: str) -> str:
 
 
 def extract(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `child.extract`), write EXRs into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.extract`), write EXRs into `folder`; the manifest as a dictionary."""
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job.get("scripts", False))

@@ -1,81 +1,72 @@
-"""Processes in the background leave the processor to the window. Imports no bpy."""
+"""The second Blender as a process: how it is started, what both say to each other, how it ends. Imports no bpy.
+
+The parent writes a job to a file, whose path is the last argument of the command; paths of further jobs go to stdin.
+The child answers with messages, lines of stdout that begin with LTSH and go on with JSON; the last of its other lines
+are kept for error texts. The end of stdin tells the child that the parent is gone.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import importlib.util
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
-import time
+import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 
 from ...scene import Cancelled, Progress, SceneError
 
-NICENESS = 10
-# Linux weighs sessions against each other, and niceness only within one (sched(7), "The autogroup feature").
-AUTOGROUP = Path("/proc/self/autogroup")
-# It takes one change in so many seconds, from all users together.
-AUTOGROUP_SECONDS = 0.1
-_TRIES = 5
-
-
-def background_options() -> dict:
-    """Options of `subprocess.Popen` for a process that comes after this one; `yield_to_us` does the rest."""
-    flags = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)  # Windows: its own children inherit it
-    return {"creationflags": flags} if flags else {}
-
-
-def yield_to_us(pid: int) -> None:
-    """Let the process `pid`, which was started just now, come after this one; threads that it starts inherit that."""
-    if hasattr(os, "setpriority"):
-        with contextlib.suppress(OSError):  # it has ended already
-            os.setpriority(os.PRIO_PROCESS, pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
-
-
-def weigh_session() -> None:
-    """Give the session that this process leads the weight that its niceness says."""
-    niceness = os.nice(0) if hasattr(os, "nice") else 0
-    for _ in range(_TRIES if niceness > 0 else 0):
-        try:
-            AUTOGROUP.write_text(str(niceness), encoding="ascii")
-            return
-        except BlockingIOError:
-            time.sleep(AUTOGROUP_SECONDS)
-        except OSError:  # no Linux, or one without sessions' weights
-            return
-
-
-MOST = 8
-
-
-def listed(names: Iterable[str]) -> str:
-    """At most 8 of `names` in quotes and how many more there are; "none" for no names."""
-    names = list(names)
-    text = ", ".join(map(repr, names[:MOST])) or "none"
-    return f"{text} and {len(names) - MOST} more" if len(names) > MOST else text
-
-
 WORKER = Path(__file__).with_name("worker.py")
-OUTPUT_LINES_KEPT = 12
 BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
+MESSAGE = "LTSH "
+OUTPUT_LINES_KEPT = 12
+NICENESS = 10
 
 
-def disk_is_full(error: OSError) -> bool:
-    """True where nothing more can be written: the disk is full, or the quota, or the file as large as may be."""
-    return error.errno in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None))
+def tell(message: dict, stream=None) -> None:
+    """Send a message to the parent: all of it or, where the parent is gone, nothing."""
+    stream = stream or sys.stdout
+    stream.write(MESSAGE + json.dumps(message) + "\n")
+    stream.flush()
 
 
-def no_room(folder: Path, error: OSError) -> str:
-    """What to say of an error that is `disk_is_full` in a temporary folder."""
-    remedy = "make room, or let TMPDIR name another folder"
-    return f"{folder.parent}: no room for temporary files ({error.strerror}); {remedy}"
+def messages(lines: Iterable[str], others: deque[str]) -> Iterator[dict]:
+    """The messages among the `lines` that a child prints; all other lines go to `others`."""
+    for line in lines:
+        message = None
+        if line.startswith(MESSAGE):
+            with contextlib.suppress(ValueError):
+                message = json.loads(line[len(MESSAGE) :])
+        if isinstance(message, dict):
+            yield message
+        elif line.strip():
+            others.append(line.strip())
+
+
+def ended(code: int, others: Iterable[str]) -> str:
+    """Error text for a child that ended too early; `others` are the last lines that it printed."""
+    return f"Blender ended with code {code}; its last output: {' | '.join(others) or 'none'}"
+
+
+def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda line: None) -> None:
+    """In a child: `take` the lines of stdin in a thread. When the parent is gone, delete the `temporary` folders, which
+    it can no longer delete, and end this process."""
+
+    def listen():
+        for line in iter(sys.stdin.buffer.readline, b""):
+            take(line.decode("utf-8", "surrogateescape").removesuffix("\n"))
+        for folder in temporary:
+            shutil.rmtree(folder, ignore_errors=True)
+        os._exit(3)
+
+    threading.Thread(target=listen, daemon=True).start()
 
 
 def child_command(job: Path, script: Path = WORKER) -> list[str]:
@@ -96,9 +87,9 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
 
 
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
-    """`command` as a process whose own files go to `folder`; the end of its stdin tells it that we are gone.
+    """`command` as a process whose own files go to `folder`.
 
-    One in the `background` comes after this process wherever both want the processor.
+    One in the `background` gets the processor after this process, as does all that it starts.
     """
     process = subprocess.Popen(
         command,
@@ -110,39 +101,39 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
         errors="replace",
         cwd=folder,
         # The user's preferences and start-up files have no say in the result.
-        # Blender leaves its own temporary folder behind when it is ended: ours goes with all that is in it.
+        # Blender leaves its own temporary folder behind when it is killed: that one goes with ours.
         env={
             **os.environ,
             **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder)),
             "BLENDER_USER_RESOURCES": str(folder / "user"),
             "PYTHONUNBUFFERED": "1",
         },
-        # Ctrl-C goes to the parent alone, which ends the child.
-        start_new_session=True,
-        **(background_options() if background else {}),
+        # Ctrl-C goes to the parent alone, which ends the child. Not a session: Linux shares the processor between
+        # sessions first, and niceness counts only within one.
+        process_group=0,
+        creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0) if background else 0,
     )
-    if background:
-        yield_to_us(process.pid)
+    if background and hasattr(os, "setpriority"):
+        os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
     return process
 
 
 class BlenderProcess:
-    """Runs worker.py, from the first job on; `folder` takes all that Blender writes on its own."""
+    """A Blender that runs worker.py, from the first job on; `folder` takes all that Blender writes on its own."""
 
     def __init__(self, folder: Path):
         self._folder = folder
         self._child: subprocess.Popen | None = None
 
     def do(self, job: dict, folder: Path, progress: Progress | None) -> dict:
-        """Do `job` in `folder`, report its progress; the manifest that was written. After an error Blender is ended."""
+        """Do `job` in `folder` and report its progress; the manifest that was written. After an error Blender ends."""
         job_path = folder / "job.json"
         temporary = [str(self._folder), str(folder)]
-        job_path.write_text(json.dumps({**job, "watch_parent": True, "temporary": temporary}), encoding="utf-8")
-        last_lines: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
+        job_path.write_text(json.dumps({**job, "temporary": temporary}), encoding="utf-8")
         try:
             self._hand_over(job_path)
-            self._follow(progress, last_lines)
-            return self._read_manifest(folder / "manifest.json", last_lines)
+            self._follow(progress)
+            return json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
         except BaseException:
             self.end()
             raise
@@ -158,38 +149,26 @@ class BlenderProcess:
                 self.end()
         self._child = start(child_command(job_path), self._folder)
 
-    def _follow(self, progress, last_lines) -> None:
-        """Report progress until the job is done, or Blender has ended."""
-        for line in self._child.stdout:
-            if line.startswith("LTSH "):
-                report = json.loads(line[len("LTSH ") :])
-                if "done" in report:
-                    return
-                if "error" in report:
-                    raise SceneError(report["error"])
-                if progress is not None and progress(report["stage"], report["fraction"]) is False:
-                    raise Cancelled(f"cancelled at {report['stage']}")
-            elif line.strip():
-                last_lines.append(line.strip())
-        self._child.wait()
-
-    def _read_manifest(self, path: Path, last_lines) -> dict:
-        if not path.is_file():
-            output = " | ".join(last_lines) or "none"
-            raise SceneError(f"Blender ended with code {self._child.poll()} and no result; its last output: {output}")
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        if "error" in manifest:
-            raise SceneError(manifest["error"])
-        return manifest
+    def _follow(self, progress) -> None:
+        """Report progress until the job is done. Raises SceneError, and Cancelled where `progress` returns False."""
+        others: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
+        for message in messages(self._child.stdout, others):
+            if "done" in message:
+                return
+            if "error" in message:
+                raise SceneError(message["error"])
+            if progress is not None and progress(message["stage"], message["fraction"]) is False:
+                raise Cancelled(f"cancelled at {message['stage']}")
+        raise SceneError(ended(self._child.wait(), others))
 
     def end(self) -> None:
-        """End and reap Blender, whatever state it is in. It has nothing to save, so it is not asked."""
+        """End Blender, whatever it is doing; it has nothing to save."""
         child, self._child = self._child, None
         if child is None:
             return
         if child.poll() is None:
             if hasattr(os, "killpg"):
-                os.killpg(child.pid, signal.SIGKILL)  # it leads a group of its own
+                os.killpg(child.pid, signal.SIGKILL)
             else:
                 child.kill()
             child.wait()
@@ -221,8 +200,15 @@ def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
     kept = _kept.get()
     if kept is not None:
         return kept.do(job, folder, progress)
-    process = BlenderProcess(folder)
-    try:
-        return process.do(job, folder, progress)
-    finally:
-        process.end()
+    with kept_blender(folder):
+        return run_child(job, folder, progress)
+
+
+MOST = 8
+
+
+def listed(names: Iterable[str]) -> str:
+    """At most 8 of `names` in quotes and how many more there are; "none" for no names."""
+    names = list(names)
+    text = ", ".join(map(repr, names[:MOST])) or "none"
+    return f"{text} and {len(names) - MOST} more" if len(names) > MOST else text

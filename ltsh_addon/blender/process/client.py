@@ -1,15 +1,11 @@
-"""Which Blender has saved a .blend, read from its first bytes, and which one runs here. Imports no bpy."""
+"""What is asked of the second Blender, and how its files become samples, lights and pictures. Imports no bpy."""
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import importlib.metadata
-import math
 import re
-import signal
 import sys
-import threading
-import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,77 +13,11 @@ import numpy as np
 
 from ...cycles import gbuffer, lobes
 from ...cycles.horizons import end_at_horizons_of_cycles
-from ...files import locked_folder, replacing_by_copy
+from ...files import replacing_by_copy, temporary_folder
+from ...imaging.color import identified
+from ...imaging.exr import read_channels
 from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples
-from . import blender_process
-from .blender_process import disk_is_full, no_room, run_child
-
-# Of a .blend as it is, or compressed by Blender since 3.0 and before.
-PLAIN, ZSTANDARD, GZIP = b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b"
-STARTS = (PLAIN, ZSTANDARD, GZIP)
-# Pointers, byte order and version, since 5.0 with the size of the header and the version of the format before.
-_HEADER = re.compile(rb"BLENDER(?:[-_][vV](\d{3})|\d\d-\d\dv(\d{4}))")
-_HEADER_BYTES = 17
-# More than a first block of either compression has.
-_READ_BYTES = 1 << 18
-
-Version = tuple[int, int]
-
-
-def saved_with(path: Path) -> Version | None:
-    """Major and minor version of the Blender that saved the file; None where that cannot be told."""
-    with path.open("rb") as file:
-        start = file.read(_READ_BYTES)
-    match = _HEADER.match(_unpacked(start))
-    return divmod(int(match[1] or match[2]), 100) if match else None
-
-
-def running() -> Version | None:
-    """Major and minor version of the Blender that will open files; None where there is none."""
-    bpy = sys.modules.get("bpy")
-    if bpy is not None:
-        return tuple(bpy.app.version[:2])
-    try:
-        found = importlib.metadata.version("bpy")
-    except importlib.metadata.PackageNotFoundError:
-        return None
-    return tuple(int(part) for part in found.split(".")[:2])
-
-
-def newer(path: Path, saved: Version, here: Version) -> str:
-    """What is wrong with a file that was `saved` by a newer Blender than the one that is `here`."""
-    saved, here = (".".join(map(str, version)) for version in (saved, here))
-    return (
-        f"{path}: was saved by Blender {saved}, but this is Blender {here}, which may miss parts of it: use Blender "
-        f"{saved}, or save the file with {here}"
-    )
-
-
-def _unpacked(start: bytes) -> bytes:
-    """The header of a file that starts with `start`; less of it where it cannot be unpacked."""
-    if start.startswith(GZIP):
-        with contextlib.suppress(zlib.error):
-            return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, _HEADER_BYTES)
-        return b""
-    if start.startswith(ZSTANDARD):
-        return _unpacked_zstandard(start)
-    return start[:_HEADER_BYTES]
-
-
-def _unpacked_zstandard(start):
-    try:
-        import zstandard  # comes with Blender, but for that of some Linux distributions
-    except ImportError:
-        return b""
-    with contextlib.suppress(zstandard.ZstdError):
-        return zstandard.ZstdDecompressor().stream_reader(start).read(_HEADER_BYTES)
-    return b""
-
-
-# Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
-# on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
-COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
-RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
+from .blender_process import run_child
 
 
 @dataclass(frozen=True)
@@ -105,6 +35,10 @@ class ExtractOptions:
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
+
+
+# Fields of `Extraction` that are those of the manifest.
+UNCHANGED = ("blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter")
 
 
 @dataclass(frozen=True)
@@ -158,89 +92,25 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
             reference=read_reference(manifest, folder),
-            blender_version=manifest["blender_version"],
-            frame=manifest["frame"],
-            camera=manifest["camera"],
-            seconds=manifest["seconds"],
-            exposure=manifest["exposure"],
             border=None if manifest["border"] is None else Border(**manifest["border"]),
-            pixel_aspect=manifest["pixel_aspect"],
-            pixel_filter=manifest["pixel_filter"],
-            color_space=_color_space(manifest["color_space"]),
+            color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
             emission=_read_emission(manifest, folder) if options.emission else None,
+            **{name: manifest[name] for name in UNCHANGED},
         )
 
 
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
     """Build the example scene and save it as the .blend `path`, at once or not at all. Raises SceneError, OSError."""
-    from ...files import replacing_by_copy
-
     with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
-def check_readable(scene: Path) -> None:
-    """Raise where a look at the file says enough, so that Blender need not start."""
-    try:
-        if not scene.exists():
-            raise SceneError(f"{scene}: no such file, expected a .blend")
-        if scene.is_dir():
-            raise SceneError(f"{scene}: is a folder, expected a .blend")
-        if not scene.is_file():  # reading a pipe or a device might never end
-            raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
-        with scene.open("rb") as file:
-            start = file.read(7)
-        saved = saved_with(scene)
-    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
-        reason = getattr(error, "strerror", None) or error
-        raise SceneError(f"{str(scene)[:200]!r}: cannot be read: {reason}") from None
-    if not start:
-        raise SceneError(f"{scene}: the file is empty, expected a .blend")
-    if not start.startswith(STARTS):
-        raise SceneError(f"{scene}: is no .blend, it starts with {start!r}")
-    here = running()
-    if saved and here and saved > here:
-        raise SceneError(newer(scene, saved, here))
-
-
-@contextlib.contextmanager
-def temporary_folder():
-    """A folder that is there meanwhile. Raises OSError, which names the folder where its disk is full."""
-    with termination_as_exception(), locked_folder() as folder:
-        try:
-            yield folder
-        except OSError as error:
-            # Errors of other files have their names in the text, and no number.
-            if disk_is_full(error) and str(error.filename or folder).startswith(str(folder)):
-                raise OSError(no_room(folder, error)) from error
-            raise
-
-
-@contextlib.contextmanager
-def termination_as_exception():
-    """Turn SIGTERM into SystemExit meanwhile, so that child and folder are cleaned up; leaves other handlers alone."""
-
-    def stop(number, frame):
-        raise SystemExit(128 + number)
-
-    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    if ours:
-        signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        if ours:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
 def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
     """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
-    from ...imaging.exr import read_channels
-
     width, height = manifest["width"], manifest["height"]
     renders, unusable, unnamed = [], 0, 0
     for index, name in enumerate(manifest["samples"]):
-        channels = read_channels(folder / name)
+        channels = _rendered(folder / name)
         gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
@@ -254,47 +124,21 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
         warnings.append(f"{unusable} samples are not shaded: {what}")
     if unnamed:
         warnings.append(f"{unnamed} pixels show a surface whose material could not be read: not shaded")
-    warnings += note_coarse_meshes(samples)
+    warnings += gbuffer.coarse_meshes(samples)
     if len(samples) == 0:
         warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
     return samples, film, warnings
 
 
-def note_coarse_meshes(samples: SurfaceSamples) -> list[str]:
-    """The warning about smooth-shaded meshes so coarse that Cycles' own sampling decides about their light."""
-    cosine = np.abs(np.sum(samples.smooth_normal * samples.geometric_normal, axis=-1))
-    # The geometric normal of ribbons that pretend to be round hair is the view direction.
-    is_ribbon = np.abs(np.sum(samples.view * samples.geometric_normal, axis=-1)) > 1.0 - RIBBON_TOLERANCE
-    count = np.count_nonzero((cosine < math.cos(COARSE_ANGLE)) & ~is_ribbon)
-    if count <= COARSE_SHARE * len(samples):
-        return []
-    degrees = math.degrees(COARSE_ANGLE)
-    return [
-        f"{count} of {len(samples)} samples lie on faces whose smooth normals are more than {degrees:.0f} degrees from "
-        "their own: there it depends on how Cycles samples how much light comes from between both horizons (2 %); "
-        "more faces help"
-    ]
-
-
 def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
     """What surfaces emit, the mean of all sample renders."""
-    from ...imaging.exr import read_channels
-
     name = manifest["passes"]["emission"]
-    images = [lobes.read_layer(read_channels(folder / file), name, "RGB") for file in manifest["samples"]]
+    images = [lobes.read_layer(_rendered(folder / file), name, "RGB") for file in manifest["samples"]]
     return np.mean(images, axis=0, dtype=np.float64)
-
-
-def _color_space(record: dict) -> ColorSpace:
-    from ...imaging.color import identified
-
-    return identified(record["to_rec709"], record["name"])
 
 
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
     """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
-    from ...imaging.exr import read_channels
-
     if manifest["reference"] is None:
         return None
     passes = manifest["passes"]
@@ -303,12 +147,20 @@ def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None
     for half, chunks in enumerate(manifest["reference"]):
         total = sum(count for _, count in chunks)
         for name, count in chunks:
-            channels = read_channels(folder / name)
+            channels = _rendered(folder / name)
             for lobe, image in sums.items():
                 light = lobes.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
                 image[half] += count / total * light * lobes.read_layer(channels, passes[f"{lobe}_color"], "RGB")
     exposure = manifest.get("exposure", 1.0)
     return {lobe: (exposure * image).astype(np.float32) for lobe, image in sums.items()}
+
+
+def _rendered(path: Path) -> dict[str, np.ndarray]:
+    """The channels of a picture that Blender rendered. Raises OSError where it is not whole: Blender is silent then."""
+    try:
+        return read_channels(path)
+    except ValueError as error:
+        raise OSError(errno.ENOSPC, "a picture was not written whole") from error
 
 
 @dataclass(frozen=True)
@@ -340,8 +192,7 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
     """
     scene = Path(job.scene).absolute()
     check_readable(scene)
-    with termination_as_exception():
-        return blender_process.run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
+    return run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
 
 def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
@@ -352,7 +203,7 @@ def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progr
     """
     with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
         job = {"task": "apply", "scene": str(Path(scene).absolute()), "path": str(unfinished), "textures": textures}
-        return blender_process.run_child(job, folder, progress)["warnings"]
+        return run_child(job, folder, progress)["warnings"]
 
 
 def scene_facts(
@@ -362,11 +213,70 @@ def scene_facts(
     "tiles", the UDIM tiles by name of those of which each can be a task of its own.
 
     `objects` are names, "selected", "all", or None for none; `uv` is a UV map, None for the active ones;
-    `scripts` of the file run only if asked for. Raises as `child.extract` does.
+    `scripts` of the file run only if asked for. Raises as `extract` does.
     """
     scene = Path(scene).absolute()
     check_readable(scene)
     job = {"task": "facts", "scene": str(scene), "frames": list(frames), "objects": objects, "uv": uv}
     job["scripts"] = scripts
     with temporary_folder() as folder:
-        return blender_process.run_child(job, folder, progress)["facts"]
+        return run_child(job, folder, progress)["facts"]
+
+
+# What a .blend starts with: as it is, or compressed by Blender since 3.0 and before.
+STARTS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
+# Pointers, byte order and version, since 5.0 with the size of the header and the version of the format before.
+_HEADER = re.compile(rb"BLENDER(?:[-_][vV](\d{3})|\d\d-\d\dv(\d{4}))")
+_HEADER_BYTES = 17
+
+Version = tuple[int, int]
+
+
+def check_readable(scene: Path) -> None:
+    """Raise SceneError where a look at the file says enough, so that Blender need not start."""
+    try:
+        if not scene.exists():
+            raise SceneError(f"{scene}: no such file, expected a .blend")
+        if scene.is_dir():
+            raise SceneError(f"{scene}: is a folder, expected a .blend")
+        if not scene.is_file():  # reading a pipe or a device might never end
+            raise SceneError(f"{scene}: is a device or a pipe, expected a .blend")
+        with scene.open("rb") as file:
+            start = file.read(_HEADER_BYTES)
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL
+        reason = getattr(error, "strerror", None) or error
+        raise SceneError(f"{str(scene)[:200]!r}: cannot be read: {reason}") from None
+    if not start:
+        raise SceneError(f"{scene}: the file is empty, expected a .blend")
+    if not start.startswith(STARTS):
+        raise SceneError(f"{scene}: is no .blend, it starts with {start[:7]!r}")
+    saved, here = saved_with(start), running()
+    if saved and here and saved > here:
+        raise SceneError(newer(scene, saved, here))
+
+
+def saved_with(start: bytes) -> Version | None:
+    """Major and minor version of the Blender that saved a file with this start; None where it is compressed."""
+    match = _HEADER.match(start)
+    return divmod(int(match[1] or match[2]), 100) if match else None
+
+
+def running() -> Version | None:
+    """Major and minor version of the Blender that will open files; None where there is none."""
+    bpy = sys.modules.get("bpy")
+    if bpy is not None:
+        return tuple(bpy.app.version[:2])
+    try:
+        found = importlib.metadata.version("bpy")
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    return tuple(int(part) for part in found.split(".")[:2])
+
+
+def newer(path: Path, saved: Version, here: Version) -> str:
+    """Error text for a file that was `saved` by a newer Blender than the one that is `here`."""
+    saved, here = (".".join(map(str, version)) for version in (saved, here))
+    return (
+        f"{path}: was saved by Blender {saved}, but this is Blender {here}, which may miss parts of it: use Blender "
+        f"{saved}, or save the file with {here}"
+    )

@@ -28,7 +28,6 @@ from .settings import preferences
 STARTING = "Starting"
 SURE_SECONDS = 3.0  # before, nobody knows how long it will take
 SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
-MESSAGE = "LTSH "
 ENDING_SECONDS = 10.0
 NO_CYCLES = "Not complete: without Cycles"
 # What stages of the command line are called there and here; others keep their names.
@@ -278,19 +277,14 @@ class Job:
         threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
 
     def _listen(self) -> None:
-        last_lines: deque[str] = deque(maxlen=blender_process.OUTPUT_LINES_KEPT)
+        others: deque[str] = deque(maxlen=blender_process.OUTPUT_LINES_KEPT)
         with self._process.stdout:
-            for line in self._process.stdout:
-                message = parsed(line)
-                if message is not None:
-                    self._messages.put(message)
-                elif line.strip():
-                    last_lines.append(line.strip())
+            for message in blender_process.messages(self._process.stdout, others):
+                self._messages.put(message)
         code = self._process.wait()
         self._process.stdin.close()
         if code != 0:
-            output = " | ".join(last_lines) or "none"
-            self._messages.put({"error": f"Blender ended with code {code}; its last output: {output}"})
+            self._messages.put({"error": blender_process.ended(code, others)})
         self._messages.put({"end": True})
 
     def poll(self) -> bool:
@@ -372,17 +366,6 @@ def _library_folders() -> list[str]:
     """Where the process finds what this Blender got with the extension."""
     spec = importlib.util.find_spec("OpenEXR")
     return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
-
-
-def parsed(line: str) -> dict | None:
-    """The message that `line` carries, or None for anything else that a process prints."""
-    if not line.startswith(MESSAGE):
-        return None
-    try:
-        message = json.loads(line[len(MESSAGE) :])
-    except ValueError:
-        return None
-    return message if isinstance(message, dict) else None
 
 
 def clock(seconds: float) -> str:

@@ -7,7 +7,7 @@ import pytest
 import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
 
-from ltsh_addon.blender.process.client import note_coarse_meshes
+from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.scene import AreaLight, SurfaceSamples
@@ -96,8 +96,8 @@ def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, sides, tu
 
 def test_coarse_meshes_are_named_where_they_fill_the_picture():
     fine = samples_near_the_horizon(0.5, count=100)
-    assert note_coarse_meshes(fine) == []
+    assert coarse_meshes(fine) == []
     normal = fine.geometric_normal.copy()
     normal[:50] = (np.sin(0.7), 0.0, np.cos(0.7))
-    (line,) = note_coarse_meshes(replace(fine, geometric_normal=normal))
+    (line,) = coarse_meshes(replace(fine, geometric_normal=normal))
     assert "50 of 100 samples" in line and "35 degrees" in line

@@ -1,4 +1,6 @@
-"""What Blender leaves of a picture where the disk is full is told from a whole one."""
+"""A picture that Blender could not write whole is told from a whole one, and why is said in one line."""
+
+import errno
 
 import numpy as np
 import OpenEXR
@@ -6,57 +8,67 @@ import pytest
 import scene_parts
 
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.render_settings import is_whole
-from ltsh_addon.imaging.exr import writing_rows
+from ltsh_addon.blender.process import client
+from ltsh_addon.files import temporary_folder
+from ltsh_addon.imaging.exr import read_channels
 
 
 def parts(path):
+    """As Blender 5.0 writes it, a part for each pass."""
     pixels = np.random.default_rng(0).normal(size=(40, 9)).astype(np.float32)
     made = [OpenEXR.Part({}, {f"{name}.V": pixels}, name) for name in ("a", "b")]
     with OpenEXR.File(made) as file:
         file.write(str(path))
 
 
-def rows(path):
-    pixels = np.random.default_rng(0).normal(size=(70, 9)).astype(np.float32)
-    with writing_rows(path, ["a", "b"], 9, 70, {"long": "x" * 999}) as writer:
-        writer.write({"a": pixels, "b": pixels})
-
-
-@pytest.mark.parametrize("write", [parts, rows])
-def test_no_cut_file_is_whole(tmp_path, write):
-    path, cut = tmp_path / "a.exr", tmp_path / "b.exr"
-    write(path)
-    assert is_whole(path)
-    data = path.read_bytes()
-    for length in {*range(0, len(data), 53), len(data) - 1}:
-        cut.write_bytes(data[:length])
-        assert not is_whole(cut), length
-
-
-def test_what_is_there_before_the_end_of_writing_is_not_whole(tmp_path):
-    pixels = np.ones((64, 9), np.float32)
-    with writing_rows(tmp_path / "a.exr", ["a"], 9, 70) as writer:
-        writer.write({"a": pixels})
-        (half,) = tmp_path.glob(".a.exr.*.tmp")
-        assert not is_whole(half)
-        writer.write({"a": pixels[:6]})
-
-
-@pytest.mark.parametrize("size", [(4, 4), (33, 50)])
-def test_what_blender_renders_is_whole(tmp_path, size):
-    """`render_exr` itself checks it, too."""
+def rendered(path, size=(33, 50)):
     scene = scene_parts.empty_scene(*size)
     scene_parts.add_camera()
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    render_settings.render_exr(scene, tmp_path / "a.exr")
-    assert is_whole(tmp_path / "a.exr")
+    render_settings.render_exr(scene, path)
 
 
-def test_a_picture_that_is_not_whole_is_an_error_of_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr(render_settings, "is_whole", lambda path: False)
-    scene = scene_parts.empty_scene(4, 4)
-    scene_parts.add_camera()
-    scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    with pytest.raises(OSError, match="not written whole"):
-        render_settings.render_exr(scene, tmp_path / "a.exr")
+@pytest.mark.parametrize("write", [parts, rendered])
+def test_no_cut_picture_is_read(tmp_path, write):
+    path, cut = tmp_path / "a.exr", tmp_path / "b.exr"
+    write(path)
+    assert read_channels(path)
+    data = path.read_bytes()
+    for length in {*range(0, len(data), 53), len(data) - 1}:
+        cut.write_bytes(data[:length])
+        with pytest.raises(ValueError, match=r"b\.exr"):
+            read_channels(cut)
+
+
+def test_a_picture_that_is_not_whole_says_where_room_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(OSError) as error, temporary_folder() as folder:
+        parts(folder / "a.exr")
+        (folder / "a.exr").write_bytes((folder / "a.exr").read_bytes()[:-1])
+        client._rendered(folder / "a.exr")
+    assert str(error.value) == (
+        f"{tmp_path}: no room for temporary files (a picture was not written whole); "
+        "make room, or let TMPDIR name another folder"
+    )
+
+
+def test_a_picture_that_is_as_large_as_may_be_is_an_error_of_the_disk(tmp_path):
+    resource = pytest.importorskip("resource", reason="limits of Unix")
+    rendered(tmp_path / "whole.exr")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "whole.exr").stat().st_size - 9, before[1]))
+    try:
+        with pytest.raises(OSError) as error:
+            rendered(tmp_path / "a.exr")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert error.value.errno == errno.EFBIG
+
+
+@pytest.mark.parametrize("size", [(4, 4), (33, 50)])
+def test_a_whole_picture_stays_as_it_was_rendered(tmp_path, size, monkeypatch):
+    """Trying whether there is room leaves no trace."""
+    rendered(tmp_path / "a.exr", size)
+    monkeypatch.setattr(render_settings, "check_room_after", lambda path: None)
+    rendered(tmp_path / "b.exr", size)
+    assert (tmp_path / "a.exr").stat().st_size == (tmp_path / "b.exr").stat().st_size

@@ -161,10 +161,11 @@ def test_cancelling_ends_the_child(tmp_path, temporary_root):
     assert left_over(temporary_root) == []
 
 
-def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary_root):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_parent_that_is_ended_takes_its_child_and_their_folders_along(tmp_path, temporary_root, number):
     path = saved_scene(tmp_path / "scene.blend")
     code = (
-        "import sys\nfrom ltsh_addon.blender.process.client import *\n"
+        "from ltsh_addon.blender.process.client import *\n"
         "def progress(stage, fraction):\n    print(stage, flush=True)\n"
         f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
     )
@@ -176,42 +177,18 @@ def test_terminating_the_parent_ends_the_child_and_clears_up(tmp_path, temporary
             if line.strip() == "Cycles A":
                 break
         children = _children_of(parent.pid)
-        parent.send_signal(signal.SIGTERM)
-        assert parent.wait(30) == 128 + signal.SIGTERM
+        parent.send_signal(number)
+        assert parent.wait(30) == -number
     finally:
         watchdog.cancel()
         parent.kill()
         parent.stdout.close()
         parent.wait()
-    assert len(children) == 1 and not _is_alive(children[0])
-    assert left_over(temporary_root) == []
-
-
-def test_a_killed_parent_takes_its_child_along(tmp_path):
-    path = saved_scene(tmp_path / "scene.blend")
-    code = (
-        "from ltsh_addon.blender.process.client import *\n"
-        "def progress(stage, fraction):\n    print(stage, flush=True)\n"
-        f"extract(ExtractOptions({str(path)!r}, width=600, height=400, cycles_samples=100000), progress=progress)\n"
-    )
-    parent = subprocess.Popen(
-        programs.python(code),
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
-    for line in parent.stdout:
-        if line.strip() == "Cycles A":
-            break
-    children = _children_of(parent.pid)
-    parent.kill()
-    parent.wait()
-    parent.stdout.close()
     deadline = time.monotonic() + 20.0
     while any(_is_alive(child) for child in children) and time.monotonic() < deadline:
         time.sleep(0.1)
     assert len(children) == 1 and not _is_alive(children[0])
+    assert left_over(temporary_root) == []
 
 
 def test_the_command_is_this_python_with_pips_bpy_or_this_blender(tmp_path):

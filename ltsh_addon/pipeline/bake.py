@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from .. import imaging, shading
+from ..files import temporary_folder
 from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples
 from ..shading.parallel import cores
 from . import picture
@@ -65,7 +66,7 @@ def bake_objects(
     tables = picture.prepare(options)
     client.check_readable(options.scene)
     finished = TileRecords(options)
-    with client.temporary_folder() as folder:
+    with temporary_folder() as folder:
         manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
         found = file_stems(names) if options.name is None else [options.name]

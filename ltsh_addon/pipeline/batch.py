@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 
+from ..files import temporary_folder
 from ..imaging import write_json, write_overview
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture
@@ -55,7 +56,6 @@ def run_tasks(
     record can be written.
     """
     from ..blender.process.blender_process import kept_blender
-    from ..blender.process.client import temporary_folder
 
     picture.prepare(job.options)
     with temporary_folder() as folder, kept_blender(folder):

@@ -5,7 +5,7 @@ World space is Blender's: metres, right-handed, z up. Radiance is scene-referred
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -29,6 +29,13 @@ Progress = Callable[[str, float], "bool | None"]
 def error_line(error: BaseException) -> str:
     """The message of an error in one line; its class where it has none."""
     return " ".join(str(error).split()) or type(error).__name__
+
+
+def listed(texts: Iterable[str], most: int = 8, separator: str = ", ") -> str:
+    """At most so many of `texts` and how many more there are; "none" for no texts."""
+    texts = list(texts)
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return (separator.join(texts[:most]) or "none") + more
 
 
 @dataclass(frozen=True)

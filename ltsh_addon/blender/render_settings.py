@@ -10,10 +10,9 @@ import mathutils
 import numpy as np
 
 from ..files import check_room_after
-from ..scene import Border, SceneError
+from ..scene import Border, SceneError, listed
 from ..shading.parallel import cores
 from .evaluated import SURFACE_TYPES
-from .process.blender_process import listed
 
 DEFAULTS = {"film_exposure": 1.0, "is_portal": False, "use_bump_map_correction": True}
 
@@ -51,7 +50,7 @@ def choose_camera(scene, name: str | None):
     else:
         camera = scene.objects.get(name)
         if camera is None or camera.type != "CAMERA":
-            cameras = listed(ob.name for ob in scene.objects if ob.type == "CAMERA")
+            cameras = listed(repr(ob.name) for ob in scene.objects if ob.type == "CAMERA")
             raise SceneError(f"camera {name!r} is not in scene {scene.name!r}; cameras there: {cameras}")
     if camera.type != "CAMERA":
         raise SceneError(
@@ -236,7 +235,7 @@ VIEW_LAYER = "ltsh"
 def choose_view_layer(scene, warnings: list[str], name: str | None = None):
     """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
     if name is not None and name not in scene.view_layers:
-        layers = listed(layer.name for layer in scene.view_layers)
+        layers = listed(repr(layer.name) for layer in scene.view_layers)
         raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
     used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
     if name is not None:

@@ -3,7 +3,7 @@
 import pytest
 
 from ltsh_addon import cli
-from ltsh_addon.blender.process.blender_process import listed
+from ltsh_addon.scene import listed
 
 
 @pytest.mark.parametrize(
@@ -40,6 +40,6 @@ def test_help_says_what_a_command_does_and_gives_examples(capsys, command):
 
 
 def test_some_of_many_names_are_listed_and_counted():
-    text = listed(f"Chair {number}" for number in range(20))
+    text = listed(repr(f"Chair {number}") for number in range(20))
     assert text.startswith("'Chair 0', 'Chair 1', ") and text.count("'") == 2 * 8 and text.endswith(" and 12 more")
-    assert listed(iter(("A", "B"))) == "'A', 'B'" and listed(()) == "none"
+    assert listed(iter(("A", "B"))) == "A, B" and listed(()) == "none"

@@ -14,7 +14,7 @@ import numpy as np
 from ...cycles.texels import BakeView, TexelMesh
 from ...cycles.uv import tiles_of
 from ...files import save_array
-from ...scene import FARTHEST, SceneError, error_line
+from ...scene import FARTHEST, SceneError, error_line, listed
 from .. import render_settings
 from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights, seen_lights
@@ -27,7 +27,6 @@ from ..materials.aovs import (
 )
 from ..materials.graph import ensure_nodes
 from ..materials.maps import MaterialPlan, SavedImages
-from ..process.blender_process import listed
 from ..render_settings import working_space
 from . import pixels
 from .pixels import SEEDS, remove_occlusion
@@ -77,7 +76,7 @@ def chosen_objects(scene, view_layer, wanted) -> list:
         return objects
     missing = [name for name in wanted if name not in view_layer.objects]
     if missing:
-        names = listed(ob.name for ob in view_layer.objects if ob.type == "MESH")
+        names = listed(repr(ob.name) for ob in view_layer.objects if ob.type == "MESH")
         raise SceneError(f"object {missing[0]!r} is not in scene {scene.name!r}; meshes there: {names}")
     return [view_layer.objects[name] for name in wanted]
 

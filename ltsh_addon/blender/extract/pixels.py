@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...scene import SceneError, error_line
+from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
@@ -22,7 +22,6 @@ from ..materials.aovs import (
     remove_aovs,
 )
 from ..process import client
-from ..process.blender_process import listed
 from ..render_settings import (
     enable_passes,
     filter_name,
@@ -188,15 +187,10 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
 def no_light(scene, reasons: list[str]) -> SceneError:
     """The error of a scene in which no light can be shaded, with the first `reasons`."""
     found = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
-    text = f"found lights {_some(found, ', ')}" if found else "found no lights at all"
+    text = f"found lights {listed(found, NAMED)}" if found else "found no lights at all"
     if reasons:
-        text += f" ({_some([line.partition('; left out')[0] for line in reasons], '; ')})"
+        text += f" ({listed((line.partition('; left out')[0] for line in reasons), NAMED, '; ')})"
     return SceneError(f"scene {scene.name!r}: no area light that renders, {text}; add an area light")
-
-
-def _some(items: list[str], separator: str) -> str:
-    more = [f"and {len(items) - NAMED} more"] if len(items) > NAMED else []
-    return separator.join([*items[:NAMED], *more])
 
 
 def extract(job: dict, folder: Path, progress) -> dict:
@@ -240,7 +234,7 @@ def _scene_named(name: str | None):
     if name is None:
         return bpy.context.scene
     if name not in bpy.data.scenes:
-        scenes = listed(scene.name for scene in bpy.data.scenes)
+        scenes = listed(repr(scene.name) for scene in bpy.data.scenes)
         raise SceneError(f"scene {name!r} is not in the file; scenes there: {scenes}")
     return bpy.data.scenes[name]
 

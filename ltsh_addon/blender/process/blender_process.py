@@ -202,13 +202,3 @@ def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
         return kept.do(job, folder, progress)
     with kept_blender(folder):
         return run_child(job, folder, progress)
-
-
-MOST = 8
-
-
-def listed(names: Iterable[str]) -> str:
-    """At most 8 of `names` in quotes and how many more there are; "none" for no names."""
-    names = list(names)
-    text = ", ".join(map(repr, names[:MOST])) or "none"
-    return f"{text} and {len(names) - MOST} more" if len(names) > MOST else text

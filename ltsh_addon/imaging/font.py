@@ -17,8 +17,6 @@ from functools import lru_cache
 
 import numpy as np
 
-CAP_HEIGHT = 14.0
-X_HEIGHT = 10.0
 ASCENT = 16.0  # highest stroke center: brackets
 DESCENT = 4.4  # lowest stroke center: g, p, q
 DIGIT_WIDTH = 8.4  # all digits take the same room, so that numbers stand in columns
@@ -129,16 +127,6 @@ STROKES = {
     "\u2212": "M0 6L8 6",  # minus
     "\u2013": "M0 5.4L7 5.4",  # en dash
     "\u2014": "M0 5.4L11 5.4",  # em dash
-    "\u00b1": "M0 7.6L8 7.6M4 11.6L4 3.6M0 0L8 0",  # plus-minus
-    "\u00d7": "M0 2.6L7 9.4M0 9.4L7 2.6",  # times
-    "\u00b7": "M0 5.6L0 5.3",  # middle dot
-    "\u2022": "M1 6h0 5v1 4h2 5v1 6M1 5.2L1 4.8",  # bullet
-    "\u00b0": "M2.4 14.6h0 12.2v2.4 9.8h4.8 12.2v2.4 14.6",  # degree
-    "\u00b2": "M.2 13C.3 14.2 1.2 15 2.4 15h4.6 12.8C4.6 11.2 3 10.2 .1 7.4L4.8 7.4",  # superscript two
-    "\u00b5": "M0 10L0 -4.4M0 3.8v3.2 0h6.6 4.4M6.6 10L6.6 0",  # micro
-    "\u2264": "M7.6 11.4L0 7.4L7.6 3.4M0 0L7.6 0",  # less or equal
-    "\u2265": "M0 11.4L7.6 7.4L0 3.4M0 0L7.6 0",  # greater or equal
-    "\u2192": "M0 6L10 6M6.6 9.4L10 6L6.6 2.6",  # arrow
     "\u2026": "M0 .3L0 0M4 .3L4 0M8 .3L8 0",  # ellipsis
 }
 
@@ -205,7 +193,7 @@ def _drawable(text: str) -> str:
 def _extent(size: float, bold: bool) -> tuple[int, int]:
     """Pixels above and below the baseline that hold all ink, anti-aliasing included."""
     unit = size / _UNITS_PER_EM
-    margin = _STROKE_WIDTH[bold] * unit / 2.0 + 1.0  # rounding to the pixel grid moves a stroke by half a pixel
+    margin = _STROKE_WIDTH[bold] * unit / 2.0 + 1.0
     return int(np.ceil(ASCENT * unit + margin)), int(np.ceil(DESCENT * unit + margin))
 
 
@@ -218,26 +206,13 @@ def _glyph(character: str, size: float, bold: bool) -> tuple[np.ndarray, int]:
     if character == " ":
         advance = max(1, round((SPACE_WIDTH + 2.0 * _BEARING) * unit))
         return np.zeros((ascent + descent, advance)), advance
-    segments, horizontal, vertical = _segments(STROKES.get(character, REPLACEMENT))
+    segments = _segments(STROKES.get(character, REPLACEMENT))
     digit = character.isdigit() and character.isascii()
     low, high = (0.0, DIGIT_WIDTH) if digit else (segments[..., 0].min(), segments[..., 0].max())
-    bearing = _BEARING * unit + stroke_width / 2.0
-    advance = int(np.ceil((high - low) * unit + 2.0 * bearing))
-    segments = segments * unit
-    x_keys = np.unique(np.array([low, high, *vertical])) * unit
-    y_keys = np.unique(np.array([-DESCENT, 0.0, X_HEIGHT, CAP_HEIGHT, *horizontal])) * unit
-    slack = (advance - (high - low) * unit) / 2.0 - low * unit  # the glyph stands in the middle of its advance
-    x = _fitted(segments[..., 0], x_keys, slack, stroke_width)
-    y = ascent - _fitted(segments[..., 1], y_keys, 0.0, stroke_width)
+    advance = int(np.ceil((high - low + 2.0 * _BEARING) * unit + stroke_width))
+    x = (segments[..., 0] - 0.5 * (low + high)) * unit + 0.5 * advance
+    y = ascent - segments[..., 1] * unit
     return _coverage(np.stack([x, y], axis=-1), (ascent + descent, advance), stroke_width), advance
-
-
-def _fitted(values: np.ndarray, keys: np.ndarray, offset: float, stroke_width: float) -> np.ndarray:
-    """`values` + `offset`, bent so that strokes centered at `keys` fill whole pixels instead of straddling them."""
-    center = 0.5 if round(stroke_width) % 2 else 0.0
-    snapped = np.floor(keys + offset - center + 0.5) + center
-    inside = np.interp(values, keys, snapped)
-    return inside + np.minimum(values - keys[0], 0.0) + np.maximum(values - keys[-1], 0.0)
 
 
 def _coverage(segments: np.ndarray, shape: tuple[int, int], stroke_width: float) -> np.ndarray:
@@ -262,24 +237,19 @@ def _blend(image: np.ndarray, x: int, y: int, coverage: np.ndarray, color) -> No
 
 
 @lru_cache(maxsize=512)
-def _segments(path: str) -> tuple[np.ndarray, tuple[float, ...], tuple[float, ...]]:
-    """Line segments (S, 2, 2) of a stroke path, the y of its horizontal and the x of its vertical lines."""
-    segments, horizontal, vertical = [], [], []
-    pen = np.zeros(2)
+def _segments(path: str) -> np.ndarray:
+    """Line segments (S, 2, 2) of a stroke path."""
+    segments, pen = [], np.zeros(2)
     for command, rest in re.findall(r"([MLhvC])([^MLhvC]*)", path):
         points = np.array([float(number) for number in re.findall(r"-?[\d.]+", rest)]).reshape(-1, 2)
         end = points[-1]
         if command == "L":
             segments.append((pen, end))
-            if pen[1] == end[1]:
-                horizontal.append(float(end[1]))
-            if pen[0] == end[0]:
-                vertical.append(float(end[0]))
         elif command != "M":
             curve = _curve(pen, _controls(command, pen, points), end)
             segments.extend(zip(curve[:-1], curve[1:], strict=True))
         pen = end
-    return np.array(segments), tuple(horizontal), tuple(vertical)
+    return np.array(segments)
 
 
 def _controls(command: str, start: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -47,8 +47,8 @@ def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
     kept = ["__init__.py", "LICENSE", *MANUAL, "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py",
             "tables/a.npz"]  # fmt: skip
     left = ["Makefile", "README.md", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py",
-            "tables/README.md", "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run", "ltsh.zip",
-            "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
+            "tables/README.md", "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run",
+            "ltsh.zip", "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
             "ltsh_addon/.hidden"]  # fmt: skip
     for name in kept + left:
         (source / name).parent.mkdir(parents=True, exist_ok=True)

@@ -225,7 +225,7 @@ def _chunks(members):
 
 
 def _add_double(samples, members, lights, radiance, shade):
-    """Add the light of `lights` at the samples `members` (Q,) by a function of `float64`."""
+    """Add the light of `lights` at the samples `members` (Q,) by a function of `double_precision`."""
     for start in range(0, len(members), DOUBLE_CHUNK):
         index = members[start : start + DOUBLE_CHUNK]
         target = np.zeros((len(radiance), len(index), 3))

@@ -1,6 +1,6 @@
 """Shading in double precision: exact polygons, any degree, and the reference quadrature.
 
-`float32` is the fast path; the points for which that is not accurate come here.
+`single_precision` is the fast path; the points for which that is not accurate come here.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ CORNERS = 49216
 
 
 def integrate(table, cosine, roughness, vertices, signed):
-    """Integrals (P,) as `integrate_polygon` returns them, all arrays float32, and the indices of the
+    """Integrals (P,) as `lobe_integrals.integrate_polygon` returns them, all arrays float32, and the indices of the
     points whose values are not accurate."""
     count, corners = vertices.shape[:2]
     ridges, scratch = moments32.prepare(table), moments32.Scratch()

@@ -415,8 +415,8 @@ class RidgeTable:
 
 
 def prepare(table: LookupTable) -> RidgeTable:
-    """The table for the hot path, with weights of the moments, made once per table. Degrees above
-    MAX_DEGREE have none: ValueError."""
+    """The table for the hot path, with weights of the moments of `edge_loop`, made once per table. Degrees above
+    `edge_loop.MAX_DEGREE` have none: ValueError."""
     return _kept(table, "_ridge_table", lambda: _ridge_product(table.ridge_weights, form_matrix(table.degree)))
 
 

@@ -5,15 +5,19 @@ linear transform turns the lobe into something simple and keeps polygons polygon
 2016), a spherical harmonics expansion in LTSH (Allmenroeder and Peters 2021), which follows the tear shape of grazing
 highlights. Either way the integral has a closed form, so the picture has no noise.
 
-    scene      the shared vocabulary: techniques, AreaLight, SurfaceSamples, Film
-    files      how files are written, and what dead processes left is deleted
-    shading    the paper: lookup table, polygon, edge integrals, `shade`, reference quadrature (numpy only)
-    cycles     how Cycles shades: closures, normals, G-buffers, UV rasters (numpy only)
-    imaging    EXR, metrics, false color, comparison sheet, report
-    blender    .blend to lights and samples, Cycles renders, viewport, panels, render engine (all that knows bpy)
-    pipeline   a .blend in, files out: options, pictures, bakes, tasks; what scripts call
-    cli        the command line
-    panel_job  the process that a panel starts
+These are the rooms of the package. A room imports only itself and rooms above it; of the rooms of `blender`, `ui`,
+`engine` and `registration` come last.
+
+    interruption  Ctrl-C and SIGTERM as exceptions
+    scene         the shared vocabulary: AreaLight, SurfaceSamples, Film, errors, names of techniques and passes
+    files         how files are written, and how leftovers of dead processes are deleted
+    shading       the paper: lookup table, polygons, integrals, `shade`, reference quadrature (numpy only)
+    cycles        how Cycles shades: BSDF formulas, normals, G-buffers, UV rasters (numpy only)
+    imaging       EXR, metrics, color, comparison sheet, report
+    blender       .blend to lights and samples, Cycles renders, viewport, panels, render engine (all that knows bpy)
+    pipeline      a .blend in, files out: pictures, bakes, tasks
+    cli           the command line
+    panel_job     the process that a panel starts
 """
 
 

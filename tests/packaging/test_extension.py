@@ -3,6 +3,7 @@
 import hashlib
 import importlib.util
 import os
+import posixpath
 import re
 import shutil
 import tomllib
@@ -10,6 +11,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from test_documents import links_of
 from test_symbolic_wheel import fake_library, fake_wheel
 
 from requirements import build_extension
@@ -22,6 +24,8 @@ WHEEL_TAGS = {
     "macos-x64": "macosx_10_15_x86_64",
     "windows-x64": "win_amd64",
 }
+# The manual and what it links to, from its folder.
+MANUAL = ["docs/manual.md"] + [f"docs/{name}" for name in links_of((ROOT / "docs/manual.md").read_text("utf-8"))]
 needs_tool = pytest.mark.skipif(importlib.util.find_spec("bpy") is None, reason="the tool comes with bpy")
 
 
@@ -40,12 +44,11 @@ def test_blender_accepts_the_manifest():
 def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
     """On a copy with one file of every kind, so that the answer does not hang on what lies in this clone."""
     source = tmp_path / "source"
-    kept = ["__init__.py", "LICENSE", "README.md", "docs/manual.md", "ltsh_addon/__init__.py",
-            "ltsh_addon/blender/x.py", "ltsh_addon/blender/glsl/x.glsl", "ltsh_addon/shading/glsl/x.h",
+    kept = ["__init__.py", "LICENSE", *MANUAL, "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py",
             "tables/a.npz"]  # fmt: skip
-    left = ["Makefile", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py", "tables/README.md",
-            "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run", "ltsh.zip",
-            "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
+    left = ["Makefile", "README.md", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py",
+            "tables/README.md", "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run",
+            "ltsh.zip", "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
             "ltsh_addon/.hidden"]  # fmt: skip
     for name in kept + left:
         (source / name).parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +105,7 @@ def test_each_platform_gets_a_zip_with_its_own_wheels(stand_ins, zips):
     hidden = re.compile(r"(^|/)(\.|__pycache__/)")
     code = [path.relative_to(ROOT).as_posix() for path in ROOT.glob("ltsh_addon/**/*") if path.is_file()]
     tables = [f"tables/{path.name}" for path in ROOT.glob("tables/*.npz")]
-    common = {"blender_manifest.toml", "__init__.py", "README.md", "LICENSE", "docs/manual.md", *tables}
+    common = {"blender_manifest.toml", "__init__.py", "LICENSE", *MANUAL, *tables}
     common |= {name for name in code if not hidden.search(name)}
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
     names = [f"ltsh-{version}-{name.replace('-', '_')}.zip" for name in sorted(PLATFORMS)]
@@ -116,6 +119,19 @@ def test_each_platform_gets_a_zip_with_its_own_wheels(stand_ins, zips):
         generated = manifest["build"]["generated"]
         assert generated == {"platforms": [platform], "wheels": [f"./{name}" for name in own]}
     assert sorted(path.name for path in stand_ins.iterdir()) == [*names, "wheels"]
+
+
+@needs_tool
+def test_links_and_pictures_in_a_zip_are_there(zips):
+    for path in zips:
+        with zipfile.ZipFile(path) as archive:
+            documents = [name for name in archive.namelist() if name.endswith(".md")]
+            links = [
+                posixpath.normpath(posixpath.join(posixpath.dirname(name), link))
+                for name in documents
+                for link in links_of(archive.read(name).decode())
+            ]
+            assert documents and set(links) <= set(archive.namelist()), path.name
 
 
 @needs_tool

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from . import comparison, results
 from .job import output_folder
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs" / "manual.md"
+# Text editors show no pictures.
+PICTURE_LINE = re.compile(r"^!\[.*\)\n\n?", re.MULTILINE)
 ARRANGE_SECONDS, ARRANGE_TRIES = 0.2, 50
 COMMANDS = (
     ("shade", "Shade", "What Shade Camera View left last"),
@@ -167,7 +170,7 @@ class LTSH_OT_manual(bpy.types.Operator):
                 self.report({"ERROR"}, f"{MANUAL}: cannot be read: {error.strerror}; install the extension again")
                 return {"CANCELLED"}
             text = bpy.data.texts.new("LTSH Manual")
-            text.write(content)
+            text.write(PICTURE_LINE.sub("", content))
             text.cursor_set(0)
         if context.window is None:
             return {"FINISHED"}

@@ -105,6 +105,8 @@ def _stage(folder: Path, wheels: list[Path]) -> None:
     _checked("build", "--source-dir", ROOT, "--output-filepath", plain)
     with zipfile.ZipFile(plain) as archive:
         archive.extractall(folder)
+    readme = folder / "README.md"
+    readme.write_text(without_dead_links(readme.read_text(encoding="utf-8"), folder), encoding="utf-8")
     (folder / "wheels").mkdir()
     for wheel in wheels:
         if "manylinux" in wheel.name:
@@ -114,6 +116,18 @@ def _stage(folder: Path, wheels: list[Path]) -> None:
     manifest = folder / MANIFEST
     names = [f"./wheels/{path.name}" for path in (folder / "wheels").iterdir()]
     manifest.write_text(with_wheels(manifest.read_text(encoding="utf-8"), names), encoding="utf-8")
+
+
+def without_dead_links(text: str, folder: Path) -> str:
+    """Markdown without pictures that are not below `folder`; of other links to what is not there the text stays."""
+
+    def kept(match: re.Match) -> str:
+        shows, words, target, end = match.groups()
+        if target.startswith(("https://", "#")) or (folder / target).is_file():
+            return match[0]
+        return "" if shows else words + end
+
+    return re.sub(r"(!?)\[([^\]]*)\]\(([^)]*)\)(\n*)", kept, text)
 
 
 def with_wheels(manifest: str, wheels: list[str]) -> str:

@@ -44,9 +44,9 @@ def test_blender_accepts_the_manifest():
 def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
     """On a copy with one file of every kind, so that the answer does not hang on what lies in this clone."""
     source = tmp_path / "source"
-    kept = ["__init__.py", "LICENSE", *MANUAL, "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py",
-            "tables/a.npz"]  # fmt: skip
-    left = ["Makefile", "README.md", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py",
+    kept = ["__init__.py", "LICENSE", "README.md", *MANUAL, "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py",
+            "ltsh_addon/blender/glsl/x.glsl", "ltsh_addon/shading/glsl/x.h", "tables/a.npz"]  # fmt: skip
+    left = ["Makefile", "pyproject.toml", "CHANGELOG.md", "tests/test_x.py", "tables/fit.py",
             "tables/README.md", "out/demo/a.png", "requirements/py313.txt", ".venv/py313/bin/python", ".ci/run",
             "ltsh.zip", "build/wheels/a.whl", "farm/README.md", "docs/demo.png", "ltsh_addon/__pycache__/x.pyc",
             "ltsh_addon/.hidden"]  # fmt: skip
@@ -105,7 +105,7 @@ def test_each_platform_gets_a_zip_with_its_own_wheels(stand_ins, zips):
     hidden = re.compile(r"(^|/)(\.|__pycache__/)")
     code = [path.relative_to(ROOT).as_posix() for path in ROOT.glob("ltsh_addon/**/*") if path.is_file()]
     tables = [f"tables/{path.name}" for path in ROOT.glob("tables/*.npz")]
-    common = {"blender_manifest.toml", "__init__.py", "LICENSE", *MANUAL, *tables}
+    common = {"blender_manifest.toml", "__init__.py", "LICENSE", "README.md", *MANUAL, *tables}
     common |= {name for name in code if not hidden.search(name)}
     version = tomllib.loads((ROOT / "blender_manifest.toml").read_text(encoding="utf-8"))["version"]
     names = [f"ltsh-{version}-{name.replace('-', '_')}.zip" for name in sorted(PLATFORMS)]

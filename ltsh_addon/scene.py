@@ -239,9 +239,11 @@ class SurfaceSamples:
         return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
     def save(self, path) -> None:
-        """Write a compressed .npz, which `load` reads back bit for bit."""
-        with Path(path).open("wb") as stream:
+        """Write a compressed .npz, whole or not at all, which `load` reads back bit for bit."""
+        unfinished = Path(f"{path}.tmp")
+        with unfinished.open("wb") as stream:
             np.savez_compressed(stream, **{field.name: getattr(self, field.name) for field in fields(self)})
+        unfinished.replace(path)
 
     @classmethod
     def load(cls, path) -> SurfaceSamples:

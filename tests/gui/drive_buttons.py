@@ -117,7 +117,7 @@ def baked(rig):
     # Panels below one that became shorter move for a moment.
     yield 3
     rig.check(max(image_pixels("LTSH floor ltsh4.combined"), default=0.0) > 0.1, "the baked texture is an image")
-    result = module("interface.results").result_of(bpy.context.scene)
+    result = module("ui.results").result_of(bpy.context.scene)
     rig.check(result is not None and result.command == "bake", "the results are those of the bake")
     rig.shot("5_baked.png")
     yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *BAKE_HEADER))

@@ -55,7 +55,7 @@ def cancelled(rig):
     rig.check(stopped.cancelled and seconds < 0.5 + 3.0 * pulse.longest, "Cancel ends the job at once")
     yield from until(lambda: not stopped.folder.exists())
     rig.check(not stopped.folder.exists(), "and the second Blender goes with its files")
-    result = module("interface.results").result_of(bpy.context.scene)
+    result = module("ui.results").result_of(bpy.context.scene)
     rig.check(result is not None and "Cycles" in result.partial, "what was finished is kept, and marked as partial")
     yield 1
     rig.shot("3_cancelled.png")

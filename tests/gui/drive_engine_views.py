@@ -135,7 +135,7 @@ def resized(rig, whole):
 
 def with_an_error(rig):
     """What goes wrong is said in the view; the picture comes back when it is over."""
-    mirror = module("viewport.scene_mirror").SceneMirror
+    mirror = module("viewport.mirror").SceneMirror
     sync = mirror.sync
 
     def broken(self, *arguments):

@@ -48,7 +48,7 @@ def started(rig):
 
 def after_the_add_on(function):
     """Let Python call `function` at its end, after the add-on's own: what is registered last is called first."""
-    end_now = module("interface.operators")._end_now
+    end_now = module("ui.operators")._end_now
     atexit.unregister(end_now)
     atexit.register(function)
     atexit.register(end_now)

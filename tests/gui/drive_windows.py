@@ -18,7 +18,7 @@ def main(rig):
 
 
 def results_of(scene):
-    return module("interface.results").result_of(scene)
+    return module("ui.results").result_of(scene)
 
 
 def second_window(rig):

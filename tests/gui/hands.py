@@ -18,7 +18,7 @@ def module(name):
 
 def job():
     """The job that runs, or None."""
-    return module("interface.operators").running_job()
+    return module("ui.operators").running_job()
 
 
 def settings():

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -237,22 +236,6 @@ class SurfaceSamples:
     def take(self, index) -> SurfaceSamples:
         """The samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
         return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})
-
-    def save(self, path) -> None:
-        """Write a compressed .npz, whole or not at all, which `load` reads back bit for bit."""
-        unfinished = Path(f"{path}.tmp")
-        with unfinished.open("wb") as stream:
-            np.savez_compressed(stream, **{field.name: getattr(self, field.name) for field in fields(self)})
-        unfinished.replace(path)
-
-    @classmethod
-    def load(cls, path) -> SurfaceSamples:
-        """Read what `save` wrote."""
-        with np.load(Path(path)) as data:
-            missing = [field.name for field in fields(cls) if field.name not in data]
-            if missing:
-                raise ValueError(f"{path}: no surface samples, {', '.join(missing)} missing")
-            return cls(**{field.name: data[field.name] for field in fields(cls)})
 
 
 @dataclass(frozen=True)

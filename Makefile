@@ -10,19 +10,20 @@ PYTEST_OPTIONS ?=
 # Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
 STRICT ?=
 
-.PHONY: help demo test lint tables lock clean bench soak extension test-blender test-gui test-farm test-3.13 test-3.11
+.PHONY: help demo test test-fast lint tables lock clean bench soak extension test-blender test-gui test-farm test-3.13 test-3.11
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    build the example scene, shade it, compare it with Cycles: out/demo/compare.png, report.json'
 	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
+	@echo 'make test-fast  the tests that need no Blender, on one Python'
 	@echo 'make test-blender BLENDER=path  the tests of tests/blender inside that Blender'
 	@echo 'make test-gui RUNNER=command  clicks through the extension in a Blender with a window, see tests/gui/README.md'
 	@echo 'make test-farm   the Slurm scripts in farm/ on a Slurm of one machine (installs it where root on Debian)'
 	@echo 'make lint    ruff only'
 	@echo 'make extension  the zips that Blender installs, one per platform: build/ltsh-*.zip'
 	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (6 minutes)'
-	@echo 'make soak    commands killed at random moments, 10,000 lights, 240 frames, 1e8 random integrals and 1e5 polygons of each kind (hours)'
+	@echo 'make soak    long tests, commands killed at random moments, 10,000 lights, 240 frames, 1e8 random integrals and 1e5 polygons of each kind (hours)'
 	@echo 'make tables  fit the lookup tables in tables/ again (long)'
 	@echo 'make lock    resolve requirements/*.in into the lock files; LOCK_OPTIONS=--upgrade takes newer versions'
 	@echo 'make clean   remove out/, build/ and caches (the environments in .venv stay)'
@@ -45,10 +46,12 @@ test: lint
 lint:
 	@python=$$($(SETUP) python newest) && "$$python" -m ruff check .
 
+# What needs no Blender runs on the newest Python alone, but for a few tests of what may differ between versions.
 test-3.13 test-3.11: test-%:
 	@status=0; python=$$($(SETUP) python $*) || status=$$?; \
 	if [ $$status -eq 0 ]; then \
-		$(LIMIT) "$$python" -m pytest $(PYTEST_OPTIONS) || status=$$?; \
+		which='not soak'; [ "$$python" = "$$($(SETUP) python newest)" ] || which='(blender or smoke) and not soak'; \
+		$(LIMIT) "$$python" -m pytest -m "$$which" $(PYTEST_OPTIONS) || status=$$?; \
 		[ $$status -ne 124 ] || echo "make: pytest on Python $* was stopped after $(PYTEST_SECONDS) seconds" >&2; \
 	elif [ $$status -eq 3 ]; then \
 		echo "*** NOT TESTED: Python $* was not found, so its Blender version was left out." >&2; \
@@ -56,6 +59,9 @@ test-3.13 test-3.11: test-%:
 		status=$(if $(STRICT),1,0); \
 	fi; \
 	exit $$status
+
+test-fast:
+	@python=$$($(SETUP) python newest) && $(LIMIT) "$$python" -m pytest --ignore=tests/blender $(PYTEST_OPTIONS)
 
 BLENDER ?= blender
 
@@ -79,7 +85,7 @@ bench:
 	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)
 
 soak:
-	@python=$$($(SETUP) python newest) && "$$python" tests/soak/kill_soak.py $(KILL_OPTIONS) && \
+	@python=$$($(SETUP) python newest) && "$$python" -m pytest -m soak && "$$python" tests/soak/kill_soak.py $(KILL_OPTIONS) && \
 	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/pipeline/test_hostile_scenes.py -k many_lights && \
 	"$$python" tests/benchmarks/animation.py $(ANIMATION_OPTIONS) && \
 	"$$python" tests/soak/soak.py $(SOAK_OPTIONS)

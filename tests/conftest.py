@@ -6,6 +6,7 @@ import platform
 import signal
 import sys
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -14,12 +15,29 @@ settings.register_profile("ltsh", derandomize=True, deadline=None, database=None
 settings.load_profile("ltsh")
 
 EXIT_STATUS = pytest.StashKey[int]()
+TESTS = Path(__file__).parent
+# Files that need no bpy, of what may depend on the versions of Python and numpy: `make test` runs them on both.
+SMOKE = {
+    "cli/test_cli_arguments.py", "imaging/test_exr.py", "packaging/test_environment.py", "pipeline/test_compare.py",
+    "pipeline/test_jobs.py", "shading/test_single_precision.py", "test_scene.py",
+}  # fmt: skip
 
 
 def pytest_sessionstart(session):
     """Shells start what runs in the background with Ctrl-C ignored, and children inherit that."""
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Marks by place, before `-m` looks at them."""
+    for item in items:
+        path = item.path.relative_to(TESTS).as_posix()
+        if path.startswith("blender/"):
+            item.add_marker("blender")
+        elif path in SMOKE:
+            item.add_marker("smoke")
 
 
 def pytest_report_header():
@@ -54,6 +72,12 @@ def child(monkeypatch):
     import fake_scene
 
     return fake_scene.FakeChild().install(monkeypatch)
+
+
+@pytest.fixture
+def out(tmp_path):
+    """An output folder that is not there yet."""
+    return tmp_path / "out"
 
 
 @pytest.fixture

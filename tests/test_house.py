@@ -220,13 +220,13 @@ def test_there_are_few_files_and_no_crumbs():
     assert not crumbs, f"fewer than {FEWEST_LINES} lines, belongs into its importer: {crumbs}"
 
 
-@pytest.mark.parametrize("folder", ["shading", "imaging"])
-def test_core_tests_do_not_need_blender(folder):
+@pytest.mark.parametrize("folder", "shading cycles imaging pipeline cli tables packaging farm helpers".split())
+def test_tests_outside_tests_blender_need_none(folder):
     users = [
         str(path.relative_to(ROOT))
         for path in sources(ROOT / "tests" / folder)
         for item in imports_of(path)
-        if item.target.split(".")[0] in BLENDER_MODULES or item.target.startswith("ltsh_addon.blender")
+        if item.target.split(".")[0] in BLENDER_MODULES
     ]
     assert not users, users
 

@@ -7,7 +7,7 @@ import pytest
 from surface_scenes import area_light, random_samples
 
 from ltsh_addon.files import load_samples, save_samples
-from ltsh_addon.scene import AREA_LIGHT_SHAPES, AreaLight, Film, SurfaceSamples
+from ltsh_addon.scene import AREA_LIGHT_SHAPES, Film, SurfaceSamples
 
 shapes = pytest.mark.parametrize("shape", AREA_LIGHT_SHAPES)
 
@@ -58,11 +58,6 @@ def test_lights_refuse_what_makes_no_sense():
     for field, value in wrong.items():
         with pytest.raises(ValueError, match=f"light 'Lamp': {field} is .*, expected three finite numbers"):
             replace(area_light("Lamp"), **{field: value})
-
-
-def test_lights_become_float64_arrays():
-    light = area_light(center=[0, 1, 2])
-    assert isinstance(light, AreaLight) and light.center.dtype == np.float64
 
 
 @pytest.mark.parametrize("field", [field.name for field in fields(SurfaceSamples)])

@@ -1,11 +1,36 @@
 """Fixtures of several tests that start Blender."""
 
+import sys
 import tempfile
 
 import pytest
 import scene_parts as parts
 
 import ltsh_addon
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.scene import SceneError
+
+
+@pytest.fixture(scope="session", autouse=True)
+def kept_blender(tmp_path_factory):
+    """One second Blender does the jobs of all tests but those that take `own_blender`.
+
+    It goes on after a scene that it could not do, which saves its start.
+    """
+    with blender_process.kept_blender(tmp_path_factory.mktemp("blender")):
+        process = blender_process._kept.get()
+        end, process.end = process.end, lambda: isinstance(sys.exc_info()[1], SceneError) or end()
+        yield
+        process.end = end
+
+
+@pytest.fixture
+def own_blender():
+    """Jobs start a Blender of their own, as for users; no other one runs meanwhile."""
+    blender_process._kept.get().end()
+    token = blender_process._kept.set(None)
+    yield
+    blender_process._kept.reset(token)
 
 
 @pytest.fixture
@@ -18,7 +43,7 @@ def addon():
 
 
 @pytest.fixture
-def temporary_root(tmp_path, monkeypatch):
+def temporary_root(tmp_path, monkeypatch, own_blender):
     """The folder in which temporary folders are made, to see what is left behind."""
     folder = tmp_path / "temporary"
     folder.mkdir()

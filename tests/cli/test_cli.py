@@ -9,24 +9,14 @@ import sys
 from pathlib import Path
 
 import fake_scene
-import numpy as np
 import pytest
+from fake_scene import run
 
-from ltsh_addon import cli, files
+from ltsh_addon import cli, files, panel_job
+from ltsh_addon.cli.progress import MessageProgress
 from ltsh_addon.scene import Cancelled, SceneError
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
-
-
-def run(capsys, *arguments, **options):
-    """Exit code, stdout, stderr."""
-    code = cli.main([str(argument) for argument in arguments], **options)
-    return code, *capsys.readouterr()
 
 
 def run_python(code):
@@ -113,22 +103,6 @@ def test_quiet_keeps_stderr_empty(capsys, child, room, out):
     assert code == 0 and stderr == "" and json.loads(stdout)["warnings"] == [fake_scene.WARNING]
 
 
-def test_a_camera_that_sees_nothing_is_a_warning(capsys, monkeypatch, room, out):
-    fake_scene.FakeChild(empty=True).install(monkeypatch)
-    code, _, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
-    assert code == 0 and stderr.startswith("warning: ") and "sees no surface" in stderr
-
-
-@pytest.mark.parametrize("command", ["compare", "shade", "demo"])
-def test_an_output_folder_that_is_a_file_fails_before_anything_runs(capsys, child, room, tmp_path, command):
-    blocker = tmp_path / "blocker"
-    blocker.write_text("mine")
-    scene = [] if command == "demo" else [room]
-    for folder in (blocker, blocker / "below"):
-        assert_failure(run(capsys, command, *scene, "-o", folder, "--quiet"), "cannot be written")
-    assert child.asked == child.built == [] and blocker.read_text() == "mine"
-
-
 @pytest.mark.skipif(os.name != "posix", reason="permissions of folders as in POSIX")
 def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path, monkeypatch):
     """The system's refusal is imitated: root, who may run the tests, is refused nothing."""
@@ -139,37 +113,6 @@ def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path
     monkeypatch.setattr(files.os, "open", refuse)
     assert_failure(run(capsys, "shade", room, "-o", tmp_path, "--quiet"), "Permission denied")
     assert child.asked == []
-
-
-def _empty(path):
-    path.write_bytes(b"")
-
-
-def _cut(path):
-    whole = (ROOT / "tables" / "ltsh2.npz").read_bytes()
-    path.write_bytes(whole[: len(whole) // 2])
-
-
-def _flipped(path):
-    data = bytearray((ROOT / "tables" / "ltsh2.npz").read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    path.write_bytes(data)
-
-
-def _other_arrays(path):
-    np.savez(path, position=np.zeros(3))
-
-
-@pytest.mark.parametrize("command", ["compare", "shade", "demo"])
-@pytest.mark.parametrize("damage", [None, _empty, _cut, _flipped, _other_arrays, Path.mkdir])
-def test_a_broken_table_fails_before_anything_runs(capsys, child, room, out, tmp_path, command, damage):
-    path = tmp_path / "broken.npz"
-    if damage is not None:
-        damage(path)
-    scene = [] if command == "demo" else [room]
-    result = run(capsys, command, *scene, "-o", out, "--quiet", "--techniques", f"ltc,{path}")
-    assert_failure(result, f"lookup table {path}")
-    assert child.asked == child.built == [] and not out.exists()
 
 
 @pytest.mark.parametrize(
@@ -198,15 +141,6 @@ def test_memory_that_runs_out_has_a_line(capsys, monkeypatch, room, out):
     assert_failure(run(capsys, "compare", room, "-o", out, "--quiet"), "MemoryError")
 
 
-def test_help_in_a_fresh_interpreter_loads_neither_blender_nor_scipy():
-    code = (
-        "import sys\nfrom ltsh_addon import cli\nassert cli.main(['compare', '--help']) == 0\n"
-        "print('loaded', sorted({'bpy', 'scipy', 'OpenEXR'} & set(sys.modules)))\n"
-    )
-    done = run_python(code)
-    assert done.stdout.splitlines()[-1] == "loaded []" and (done.returncode, done.stderr) == (0, "")
-
-
 def test_without_bpy_a_line_says_what_to_install(room, out):
     code = f"""
 import importlib.util as util, sys
@@ -218,3 +152,31 @@ sys.exit(cli.main(["compare", {str(room)!r}, "-o", {str(out)!r}, "--quiet"]))
     done = run_python(code)
     assert (done.returncode, done.stdout) == (1, "") and len(done.stderr.splitlines()) == 1
     assert "no module bpy" in done.stderr and "pip install" in done.stderr and list(out.iterdir()) == []
+
+
+SMALL = ["--techniques", "ltc", "--passes", "diffuse"]
+
+
+def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, room, tmp_path):
+    fake_scene.FakeChild().install(monkeypatch)
+    sent = []
+    arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL]
+    report, _ = panel_job._command(arguments, MessageProgress(sent.append))
+    assert report == json.loads((tmp_path / "out" / "report.json").read_text()) and report["resolution"]
+    stages = list(dict.fromkeys(message["stage"] for message in sent))
+    assert stages[0] == "samples" and stages[-2:] == ["LTC", "write"] and sent[-1]["fraction"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "complaint"),
+    [
+        ([], SceneError("no area light\nthat renders"), "no area light that renders"),
+        (["--aa", "none"], None, "ltsh shade: argument --aa: 'none' was given"),
+        (["--camera", "A"], RuntimeError("what?"), "unexpected error: RuntimeError: what?"),
+    ],
+)
+def test_a_command_that_fails_gives_the_line_that_says_why(monkeypatch, room, tmp_path, arguments, error, complaint):
+    fake_scene.FakeChild(error=error).install(monkeypatch)
+    arguments = ["shade", str(room), "-o", str(tmp_path / "out"), *SMALL, *arguments]
+    report, line = panel_job._command(arguments, MessageProgress([].append))
+    assert report is None and line.startswith(complaint)

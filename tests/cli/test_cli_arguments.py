@@ -4,22 +4,12 @@ import json
 from pathlib import Path
 
 import pytest
+from fake_scene import run
 
-from ltsh_addon import cli, shading
+from ltsh_addon import shading
 from ltsh_addon.cli import commands
 from ltsh_addon.pipeline.options import techniques
 from ltsh_addon.scene import VERSION
-
-
-@pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
-
-
-def run(capsys, *arguments, **options):
-    """Exit code, stdout, stderr."""
-    code = cli.main([str(argument) for argument in arguments], **options)
-    return code, *capsys.readouterr()
 
 
 def assert_misuse(result, complaint):

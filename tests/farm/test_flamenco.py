@@ -8,6 +8,7 @@ from pathlib import Path
 
 import fake_scene
 import pytest
+from kills import contents
 
 from ltsh_addon import cli
 
@@ -108,9 +109,3 @@ def test_all_tasks_together_are_the_single_run_byte_for_byte(tmp_path, monkeypat
     single = ["compare", str(room), "-o", str(tmp_path / "one"), "--frames", "1-5", "--techniques", "ltc"]
     assert cli.main([*single, "--passes", "diffuse", "--cycles-samples", "4", "--quiet"]) == 0
     assert contents(out) == contents(tmp_path / "one") and len(contents(out)) > 10
-
-
-def contents(folder):
-    """Bytes by name of all files below `folder` but for times."""
-    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ltsh_addon import shading
+from ltsh_addon import cli, shading
 from ltsh_addon.blender.process import client
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
@@ -12,6 +12,12 @@ WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
 # Of both halves of the Cycles image around the true one; the factor of A is 1 + NOISE, of B 1 - NOISE.
 NOISE = 0.03
 WARNING = "material 'Glass': transmission is not shaded"
+
+
+def run(capsys, *arguments, **options):
+    """Exit code, stdout and stderr of a command line."""
+    code = cli.main([str(argument) for argument in arguments], **options)
+    return code, *capsys.readouterr()
 
 
 def film() -> Film:

@@ -60,8 +60,8 @@ def ggx(directions, samples):
     cos_o = np.sum(samples.normal * samples.view, axis=-1)[:, None]
     cos_i = _dot(directions, samples.normal)
     half = directions + samples.view[:, None]
-    half /= np.linalg.norm(half, axis=-1, keepdims=True)
-    cos_h, cos_d = _dot(half, samples.normal), np.sum(half * directions, axis=-1)
+    half /= np.sqrt(np.einsum("psk,psk->ps", half, half))[..., None]
+    cos_h, cos_d = _dot(half, samples.normal), np.einsum("psk,psk->ps", half, directions)
     distribution = alpha2 / (np.pi * (cos_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
     lit = (cos_i > 0.0) & (cos_o > 0.0)
     smith = 1.0 / (1.0 + _smith(alpha2, cos_o) + _smith(alpha2, np.where(lit, cos_i, 1.0)))
@@ -87,7 +87,7 @@ def radiance(samples, lights, brdf, count=64, weight=None) -> np.ndarray:
     for light in lights:
         centers, area = patches_of(light, count)
         offset = centers - samples.position[:, None]
-        distance2 = np.sum(offset**2, axis=-1)
+        distance2 = np.einsum("psk,psk->ps", offset, offset)
         directions = offset / np.sqrt(distance2)[..., None]
         cosine = np.maximum(-(directions @ light.direction), 0.0)
         geometry = area * cosine / distance2 * spread_factor(light, cosine)

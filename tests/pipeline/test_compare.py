@@ -1,19 +1,33 @@
 """What a comparison writes, on a scene whose Cycles image is known: truth times 1 + and 1 - fake_scene.NOISE."""
 
+import json
+import math
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import fake_scene
 import numpy as np
 import pytest
-from comparison_runs import FLOAT32, TECHNIQUES, options, written
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline import compare_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene, picture, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
+TECHNIQUES = ("ltc", "ltsh4", "reference")
+# Images pass through float32 once; sums of a few of them differ by a few roundings.
+FLOAT32 = 4 * float(np.finfo(np.float32).eps)
+
+
+def options(folder, **changes):
+    given = {"scene": Path("room.blend"), "techniques": TECHNIQUES, "cycles_samples": 64, **changes}
+    return PictureOptions(output=folder / "out", **given)
+
+
+def written(folder, name="compare.exr"):
+    return imaging.read_layers(folder / "out" / name)
 
 
 def test_layers_have_the_names_of_the_design(child, tmp_path):
@@ -136,3 +150,174 @@ def test_a_comparison_needs_two_cycles_samples(child, tmp_path):
     with pytest.raises(ValueError, match="cycles_samples is 1, expected at least 2"):
         compare_scene(options(tmp_path, cycles_samples=1))
     assert child.asked == [] and not (tmp_path / "out").exists()
+
+
+def without_seconds(report):
+    """What stands in report.json of a report."""
+    return {name: value for name, value in report.items() if name != "seconds"}
+
+
+def check_statistics(figures, pixels):
+    assert set(figures) >= {
+        *("relative_l2", "unbiased_relative_error", "unbiased_squared_error", "relative_rmse", "bias"),
+        *("median_relative_error", "percentile_95_relative_error", "max_absolute_error", "not_finite", "pixels"),
+    }
+    assert figures["pixels"] == pixels and figures["not_finite"] == 0
+    numbers = [value for key, value in figures.items() if key not in ("metals", "dielectrics")]
+    assert all(value is None or math.isfinite(value) for value in numbers)
+
+
+def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("specular", "diffuse")):
+    """The report's schema, by hand."""
+    types = {
+        "scene": str, "camera": str, "frame": int, "resolution": list, "sub_samples": int, "surface_samples": int,
+        "cycles_samples": int, "lights": list, "versions": dict, "tables": dict, "passes": dict,
+        "warnings": list, "exposure": float, "color_space": str,
+        "pixel_aspect": float, "pixel_filter": str,
+    }  # fmt: skip
+    assert set(report) == {*types, "reference", "border"}
+    assert all(isinstance(report[key], kind) for key, kind in types.items())
+    assert set(report["versions"]) == {"ltsh", "blender", "python", "numpy", "OpenEXR"}
+    assert all(isinstance(version, str) and version for version in report["versions"].values())
+    assert set(report["tables"]) == set(techniques)
+    for light in report["lights"]:
+        assert set(light) == {"name", "shape", "group", "radiance", "patches"} and len(light["radiance"]) == 3
+    assert list(report["passes"]) == list(passes)
+    for figures in report["passes"].values():
+        assert list(figures["techniques"]) == list(techniques)
+        for name, row in figures["techniques"].items():
+            if report["cycles_samples"]:
+                check_statistics(row["against_cycles"], pixels)
+            compared = "reference" in techniques and name != "reference"
+            assert ("against_reference" in row) is compared
+            if compared:
+                check_statistics(row["against_reference"], samples)
+                assert {"metals", "dielectrics"} <= set(row["against_reference"])
+
+
+def test_the_report_has_its_schema_and_is_the_file(child, tmp_path):
+    report = compare_scene(options(tmp_path, frame=3, camera="Side", sub_samples=2))
+    on_disk = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    seconds = report.pop("seconds")
+    assert on_disk == json.loads(json.dumps(report))
+    assert json.loads((tmp_path / "out" / "timing.json").read_text(encoding="utf-8")) == {"seconds": seconds}
+    assert set(seconds) == {"start", "samples", "cycles", "techniques", "total"}
+    assert set(seconds["techniques"]) == set(TECHNIQUES) and min(seconds["techniques"]["ltc"].values()) >= 0.0
+    film = fake_scene.film()
+    check_schema(on_disk, pixels=18, samples=len(film.pixel))
+    assert (on_disk["frame"], on_disk["camera"], on_disk["resolution"]) == (3, "Side", [6, 4])
+    assert on_disk["warnings"] == [fake_scene.WARNING] and on_disk["sub_samples"] == 2
+    assert on_disk["surface_samples"] == 35 and on_disk["cycles_samples"] == 64
+    assert on_disk["lights"][1] == {
+        "name": "Light 1", "shape": "SQUARE", "group": "Fill.001", "radiance": [3.0, 3.0, 1.0], "patches": 1
+    }  # fmt: skip
+    asked = child.asked[0]
+    assert (asked.frame, asked.camera, asked.sub_samples, asked.cycles_samples) == (3, "Side", 2, 64)
+
+
+def test_figures_against_cycles_are_those_of_the_known_noise(child, tmp_path):
+    """T = R, A = (1 + n) R, B = (1 - n) R: noise n, e^2 = -n^2 / (1 - n^2), no error against the mean."""
+    report = compare_scene(options(tmp_path))
+    for figures in report["passes"].values():
+        row = figures["techniques"]["reference"]["against_cycles"]
+        assert figures["noise"] == pytest.approx(fake_scene.NOISE, rel=1e-5)
+        expected = -(fake_scene.NOISE**2) / (1.0 - fake_scene.NOISE**2)
+        assert row["unbiased_squared_error"] == pytest.approx(expected, rel=1e-3)
+        assert row["unbiased_relative_error"] == 0.0
+        # The halves are float32, so the rest is their rounding.
+        assert max(row["relative_l2"], abs(row["bias"]), row["relative_rmse"]) < FLOAT32
+
+
+def test_figures_against_the_reference_come_from_samples(child, tmp_path):
+    report = compare_scene(options(tmp_path))
+    samples = fake_scene.samples(35)
+    shaded = [shading.shade(samples, fake_scene.lights(), name) for name in ("reference", "ltc")]
+    truth, found = (part.specular.sum(axis=0) for part in shaded)
+    row = report["passes"]["specular"]["techniques"]["ltc"]["against_reference"]
+    even, odd = slice(0, None, 2), slice(1, None, 2)
+    for index, expected in ((slice(None), row), (even, row["metals"]), (odd, row["dielectrics"])):
+        error = np.linalg.norm((found - truth)[index]) / np.linalg.norm(truth[index])
+        # Radiance is float32: rounding of 6e-8 in a difference of 7e-3.
+        assert expected["relative_l2"] == pytest.approx(error, rel=1e-4) and expected["pixels"] == len(truth[index])
+    assert report["passes"]["diffuse"]["techniques"]["ltc"]["against_reference"]["relative_l2"] < 1e-6
+
+
+def test_material_classes_part_metals_from_dielectrics():
+    samples = replace(
+        fake_scene.samples(5),
+        specular_f90=np.array([[1.0, 1, 1], [0, 0, 0], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6], [0, 0, 0]]),
+        dielectric=np.array([0.0, 1.0, 0.6, 0.4, 0.0]),
+    )
+    classes = picture.material_classes(samples)
+    assert classes["metals"].tolist() == [True, False, False, True, False]
+    assert classes["dielectrics"].tolist() == [False, True, True, False, False]
+
+
+def test_a_reference_on_a_subset_is_stated_and_zero_elsewhere(child, tmp_path):
+    report = compare_scene(options(tmp_path, reference_samples=20))
+    layers, facts = written(tmp_path), report["reference"]
+    assert facts["of"] == 35 and 0 < facts["samples"] <= 20 and isinstance(facts["seed"], int)
+    evaluated = layers["reference.specular"].any(axis=2)
+    inside, film = np.count_nonzero(evaluated), fake_scene.film()
+    assert np.count_nonzero(evaluated.ravel()[film.pixel]) == facts["samples"]
+    for pass_name in ("specular", "diffuse"):
+        for layer in (f"reference.{pass_name}", f"error_reference.{pass_name}"):
+            assert not layers[layer][~evaluated].any()
+        techniques = report["passes"][pass_name]["techniques"]
+        assert techniques["reference"]["against_cycles"]["pixels"] == inside < 18
+        assert techniques["ltc"]["against_cycles"]["pixels"] == 18
+        assert techniques["ltc"]["against_reference"]["pixels"] == facts["samples"]
+        # Pixels of the subset are whole: they agree with Cycles as they do without a subset.
+        assert techniques["reference"]["against_cycles"]["relative_l2"] < FLOAT32
+    again = compare_scene(options(tmp_path, reference_samples=20))
+    assert again["reference"] == facts
+    assert np.array_equal(written(tmp_path)["reference.specular"], layers["reference.specular"])
+    stated = f"{facts['samples']} of 35 samples"
+    assert stated.encode() in (tmp_path / "out" / "compare.exr").read_bytes()
+
+
+def test_a_reference_on_all_samples_says_so(child, tmp_path):
+    facts = compare_scene(options(tmp_path))["reference"]
+    assert (facts["samples"], facts["of"], facts["seed"]) == (35, 35, None)
+    assert 0.0 <= facts["largest_error_estimate"] < 1e-3
+
+
+def test_without_the_reference_nothing_is_compared_with_it(child, tmp_path):
+    report = compare_scene(options(tmp_path, techniques=("ltsh2",)))
+    assert report["reference"] is None
+    check_schema(without_seconds(report), pixels=18, samples=35, techniques=("ltsh2",))
+
+
+def test_the_diffuse_pass_alone(child, tmp_path, monkeypatch):
+    sheets = []
+    make_sheet = imaging.comparison_sheet
+    monkeypatch.setattr(imaging, "comparison_sheet", lambda *a, **k: sheets.append(a) or make_sheet(*a, **k))
+    report = compare_scene(options(tmp_path, passes=("diffuse",)))
+    check_schema(without_seconds(report), pixels=18, samples=35, passes=("diffuse",))
+    layers = written(tmp_path)
+    assert not [name for name in layers if "specular" in name and not name.startswith("samples.")]
+    title, (_, image), tiles = sheets[0]
+    assert "diffuse" in title and np.allclose(image, layers["cycles.diffuse"])
+    assert np.allclose(tiles[0].image, layers["ltc.diffuse"])
+
+
+def test_no_samples_at_all(monkeypatch, tmp_path):
+    fake_scene.FakeChild(empty=True).install(monkeypatch)
+    report = compare_scene(options(tmp_path))
+    check_schema(json.loads((tmp_path / "out" / "report.json").read_text()), pixels=0, samples=0)
+    assert report["surface_samples"] == 0 and "sees no surface" in report["warnings"][0]
+    assert not any(plane.any() for plane in written(tmp_path).values())
+    assert report["passes"]["specular"]["techniques"]["ltc"]["against_cycles"]["relative_l2"] is None
+
+
+def test_shade_writes_its_layers_and_report_and_nothing_else(child, tmp_path):
+    report = shade_scene(options(tmp_path))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"shade.exr", "report.json", "timing.json"}
+    assert child.asked[0].cycles_samples == 0
+    check_schema(without_seconds(report), pixels=18, samples=35)
+    assert report["cycles_samples"] == 0 and "noise" not in report["passes"]["specular"]
+    shaded = written(tmp_path, "shade.exr")
+    assert not [name for name in shaded if name.startswith(("cycles", "error_"))]
+    compare_scene(options(tmp_path))
+    compared = written(tmp_path)
+    assert set(shaded) < set(compared) and all(np.array_equal(shaded[name], compared[name]) for name in shaded)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import fake_scene
 import pytest
+from kills import contents
 
 from ltsh_addon import cli
 from ltsh_addon.pipeline import PictureOptions, batch, tasks
@@ -26,12 +27,6 @@ def run(capsys, *arguments):
     code = cli.main([str(argument) for argument in arguments])
     stdout, stderr = capsys.readouterr()
     return code, stdout, stderr.replace(f"warning: {fake_scene.WARNING}\n", "")
-
-
-def contents(folder):
-    """Bytes by name of all files below `folder` but for times."""
-    files = (path for path in folder.rglob("*") if path.is_file() and "timing" not in str(path.relative_to(folder)))
-    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @pytest.mark.parametrize("command", ["shade", "compare"])

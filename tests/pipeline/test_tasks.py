@@ -4,9 +4,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from fake_scene import run
 
-from ltsh_addon import cli
-from ltsh_addon.pipeline import PictureOptions
+from ltsh_addon.pipeline import PictureOptions, tasks
 from ltsh_addon.pipeline import options as options_module
 from ltsh_addon.pipeline import tasks as tasks_module
 from ltsh_addon.pipeline.tasks import Job, shard_of, tasks_of
@@ -17,12 +17,6 @@ SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
 def job(room, output, command="shade", **changes):
     options = PictureOptions(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
     return Job(command, options, **{"scenes": (room,), **changes})
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout, stderr."""
-    code = cli.main([str(argument) for argument in arguments])
-    return code, *capsys.readouterr()
 
 
 @pytest.mark.parametrize(
@@ -113,3 +107,30 @@ def test_shards_are_disjoint_and_together_everything(room, tmp_path):
         shards = [shard_of(tasks, (number, count)) for number in range(1, count + 1)]
         assert sorted((task for shard in shards for task in shard), key=tasks.index) == tasks
         assert max(map(len, shards)) - min(map(len, shards)) <= 1
+
+
+def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
+    records = tasks.Records(tmp_path, "tiles")
+    names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
+    for name in names:
+        records.write(name, "key", {"name": name}, ())
+    read = []
+    read_one = tasks._read
+    monkeypatch.setattr(tasks, "_read", lambda path: read.append(path) or read_one(path))
+
+    def found(*stems):
+        return {record["task"]["name"] for record in records.all_whole("key", stems or None)}
+
+    assert found() == set(names) and found("Floor") == {"Floor.1001", "Floor.1002"} and len(read) == len(names) + 2
+    assert found("a[b]") == {"a[b].1001"} and found("y") == set()
+    assert found("x/Floor", "ab") == {"x/Floor.1001", "ab.1001"}
+
+
+def test_a_changed_file_has_another_digest(tmp_path):
+    room = tmp_path / "room.blend"
+    room.write_bytes(b"BLENDER")
+    options = PictureOptions(room, tmp_path, techniques=("ltc",))
+    first = tasks.contents_digest(options)
+    assert tasks.contents_digest(options) == first
+    room.write_bytes(b"BLENDER, other")
+    assert tasks.contents_digest(options) != first

@@ -9,6 +9,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ltsh_addon import shading
 from ltsh_addon.pipeline import export as export_module
@@ -25,6 +26,8 @@ TABLES = {name: None for name in shading.SHIPPED_TABLES} | {
     f"random_{degree}": ("ltsh", degree) for degree in (1, 5, MAX_DEGREE)
 }
 TABLES["random_ltc"] = ("ltc", 1)
+# A compiler takes a second for each; two of the degrees between are for `make soak`.
+NAMES = [pytest.param(name, marks=pytest.mark.soak) if name in ("ltsh2", "random_5") else name for name in TABLES]
 
 _SHIM = """
 #include <cmath>

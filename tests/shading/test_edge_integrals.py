@@ -140,21 +140,6 @@ def test_tiny_polygons_keep_their_relative_accuracy(degree):
         assert np.abs(closed_form(polygon, degree) - expected).max() < 1e-5 * scale
 
 
-@pytest.mark.parametrize("degree", [2, 4, 6])
-def test_reversing_a_polygon_reverses_its_integrals(degree):
-    for polygon in random_polygons("generic", 5, seed=1):
-        forward, backward = closed_form(polygon, degree), closed_form(polygon[::-1], degree)
-        assert np.abs(forward + backward).max() < 1e-14
-
-
-@pytest.mark.parametrize("degree", [2, 4, 6])
-def test_splitting_a_polygon_adds_up(degree):
-    """Cut from corner 0 to a corner that is not its neighbor."""
-    for polygon in (p for p in random_polygons("generic", 30, seed=2) if len(p) > 3):
-        parts = closed_form(polygon[:3], degree) + closed_form(np.concatenate([polygon[:1], polygon[2:]]), degree)
-        assert np.abs(parts - closed_form(polygon, degree)).max() < 1e-13
-
-
 def test_moments_do_not_depend_on_the_batch():
     polygons = np.stack([p for p in random_polygons("generic", 60, seed=3) if len(p) == 4])
     unit = np.ascontiguousarray(polygons.transpose(2, 1, 0))

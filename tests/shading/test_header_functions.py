@@ -15,13 +15,15 @@ EPS = float(np.finfo(np.float32).eps)
 ROOM = 8
 
 
-@pytest.fixture(
-    scope="module", params=[(name, branch) for branch in ("c", "glsl") for name in header_harness.TABLES], ids="-".join
-)
-def compiled(request, folder, tables):
+@pytest.fixture(scope="module", params=header_harness.NAMES)
+def name(request):
+    return request.param
+
+
+@pytest.fixture(scope="module", params=["c", "glsl"])
+def compiled(request, name, folder, tables):
     """(table, header) of every table in both branches."""
-    name, branch = request.param
-    table = tables[name]
+    branch, table = request.param, tables[name]
     if branch == "c":
         return table, header_harness.compiled(folder / f"{name}.h", folder, name)
     if header_harness.CXX_COMPILER is None:
@@ -65,7 +67,6 @@ def test_the_quadrature_knows_a_solid_angle():
     assert quadrature(table, 1.0, np.sqrt(0.5), octant, 5) == pytest.approx(0.5 * np.pi, abs=1e-6)
 
 
-@pytest.mark.parametrize("name", header_harness.TABLES)
 def test_the_numbers_come_back_bit_for_bit(folder, tables, name):
     table = tables[name]
     rows, columns = table.warp.shape[:2]

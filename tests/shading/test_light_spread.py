@@ -12,7 +12,6 @@ from test_single_precision import PROMISED, all_kinds_of_samples
 from ltsh_addon import shading
 from ltsh_addon.shading import light_cone
 
-DEGREES = (1.0, 20.0, 60.0, 120.0, 170.0)
 # Of a result, or of a hundredth of the largest one: what the spread of the closed forms may be off, and the reference.
 CLOSED, QUADRATURE = 3e-3, 1e-3
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -56,11 +55,12 @@ def assert_close(found, expected, tolerance, what):
     assert error.max() < tolerance, (what, error.argmax(), found[error.argmax()], expected[error.argmax()])
 
 
-@pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
-@pytest.mark.parametrize("degrees", DEGREES[1:])
+@pytest.mark.parametrize(
+    ("degrees", "shape"), [(20.0, "RECTANGLE"), (60.0, "ELLIPSE"), (120.0, "RECTANGLE"), (170.0, "ELLIPSE")]
+)
 def test_lights_with_a_spread_match_patches(degrees, shape):
     """The closed forms in both precisions and the quadrature; the oracle leaves 1e-4."""
-    pairs = cases(degrees, shape, 4, seed=int(degrees))
+    pairs = cases(degrees, shape, 2, seed=int(degrees))
     table = shading.load_table("ltsh4")
     expected = {
         "lobe": [lobe_over_patches(table, *pair) for pair in pairs],
@@ -78,7 +78,7 @@ def test_lights_with_a_spread_match_patches(degrees, shape):
 @pytest.mark.parametrize("degrees", [1.0, 4.0])
 def test_narrow_cones_match_patches(degrees):
     """Of a rectangle: the oracle resolves their cones."""
-    pairs = cases(degrees, "RECTANGLE", 6, seed=7)
+    pairs = cases(degrees, "RECTANGLE", 3, seed=7)
     table = shading.load_table("ltsh2")
     shaded = [shading.shade(sample, [light], table) for sample, light in pairs]
     expected = [lobe_over_patches(table, *pair) for pair in pairs]
@@ -112,11 +112,11 @@ def repeated(sample, position):
     return type(sample)(**{**fields, "position": position})
 
 
-@pytest.mark.parametrize("degrees", [2.0, 30.0, 100.0, 175.0])
+@pytest.mark.parametrize("degrees", [2.0, 100.0])
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_single_precision_keeps_its_promise(name, degrees):
     """Horizons, bump maps and all Fresnel terms; the promise is per unit of the radiance straight ahead."""
-    samples, lights = all_kinds_of_samples(120, seed=5), focused_lights(degrees)
+    samples, lights = all_kinds_of_samples(40, seed=5), focused_lights(degrees)
     single = shading.shade(samples, lights, name, workers=1)
     double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
     limit = PROMISED * light_cone.peak_factor(np.radians(degrees))
@@ -139,7 +139,7 @@ def test_a_spread_of_pi_is_no_spread(technique):
 
 
 @techniques
-@pytest.mark.parametrize("degrees", [15.0, 70.0, 140.0])
+@pytest.mark.parametrize("degrees", [15.0, 140.0])
 def test_splitting_a_light_adds_up(technique, degrees):
     samples = random_samples(30, seed=4, lowest_roughness=0.2)
     light = area_light(spread=np.radians(degrees), radiance=(1, 1, 1))
@@ -167,7 +167,7 @@ def test_rotating_and_moving_everything_changes_nothing(technique):
 
 
 @techniques
-@pytest.mark.parametrize("degrees", DEGREES)
+@pytest.mark.parametrize("degrees", [1.0, 60.0, 170.0])
 def test_hostile_places_give_finite_radiance(technique, degrees):
     """On the light's axis, at its edge and corner, in its plane, on its surface, mirrors, grazing views."""
     places = [(0, 0, 0), (1, 0, 0), (1, 0.6, 0), (1, 0.6, 2.9999), (0.2, 0.1, 3), (4, 0, 3), (0, 0, 2.999999)]
@@ -197,7 +197,7 @@ def test_a_horizon_beyond_the_cone_changes_nothing(dtype):
     random = np.random.default_rng(5)
     reach, checked = np.tan(np.radians(2.0)), 0
     white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": 0.6}
-    for _ in range(100):
+    for _ in range(40):
         # Turned, so that no coordinate is exact.
         axes = np.linalg.qr(random.normal(size=(3, 3)))[0]
         axes[2] *= np.linalg.det(axes)

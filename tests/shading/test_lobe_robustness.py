@@ -9,7 +9,7 @@ from ltsh_addon import shading
 SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 # The directional albedo of GGX is at most 1; a fitted lobe that dips below zero elsewhere may exceed it a little.
 LARGEST = 1.3
-EACH = 10_000
+EACH = 4_000
 
 
 def unit(vectors):

@@ -83,15 +83,6 @@ def test_the_two_sides_of_the_horizon_add_up_to_a_non_convex_polygon(shape):
     assert total == pytest.approx(vector_area(polygon), abs=1e-13)
 
 
-def test_the_two_sides_of_the_horizon_add_up_to_a_rectangle():
-    for polygon in random_rectangles(60, seed=2):
-        if not 0 < (polygon[:, 2] > 0.0).sum() < 4:
-            continue
-        above = vector_area(clipped(polygon))
-        below = vector_area(clipped(polygon * np.array([1.0, 1.0, -1.0]))) * np.array([-1.0, -1.0, 1.0])
-        assert above + below == pytest.approx(vector_area(polygon), abs=1e-12)
-
-
 def test_split_at_horizon_partitions_the_points():
     polygons = random_rectangles(300, seed=3, height=0.0)
     above = (polygons[..., 2] > 0.0).any(axis=1)

@@ -10,11 +10,9 @@ from test_polygon_lights import STAR, polygon_light
 from test_workers import children_only, short_tasks_for_children, started  # noqa: F401 (fixtures)
 
 from ltsh_addon import shading
-from ltsh_addon.shading import integrator, parallel
 
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
 techniques = pytest.mark.parametrize("technique", TECHNIQUES)
-dtypes = pytest.mark.parametrize("dtype", [np.float32, np.float64])
 
 
 def numbered_samples(count, seed=0):
@@ -31,10 +29,9 @@ def every_light():
     return [*lights, area_light(spread=0.2, group="Fill")]
 
 
-@dtypes
-@techniques
+@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, 2 * [np.float32, np.float64], strict=True)))
 def test_only_receivers_are_lit(technique, dtype):
-    samples = numbered_samples(60, seed=1)
+    samples = numbered_samples(24, seed=1)
     lights = every_light()
     free = shading.shade(samples, lights, technique, dtype=dtype, workers=1)
     bound = [replace(light, receivers=(1, 7)) for light in lights]
@@ -52,16 +49,17 @@ def test_only_receivers_are_lit(technique, dtype):
 
 @techniques
 def test_a_partition_of_the_receivers_adds_up(technique):
-    samples, lights = numbered_samples(60, seed=2), every_light()
+    samples, lights = numbered_samples(24, seed=2), every_light()
     parts = [replace(light, receivers=numbers) for light in lights for numbers in ((0, 2), (1,), (7, 99))]
     expected = shading.shade(samples, lights, technique, dtype=np.float64, workers=1)
     found = shading.shade(samples, parts, technique, dtype=np.float64, workers=1)
     assert np.abs(found.combined - expected.combined).max() < 1e-9 * expected.combined.max()
 
 
-@dtypes
-@pytest.mark.parametrize("part", shading.PASSES)
-@pytest.mark.parametrize("technique", ["ltc", "ltsh4", shading.REFERENCE])
+@pytest.mark.parametrize(
+    ("technique", "part", "dtype"),
+    [("ltsh4", "specular", np.float32), ("ltc", "diffuse", np.float64), (shading.REFERENCE, "specular", np.float64)],
+)
 def test_workers_do_not_change_one_bit(technique, part, dtype, started, children_only):  # noqa: F811
     """The numbers travel with either pass; spread and corners with the lights."""
     samples = numbered_samples(60, seed=3)
@@ -72,13 +70,3 @@ def test_workers_do_not_change_one_bit(technique, part, dtype, started, children
     )
     assert len(started) == 1 and test_workers.all_ended(started)
     assert one.any() and np.array_equal(one, two)
-
-
-def test_numbers_travel_only_where_a_light_asks_for_them():
-    samples = numbered_samples(10)
-    for receivers, expected in ((None, False), ((1,), True)):
-        lights = (area_light(receivers=receivers),)
-        job = integrator.Task(lights, ("",), shading.load_table("ltc"), ("diffuse",), True)
-        side = parallel.ParentSide(job, samples, 10)
-        assert ("receiver" in side.sent) == expected
-        side.close()

@@ -44,8 +44,8 @@ def relative_error(found, expected):
 
 
 @pytest.mark.parametrize("grazing", [False, True], ids=["steep", "grazing"])
-@pytest.mark.parametrize("roughness", [0.1, 0.2, 0.5])
-@pytest.mark.parametrize("distance", [0.05, 0.2, 0.7, 3.0])
+@pytest.mark.parametrize("roughness", [0.1, 0.5])
+@pytest.mark.parametrize("distance", [0.05, 0.2, 3.0])
 @pytest.mark.parametrize("shape", ["DISK", "ELLIPSE"])
 def test_round_lights_are_round(shape, distance, roughness, grazing):
     """Both lobes and precisions, against a polygon of 768 corners, which is within 1e-6."""

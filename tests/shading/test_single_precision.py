@@ -9,7 +9,6 @@ from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
 from ltsh_addon.shading import edge_integrals, float32, moments32
-from ltsh_addon.shading.lookup_table import LookupTable
 from ltsh_addon.shading.polygon import project_to_sphere
 
 # What `shade` promises for radiance 1.
@@ -122,28 +121,6 @@ def test_edge_loop_gives_the_moments(degree, corners):
     assert np.abs(moments - expected)[:, ~needs_float64].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
 
 
-@pytest.mark.parametrize("most", [1, 513, 1000, 5000])
-def test_pieces_of_a_batch_have_the_sums_of_the_whole(most, monkeypatch):
-    """1500 polygons in pieces of at least 512, against their moments at once."""
-    monkeypatch.setattr(moments32, "PIECE_CORNERS", 4 * most)
-    polygons = regular_polygons(4, 1500, seed=5)
-    weights = np.random.default_rng(6).normal(size=(2, 15, 1500)).astype(np.float32)
-    moments, expected_mask = moments32.moments(polygons, 4, moments32.Scratch())
-    sums, angle, needs_float64 = moments32.weighted_moments(polygons, weights, 4, moments32.Scratch())
-    expected = np.einsum("fkp,kp->fp", weights.astype(float), moments.astype(float))
-    assert np.abs(sums - expected).max() < 15 * 1e-7 * np.abs(weights * moments).max()
-    assert np.abs(angle - moments[0]).max() < 1e-6 and np.array_equal(needs_float64, expected_mask)
-
-
-@pytest.mark.parametrize(("count", "most"), [(0, 600), (1, 600), (512, 1), (1200, 600), (1201, 600), (100_000, 4111)])
-def test_pieces_make_up_the_whole_and_are_about_equal(count, most):
-    parts = moments32.pieces(count, most)
-    assert [index for part in parts for index in range(count)[part]] == list(range(count))
-    lengths = [part.stop - part.start for part in parts]
-    assert max(lengths, default=0) <= max(most, 512)
-    assert max(lengths, default=0) - min(lengths, default=0) <= len(lengths)
-
-
 def test_edge_loop_gives_the_integrals_of_the_direction():
     polygons = regular_polygons(6, 300, seed=9)
     expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))
@@ -179,29 +156,6 @@ def test_polygons_that_single_precision_cannot_do_are_reported(gap):
         moments32.cosine_integral(polygons, moments32.Scratch()),
     ):
         assert needs_float64.tolist() == [True, True, False]
-
-
-@table_names
-def test_premultiplied_weights_are_the_coefficients_lobe_integrals_use(name):
-    table = shading.load_table(name)
-    generator = np.random.default_rng(6)
-    cosine, roughness = generator.random((2, 200)).astype(np.float32)
-    sine = np.sqrt(1.0 - cosine.astype(float) ** 2).astype(np.float32)
-    curves = tuple(range(table.coefficients.shape[2]))
-    warp, weights, tilt = moments32.prepare(table).fetch(
-        curves, cosine, sine, roughness, np.ones(200), moments32.Scratch()
-    )
-    lobe = table.lookup(cosine.astype(float), roughness.astype(float))
-    for row, expected in zip(warp, (lobe.xx, lobe.xz, lobe.yy, lobe.zz), strict=True):
-        assert np.abs(row - expected).max() < 3e-6 * np.abs(expected).max()
-    expected = lobe.coefficients
-    if tilt is None:
-        matrix = table.ridge_weights @ moments32.form_matrix(table.degree)
-        expected = np.einsum("fkp,kr->frp", expected, matrix)
-    else:
-        assert np.abs(tilt - lobe.tilt).max() < 1e-5
-    assert np.abs(weights - expected).max() < 1e-5 * np.abs(expected).max()
-    assert isinstance(table, LookupTable) and moments32.prepare(table) is moments32.prepare(table)
 
 
 @pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])

@@ -59,8 +59,7 @@ def all_ended(processes):
     return all(process.returncode is not None for process in processes)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("technique", TECHNIQUES)
+@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, 2 * [np.float32, np.float64], strict=True)))
 def test_workers_do_not_change_one_bit(technique, dtype, started, children_only):
     """All blocks come from children, against all blocks from this process."""
     samples = replace(random_samples(90, seed=6), bump_alpha2=np.full(90, 0.1))
@@ -85,25 +84,6 @@ def test_workers_use_the_matrix_of_this_process(dtype, started, children_only):
     assert len(started) == 2 and np.array_equal(one.specular, three.specular)
     plain = shading.shade(samples, four_lights(), "ltsh4", passes=["specular"], workers=1, dtype=dtype)
     assert not np.array_equal(one.specular, plain.specular)
-
-
-@pytest.mark.parametrize("part", shading.PASSES)
-def test_single_passes_travel_too(part, started, children_only):
-    samples = random_samples(60, seed=7)
-    one, two = (shading.shade(samples, four_lights(), "ltsh2", passes=[part], workers=count) for count in (1, 2))
-    assert len(started) == 1
-    assert np.array_equal(getattr(one, part), getattr(two, part))
-
-
-@pytest.mark.parametrize("count", [0, 1, 1023, 1024, 5000, 123_457])
-def test_blocks_make_up_the_samples_and_are_short_at_the_end(count):
-    """Whoever ends first waits for the other's last block."""
-    blocks = integrator._blocks(count, 256, 2048)
-    assert [block.start for block in blocks] + [count] == [0] + [block.stop for block in blocks]
-    lengths = [block.stop - block.start for block in blocks]
-    assert lengths == sorted(lengths, reverse=True)
-    assert all(length <= max(256, (count - block.start) // 4) for block, length in zip(blocks, lengths, strict=True))
-    assert max(lengths, default=0) <= 2048 and all(length >= 256 for length in lengths[:-1])
 
 
 def test_progress_is_reported_from_this_thread_and_reaches_one(started):
@@ -206,27 +186,6 @@ def test_children_of_a_killed_parent_end():
     assert not is_running(child)
 
 
-def test_shared_blocks_hold_arrays_side_by_side():
-    layout, size = parallel.layout_of({"a": ((3, 2), np.float64), "b": ((5,), np.float32), "c": ((0, 3), np.int8)})
-    block = parallel.SharedBlock(size)
-    ours, theirs = block.arrays(layout), parallel.arrays_in(parallel.attach(block.handle, size), layout)
-    for number, name in enumerate("abc"):
-        ours[name][...] = number + 1
-    for number, name in enumerate("abc"):
-        assert (theirs[name] == number + 1).all()
-        assert theirs[name].shape == ours[name].shape and theirs[name].dtype == ours[name].dtype
-    block.close()
-
-
-def test_a_normal_that_stands_for_another_is_sent_once():
-    samples = random_samples(20)
-    task = integrator._task(tuple(four_lights()), "ltc", ("specular",), np.float32)
-    side = parallel.ParentSide(task, samples, 20)
-    assert side.same == {"geometric_normal": "normal"}
-    assert not {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"} & set(side.sent)
-    side.close()
-
-
 def test_messages_survive_the_way_and_an_end_is_noticed():
     stream = io.BytesIO()
     for message in ({"a": 1}, None, list(range(1000))):
@@ -235,16 +194,6 @@ def test_messages_survive_the_way_and_an_end_is_noticed():
     assert [worker.receive(stream) for _ in range(3)] == [{"a": 1}, None, list(range(1000))]
     with pytest.raises(EOFError):
         worker.receive(stream)
-
-
-def test_the_package_may_have_another_name_in_the_parent():
-    """Blender loads it as bl_ext.user_default.ltsh.ltsh_addon."""
-    stream = io.BytesIO()
-    data = b"cbl_ext.repository.ltsh.ltsh_addon.shading.brdf\nschlick_curve\n."
-    stream.write(worker._LENGTH.pack(len(data)) + data)
-    stream.seek(0)
-    found = worker.receive(stream, "bl_ext.repository.ltsh.ltsh_addon")
-    assert found.__module__ == "ltsh_addon.shading.brdf"
 
 
 RENAMED = """

@@ -41,6 +41,7 @@ def run(*arguments, **options):
     )
 
 
+@pytest.mark.soak
 def test_fitting_writes_tables_that_validate_measures(tmp_path):
     """Two coarse tables at a time, one of another BRDF; then all figures of both, as JSON and as text."""
     done = run("fit", "ltsh1", "ltc", "-o", tmp_path / "new", "--size", 4, "--brdf", "beckmann")
@@ -59,6 +60,7 @@ def test_fitting_writes_tables_that_validate_measures(tmp_path):
     assert f"{figures['mean']:.4f}" in text and text.count(str(paths[0])) == 2
 
 
+@pytest.mark.soak
 def test_the_same_command_gives_the_same_bytes(tmp_path):
     for folder in ("first", "second"):
         assert run("fit", "ltsh1", "-o", tmp_path / folder, "--size", 4).returncode == 0

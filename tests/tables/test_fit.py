@@ -8,7 +8,7 @@ import pytest
 from ltsh_addon.shading import brdf, load_table, spherical_harmonics
 from ltsh_addon.shading.lookup_table import roughness_nodes, theta_nodes
 from tables import fit, refine, walk
-from tables.brdfs import BECKMANN, GGX
+from tables.brdfs import BECKMANN, GGX, polar_samples
 from tables.families import family_named
 from tables.projection import FLAT, Cells, Points, project, relative_error, warped_basis
 from tables.validate import hemisphere_samples, validate
@@ -101,29 +101,6 @@ def test_refinement_lowers_the_error_between_the_nodes(coarse):
     assert means[1] < 0.8 * means[0], means
 
 
-def test_distribution_is_the_transpose_of_interpolation():
-    generator = np.random.default_rng(3)
-    cells = Cells((5, 4), np.zeros(48), np.zeros(48), np.zeros((48, 1)))
-    nodes, values = generator.normal(size=(5, 4, 3)), generator.normal(size=(48, 3))
-    left, right = (cells.interpolate(nodes) * values).sum(), (nodes * cells.distribute(values)).sum()
-    assert left == pytest.approx(right, rel=1e-12)
-    assert cells.interpolate(np.ones((5, 4, 1))) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_node_blocks_are_the_diagonal_of_the_normal_matrix():
-    """Column by column of the operator: interpolate, multiply, distribute."""
-    generator = np.random.default_rng(4)
-    cells = Cells((3, 4), np.zeros(24), np.zeros(24), np.zeros((24, 1)))
-    roots = generator.normal(size=(24, 2, 2))
-    matrices = roots @ np.swapaxes(roots, 1, 2)
-    blocks = cells.node_blocks(matrices)
-    for i, j, k in [(0, 0, 0), (1, 2, 1), (2, 3, 0), (2, 1, 1)]:
-        unit = np.zeros((3, 4, 2))
-        unit[i, j, k] = 1.0
-        column = cells.distribute(np.matmul(matrices, cells.interpolate(unit)[..., None])[..., 0])
-        assert column[i, j] == pytest.approx(blocks[i, j, :, k], rel=1e-12)
-
-
 def test_mirrors_get_the_known_warp_and_no_number_runs_away(coarse):
     """A = B = C = 1 at roughness 0; the targets allow 1e4."""
     arrays = coarse[0].arrays
@@ -158,6 +135,7 @@ class Memory:
                 raise KeyboardInterrupt
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("stop_after", [3, 9])
 def test_a_fit_that_was_stopped_goes_on_and_gives_the_same_numbers(stop_after):
     """Stopped during the walk, and during the refinement (5 x 5 nodes: 9 anti-diagonals)."""
@@ -180,6 +158,7 @@ def test_a_checkpoint_of_other_settings_or_a_broken_one_is_ignored(tmp_path):
     assert fit.Checkpoint(tmp_path / "none", {}).load() == {}
 
 
+@pytest.mark.soak
 def test_rounding_to_float32_changes_no_figure(coarse, tmp_path):
     """The stored numbers are of order 1 to 100: their rounding moves errors by no more than 1e-5."""
     fitted, _ = coarse
@@ -192,6 +171,7 @@ def test_rounding_to_float32_changes_no_figure(coarse, tmp_path):
         assert getattr(second, key) == pytest.approx(value, abs=1e-5), key
 
 
+@pytest.mark.soak
 def test_other_brdfs_can_be_fitted(tmp_path):
     """Beckmann, in two functions: its coarse table approximates Beckmann, and not GGX."""
     fitted = fit.fit(family_named("ltsh2"), 6, model=BECKMANN)
@@ -276,3 +256,59 @@ def test_coefficients_at_a_point_are_the_constrained_optimum():
         step = generator.normal(size=found.shape) * 1e-2
         step -= row * (row * step).sum() / (row * row).sum()
         assert relative_error(points, np.einsum("psk,pk->ps", basis, found + step))[0] > least
+
+
+COSINE = np.array([1.0, 0.7, 0.4, 0.2, 0.05])
+ALPHA = np.array([0.3, 0.04, 1.0, 0.36, 0.1])
+# Relative errors: the fit's rule is Gauss-Legendre along rays; the other one mixes two sets, midpoint in azimuth.
+RULES = [(polar_samples, 3e-4), (hemisphere_samples, 3e-3)]
+
+rules = pytest.mark.parametrize("rule, tolerance", RULES, ids=["fit", "validation"])
+
+
+@rules
+def test_moments_of_the_hemisphere(rule, tolerance):
+    directions, weights = rule(COSINE, ALPHA)
+    x, y, z = np.moveaxis(directions, -1, 0)
+    assert np.linalg.norm(directions, axis=-1) == pytest.approx(1.0, abs=1e-12)
+    assert (weights >= 0.0).all() and y.min() >= 0.0 and z[weights > 0.0].min() >= 0.0
+    for values, exact in [(1.0, 2.0 * np.pi), (z, np.pi), (z * z, 2.0 * np.pi / 3.0), (x * x, 2.0 * np.pi / 3.0)]:
+        assert (weights * values).sum(axis=1) == pytest.approx(exact, rel=tolerance)
+
+
+@rules
+def test_directional_albedo_of_ggx(rule, tolerance):
+    """Against a tensor rule that knows nothing of the lobe, on surfaces rough enough for it."""
+    nodes, node_weights = np.polynomial.legendre.leggauss(300)
+    z, phi = (grid.ravel() for grid in np.meshgrid(0.5 * (nodes + 1.0), 0.5 * np.pi * (nodes + 1.0), indexing="ij"))
+    radius = np.sqrt(1.0 - z * z)
+    tensor = np.stack([radius * np.cos(phi), radius * np.sin(phi), z], axis=-1)
+    tensor_weights = np.outer(node_weights, node_weights).ravel() * 0.5 * np.pi
+    cosine, alpha = np.array([1.0, 0.7, 0.4, 0.2]), np.array([0.3, 0.2, 1.0, 0.36])
+    directions, weights = rule(cosine, alpha)
+    found = (weights * brdf.ggx_brdf_cosine(cosine, alpha, directions)).sum(axis=1)
+    expected = [brdf.ggx_brdf_cosine(mu, a, tensor) @ tensor_weights for mu, a in zip(cosine, alpha, strict=True)]
+    assert found == pytest.approx(expected, rel=tolerance)
+
+
+def test_the_fit_sees_needles_under_the_view():
+    """A lobe that wraps around to a needle at the horizon below the view direction: against ten times the points."""
+    cosine, alpha = np.array([np.cos(np.radians(86.4))]), np.array([0.06])
+    norms = []
+    for counts in [(28, 28), (90, 120)]:
+        directions, weights = polar_samples(cosine, alpha, *counts)
+        x, y, z = np.moveaxis(directions, -1, 0)
+        needle = np.exp(-((y / 0.05) ** 2) - (z / 0.03) ** 2) * (x > 0.0)
+        norms.append((weights * needle**2).sum())
+    assert norms[0] == pytest.approx(norms[1], rel=0.02)
+
+
+def test_sharp_lobes_are_integrated_too():
+    """Both rules, from roughness 0.03 on; smooth surfaces seen from above reflect nearly everything."""
+    cosine, alpha = np.array([0.9, 0.5, 0.3]), np.array([1e-3, 1e-3, 3e-3])
+    albedos = []
+    for rule, _ in RULES:
+        directions, weights = rule(cosine, alpha)
+        albedos.append((weights * brdf.ggx_brdf_cosine(cosine, alpha, directions)).sum(axis=1))
+    assert albedos[0] == pytest.approx(albedos[1], rel=3e-3)
+    assert albedos[0] == pytest.approx(1.0, abs=3e-3)

@@ -182,7 +182,13 @@ _kept: ContextVar[BlenderProcess | None] = ContextVar("kept Blender", default=No
 
 @contextlib.contextmanager
 def kept_blender(folder: Path):
-    """Meanwhile one Blender does all jobs of this thread, which saves its start; `folder` is its temporary one."""
+    """Meanwhile one Blender does all jobs of this thread, which saves its start; `folder` is its temporary one.
+
+    A Blender that is kept already goes on doing them.
+    """
+    if _kept.get() is not None:
+        yield
+        return
     process = BlenderProcess(folder)
     token = _kept.set(process)
     try:

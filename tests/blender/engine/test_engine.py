@@ -8,7 +8,6 @@ import scene_parts as parts
 import ltsh_addon
 from ltsh_addon import shading
 from ltsh_addon.blender.engine import render as render_module
-from ltsh_addon.blender.engine import settings as settings_module
 from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
@@ -44,32 +43,6 @@ def render(scene, path):
 def picture(channels, layer, name, letters="RGB"):
     """Pass `name` of a view layer, (H, W, C)."""
     return np.stack([channels[f"{layer}.{name}.{letter}"] for letter in letters], axis=-1)
-
-
-def handlers_of_package():
-    """Names of Blender's handler lists with functions of ours."""
-    lists = {name: getattr(bpy.app.handlers, name) for name in dir(bpy.app.handlers)}
-    ours = ltsh_addon.__name__
-    return [
-        name
-        for name, functions in lists.items()
-        if isinstance(functions, list) and any(function.__module__.startswith(ours) for function in functions)
-    ]
-
-
-def test_unregister_leaves_nothing_behind():
-    parts.empty_scene()
-    before = set(dir(bpy.types)), {panel: set(panel.COMPAT_ENGINES) for panel in settings_module.shared_panels()}
-    bpy.context.scene.render.engine = "CYCLES"
-    ltsh_addon.register()
-    assert hasattr(bpy.types, "LTSH_PT_view") and handlers_of_package()
-    assert "LTSH" in bpy.types.DATA_PT_lens.COMPAT_ENGINES
-    assert bpy.ops.ltsh.preview() == {"FINISHED"} and bpy.context.scene.render.engine == "LTSH"
-    ltsh_addon.unregister()
-    assert set(dir(bpy.types)) == before[0]
-    assert {panel: set(panel.COMPAT_ENGINES) for panel in settings_module.shared_panels()} == before[1]
-    assert not handlers_of_package() and not hasattr(bpy.types.Scene, "ltsh_view")
-    assert bpy.context.scene.render.engine == "CYCLES"
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):

@@ -35,9 +35,7 @@ def plain_positions(folder, scene):
 
 
 def saved(folder):
-    path = folder / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    return path
+    return scene_parts.save(folder / "scene.blend")
 
 
 def positions(found):

@@ -47,8 +47,7 @@ def test_the_space_is_named_and_its_matrix_is_blenders(space):
 def test_lights_and_surfaces_shine_as_in_cycles(tmp_path, space, temperature):
     given = {} if temperature is None else {"use_temperature": True, "temperature": temperature}
     colored_room(space, surface=(0.8, 0.3, 0.1), color=(0.9, 0.4, 0.2), **given)
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(tmp_path / "scene.blend")
     options = PictureOptions(path, tmp_path / "out", techniques=("ltc",), passes=("diffuse",), cycles_samples=512)
     report = compare_scene(options)
     layers = imaging.read_layers(tmp_path / "out" / "compare.exr")
@@ -67,8 +66,7 @@ def test_the_sheet_looks_the_same_whatever_the_space(tmp_path):
     sheets, values = {}, {}
     for space in SPACES:
         colored_room(space, color=(0.9, 0.6, 0.3))
-        path = tmp_path / "scene.blend"
-        bpy.ops.wm.save_as_mainfile(filepath=str(path))
+        path = scene_parts.save(tmp_path / "scene.blend")
         compare_scene(PictureOptions(path, tmp_path, techniques=("ltc",), passes=("diffuse",), cycles_samples=64))
         image = bpy.data.images.load(str(tmp_path / "compare.png"))
         sheets[space] = 255.0 * np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[..., :3]
@@ -83,7 +81,7 @@ def test_the_sheet_looks_the_same_whatever_the_space(tmp_path):
 
 
 @pytest.mark.parametrize("space", ["Linear Rec.709", "Linear Rec.2020"])
-def test_an_own_opencolorio_configuration_is_taken_into_account(tmp_path, monkeypatch, space):
+def test_an_own_opencolorio_configuration_is_taken_into_account(tmp_path, monkeypatch, own_blender, space):
     own = tmp_path / "colormanagement"
     shutil.copytree(Path(bpy.utils.system_resource("DATAFILES")) / "colormanagement", own)
     config = (own / "config.ocio").read_text(encoding="utf-8")
@@ -91,8 +89,7 @@ def test_an_own_opencolorio_configuration_is_taken_into_account(tmp_path, monkey
     assert (changed != config) == (space != "Linear Rec.709")
     (own / "config.ocio").write_text(changed, encoding="utf-8")
     colored_room("Linear Rec.709")
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(tmp_path / "scene.blend")
     monkeypatch.setenv("OCIO", str(own / "config.ocio"))
     found = extract(ExtractOptions(path)).color_space
     # Since 5.0 the space stands in the file; before, the configuration alone decides.

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from ltsh_addon.blender import demo as demo_module
-from ltsh_addon.blender import demo_meshes
 from ltsh_addon.blender.process import blender_process, client
 from ltsh_addon.blender.saving import check_whole
 
@@ -39,20 +38,6 @@ def test_a_file_that_was_cut_while_it_was_saved_is_refused(demo_file, tmp_path, 
         check_whole(cut)
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
-@pytest.mark.skipif(bool(bpy.app.binary_path), reason="starts this Python")
-def test_a_demo_that_does_not_fit_leaves_no_file(tmp_path):
-    code = (
-        "import resource, sys\nresource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))\n"
-        "from ltsh_addon import cli\nsys.exit(cli.main(sys.argv[1:]))"
-    )
-    command = [sys.executable, "-c", code, "demo", "-o", str(tmp_path / "out"), "--quiet"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 1 and done.stderr.startswith(f"ltsh: {tmp_path / 'out'}: Blender c"), done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert not list((tmp_path / "out").glob("*.blend")) and not list((tmp_path / "out").glob(".*.blend"))
-
-
 def surface_shader(material):
     """The one shader that feeds the material's surface."""
     (output,) = (node for node in material.node_tree.nodes if node.type == "OUTPUT_MATERIAL")
@@ -60,25 +45,10 @@ def surface_shader(material):
     return link.from_node
 
 
-def image_behind(socket):
-    """The image that feeds `socket`, through a normal map where there is one; None without."""
-    if not socket.is_linked:
-        return None
-    node = socket.links[0].from_node
-    if node.type == "NORMAL_MAP":
-        node = node.inputs["Color"].links[0].from_node
-    assert node.type == "TEX_IMAGE"
-    return node.image
-
-
 def pixels(image):
     values = np.empty(len(image.pixels), dtype=np.float32)
     image.pixels.foreach_get(values)
     return values.reshape(image.size[1], image.size[0], -1)[..., :3]
-
-
-def test_only_the_file_is_left_beside_it(demo_file):
-    assert [path.name for path in demo_file.parent.iterdir()] == ["demo.blend"]
 
 
 def test_four_area_lights_of_the_four_shapes_shine(demo):
@@ -106,12 +76,6 @@ def test_every_material_is_a_single_scatter_ggx_lobe(demo):
     assert {surface_shader(material).type for material in used} == SPECULAR_NODES
 
 
-def test_every_mesh_has_faces_and_a_material(demo):
-    meshes = [ob for ob in demo.objects if ob.type == "MESH"]
-    assert len(meshes) > 20
-    assert all(len(ob.data.polygons) > 0 and len(ob.material_slots) == 1 for ob in meshes)
-
-
 @pytest.mark.parametrize("kind", ["metal", "plastic"])
 def test_balls_of_metal_and_plastic_go_from_smooth_to_rough(demo, kind):
     balls = [ob for ob in demo.objects if ob.name.startswith(f"{kind} ball")]
@@ -122,42 +86,12 @@ def test_balls_of_metal_and_plastic_go_from_smooth_to_rough(demo, kind):
     assert {shader.inputs["Metallic"].default_value for shader in shaders} == {float(kind == "metal")}
 
 
-def test_the_roughness_of_the_floor_varies(demo):
-    floor = demo.objects["floor"]
-    image = image_behind(surface_shader(floor.material_slots[0].material).inputs["Roughness"])
-    values = pixels(image)
-    assert image.colorspace_settings.name == "Non-Color" and floor.data.uv_layers
-    assert 0.1 < values.min() < 0.2 and 0.4 < values.max() < 0.7 and values.std() > 0.05
-    # 8 bits per channel, gray.
-    assert np.ptp(values, axis=2).max() <= 1.0 / 255.0
-
-
-def test_the_wall_is_normal_mapped(demo):
-    wall = demo.objects["back wall"]
-    image = image_behind(surface_shader(wall.material_slots[0].material).inputs["Normal"])
-    normal = 2.0 * pixels(image) - 1.0
-    assert image.colorspace_settings.name == "Non-Color" and wall.data.uv_layers
-    # Half floats or better: 2^-10 near 1.
-    assert np.abs(np.linalg.norm(normal, axis=2) - 1.0).max() < 2e-3
-    assert normal[..., 2].min() > 0.8 and normal[..., :2].std(axis=(0, 1)).min() > 0.1
-    assert np.abs(normal[..., :2].mean(axis=(0, 1))).max() < 1e-3
-
-
 def test_nothing_lies_outside_the_file(demo):
     images = [image for image in bpy.data.images if image.type == "IMAGE"]
     assert len(images) >= 4 and all(image.packed_file is not None and image.users > 0 for image in images)
     assert not bpy.data.libraries and not bpy.data.texts and not bpy.data.sounds and not bpy.data.movieclips
     # Paths of packed images are not looked up, and none may lead to the machine the file was made on.
     assert all(str(Path.home()) not in path for path in bpy.utils.blend_paths(absolute=False, packed=True))
-
-
-def test_images_show_what_was_computed(demo):
-    """Row 0 of Blender's images is the bottom row; 8 bits per channel round by at most half a step."""
-    for name, computed in (
-        ("screen", demo_meshes.screen_picture()),
-        ("floor roughness", demo_meshes.floor_textures()[0][..., None]),
-    ):
-        assert np.abs(pixels(bpy.data.images[name]) - np.clip(computed, 0.0, 1.0)).max() < 0.51 / 255.0
 
 
 def fingerprint_in_fresh_interpreter():

@@ -65,8 +65,7 @@ def stripes(kind, width):
 def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
     scene = stripes(kind, width)
     count = 64
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(tmp_path / "scene.blend")
     errors = {}
     for name in (kind, "other"):
         if name == "other":

@@ -30,16 +30,6 @@ def test_one_sample_per_pixel_is_at_the_center(tmp_path):
     assert np.allclose(surface.view, (0.0, 0.0, 1.0), atol=1e-6)
 
 
-def test_sub_sample_offsets_cover_the_pixel_evenly():
-    for count in (4, 16, 64):
-        offsets = render_settings.filter_points("BOX", 1.0, count)
-        assert offsets.shape == (count, 2) and np.abs(offsets).max() <= 0.5
-        # The share of the points in any quarter of the pixel is right up to a few points.
-        for corner in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            inside = ((offsets * corner) > 0.0).all(axis=1).sum()
-            assert abs(inside - count / 4.0) <= 2.0
-
-
 @pytest.mark.parametrize("size", [scene_parts.SIZE, scene_parts.SIZE[::-1]])
 @pytest.mark.parametrize("pixel_aspect", [1.0, 1.5])
 def test_the_same_point_of_every_pixel_is_sampled(tmp_path, size, pixel_aspect):
@@ -218,44 +208,3 @@ def test_instances_are_sampled_with_their_own_materials(tmp_path):
     halves = scene_parts.reference(tmp_path, prepared, 64)["diffuse"].reshape(2, -1, 3)
     outside = np.setdiff1d(np.arange(24 * 16), pixel)
     assert not halves[:, outside].any() and halves[:, pixel].min() > 0.0
-
-
-def test_an_object_without_faces_is_no_obstacle(tmp_path):
-    scene_parts.empty_scene()
-    scene_parts.add_top_camera()
-    scene_parts.add_area_light()
-    scene_parts.add_mesh("No faces", [(0, 0, 0), (1, 0, 0)], [])
-    scene_parts.add_mesh("Nothing", [], [])
-    ((surface, pixel, unusable),), _ = scene_parts.sample(tmp_path, scene_parts.prepare())
-    assert len(surface) == len(pixel) == unusable == 0
-
-
-def test_reflections_of_valid_normals_leave_the_surface():
-    """Independent of Cycles: the mirrored view ends exactly at the threshold, and good normals stay."""
-    generator = np.random.default_rng(7)
-    true_normal, view, normal = (horizons.unit(generator.normal(size=(4000, 3))) for _ in range(3))
-    facing = np.sum(view * true_normal, axis=-1) > 0.02
-    true_normal, view, normal = true_normal[facing], view[facing], normal[facing]
-    valid = horizons.valid_specular_normal(normal, true_normal, view)
-    assert np.allclose(np.linalg.norm(valid, axis=-1), 1.0, atol=1e-12)
-
-    def elevation(axis):
-        mirrored = 2.0 * np.sum(axis * view, axis=-1, keepdims=True) * axis - view
-        return np.sum(mirrored * true_normal, axis=-1)
-
-    threshold = np.minimum(0.9 * np.sum(view * true_normal, axis=-1), 0.01)
-    good = elevation(normal) >= threshold
-    assert np.array_equal(valid[good], normal[good]) and good.any() and not good.all()
-    assert np.abs(elevation(valid) - threshold)[~good].max() < 1e-12
-    # Bent in the plane of both normals, towards the true one.
-    volume = np.linalg.det(np.stack([valid, normal, true_normal], axis=-2)[~good])
-    assert np.abs(volume).max() < 1e-12
-    assert np.all(np.sum(valid * true_normal, axis=-1)[~good] >= np.sum(normal * true_normal, axis=-1)[~good])
-
-
-def test_bump_alpha_is_an_eighth_of_the_squared_tangent():
-    angle = np.radians([0.0, 30.0, 60.0, 75.0, 90.0])
-    up = np.tile([0.0, 0.0, 1.0], (5, 1))
-    tilted = np.stack([np.sin(angle), np.zeros(5), np.cos(angle)], axis=-1)
-    expected = [0.0, 1.0 / 24.0, 3.0 / 8.0, 1.0, 1.0]
-    assert np.allclose(horizons.bump_alpha2(tilted, up), expected, atol=1e-12)

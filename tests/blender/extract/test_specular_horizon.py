@@ -1,62 +1,14 @@
-"""Which horizon ends a specular lobe, by numbers and against Cycles."""
+"""Specular lobes end at the horizon at which those of Cycles do."""
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
 
-from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.imaging import unbiased_relative_error
-from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading import shade
-
-
-def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
-    """Points at the origin, seen obliquely, whose geometric and smooth normals differ."""
-    tilted, up = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
-    view = np.array(view)
-    vectors = {"view": view, "normal": up, "diffuse_normal": up, "smooth_normal": up, "geometric_normal": tilted}
-    zero = np.zeros((count, 3))
-    return SurfaceSamples(
-        **{name: np.tile(vector, (count, 1)) for name, vector in vectors.items()},
-        position=zero,
-        roughness=np.full(count, roughness),
-        specular_f0=zero + 1.0,
-        specular_f90=zero + 1.0,
-        dielectric=zero,
-        ior=np.full(count, 1.5),
-        diffuse_albedo=zero,
-    )
-
-
-def light_at(distance, half):
-    """A square light on the x axis that faces the origin, its center on the horizon."""
-    axes = {"half_u": (0.0, half, 0.0), "half_v": (0.0, 0.0, half), "direction": (-1.0, 0.0, 0.0)}
-    return AreaLight("Light", "SQUARE", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
-
-
-@pytest.mark.parametrize(
-    "roughness, view, light, smooth",
-    [
-        (0.6, (-0.96, 0.0, 0.28), (3.0, 0.3), True),
-        # The mirror direction is 3 degrees above the horizon: 45 per sr for the lobe's choice, 0.2 for the light's.
-        (0.15, (-0.9987, 0.0, 0.05), (0.5, 3.0), False),
-    ],
-)
-def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, view, light, smooth):
-    samples = samples_near_the_horizon(roughness, view)
-    found = end_at_horizons_of_cycles(samples, (light_at(*light),)).geometric_normal
-    assert np.array_equal(found, samples.smooth_normal if smooth else samples.geometric_normal)
-
-
-def test_without_lights_or_differences_nothing_changes():
-    samples = samples_near_the_horizon(0.5)
-    assert end_at_horizons_of_cycles(samples, ()) is samples
-    flat = replace(samples, geometric_normal=samples.smooth_normal)
-    assert end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),)) is flat
 
 
 @pytest.mark.parametrize(
@@ -92,12 +44,3 @@ def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, sides, tu
     # Measured: up to 0.7 %, noise included; the other horizon is wrong by 3 to 47 %.
     assert chosen < 8e-3
     assert 1.5e-2 < max(error(samples.geometric_normal), error(samples.smooth_normal))
-
-
-def test_coarse_meshes_are_named_where_they_fill_the_picture():
-    fine = samples_near_the_horizon(0.5, count=100)
-    assert coarse_meshes(fine) == []
-    normal = fine.geometric_normal.copy()
-    normal[:50] = (np.sin(0.7), 0.0, np.cos(0.7))
-    (line,) = coarse_meshes(replace(fine, geometric_normal=normal))
-    assert "50 of 100 samples" in line and "35 degrees" in line

@@ -21,9 +21,7 @@ def start(light=True, camera=(0.0, -3.0, 2.0)):
 
 
 def save(folder):
-    path = folder / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    return path
+    return scene_parts.save(folder / "scene.blend")
 
 
 def baked(path, output, **options):

@@ -52,8 +52,7 @@ def plain_diffuse(folder, scene, samples=256):
 
 def compared(folder, **options):
     """Report and layers of a comparison of the open file."""
-    path = folder / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(folder / "scene.blend")
     given = {"techniques": ("ltc",), "cycles_samples": 128, "passes": ("diffuse",), **options}
     report = compare_scene(PictureOptions(path, folder / "out", **given))
     return report, imaging.read_layers(folder / "out" / "compare.exr")

@@ -1,10 +1,13 @@
-"""Scenes that nobody meant: broken, empty, huge or odd. Each function of SCENES builds one in the running Blender."""
+"""Scenes that nobody meant: broken, empty, huge or odd. Each function builds one in the running Blender."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import bpy
 import numpy as np
 import scene_parts
+from scene_parts import add_area_light, add_mesh, add_plane
 
 NAN, INF = float("nan"), float("inf")
 MARK = "LTSH_SCRIPT_RAN"
@@ -23,102 +26,28 @@ def plain(camera=True, light=True, plane=True):
     return scene
 
 
-def no_camera():
-    plain(camera=False)
-
-
-def no_light():
-    plain(light=False)
-
-
-def nothing_at_all():
-    plain(camera=False, light=False, plane=False)
-
-
-def no_object():
-    plain(plane=False)
-
-
-def other_lights_only():
-    plain(light=False)
-    scene_parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")))
-
-
-def only_light(**changes):
+def with_light(**changes):
+    """The plain scene, its light changed."""
     plain()
     for name, value in changes.items():
         setattr(bpy.data.lights["Key"], name, value)
 
 
-def light_of_no_size():
-    only_light(size=0.0, size_y=0.0)
-
-
-def second_light_of_no_size():
+def with_more(add, **settings):
+    """The plain scene, and what a function of scene_parts adds to it."""
     plain()
-    scene_parts.add_area_light("Dot", size=0.0, size_y=0.0)
+    add(**settings)
 
 
-def light_scaled_to_nothing():
+def placed(name, attribute, *values):
+    """The plain scene with another location or scale of an object."""
     plain()
-    bpy.data.objects["Key"].scale = 0.0, 0.0, 0.0
+    setattr(bpy.data.objects[name], attribute, values)
 
 
-def light_without_power():
-    only_light(energy=0.0)
-
-
-def light_of_negative_power():
-    only_light(energy=-50.0)
-
-
-def light_of_endless_power():
-    only_light(energy=INF)
-
-
-def light_of_power_that_is_no_number():
-    only_light(energy=NAN)
-
-
-def light_that_is_nowhere():
-    """The only light, with a transform that is no number: Blender keeps what a driver or a simulation put there."""
-    plain()
-    bpy.data.objects["Key"].location.x = NAN
-
-
-def second_light_that_is_nowhere():
-    plain()
-    scene_parts.add_area_light("Lost", location=(INF, 0.0, 0.0))
-
-
-def object_that_is_nowhere():
-    plain()
-    scene_parts.add_plane(name="Lost", location=(NAN, NAN, NAN))
-
-
-def object_of_endless_size():
-    plain()
-    scene_parts.add_plane(name="Lost", scale=(INF, 1.0, 1.0))
-
-
-def object_of_no_size():
-    plain()
-    scene_parts.add_plane(name="Flat", scale=(0.0, 0.0, 0.0))
-
-
-def camera_that_is_nowhere():
-    plain()
-    bpy.context.scene.camera.location = NAN, 0.0, 5.0
-
-
-def vertices_that_are_nowhere():
-    plain()
-    scene_parts.add_mesh("Torn", [(NAN, 0, 1), (1, 0, 1), (0, 1, 1)], [(0, 1, 2)])
-
-
-def far_away():
-    plain()
-    scene_parts.add_plane(name="Far", location=(1e30, 1e30, -1e30), size=1e20)
+def other_lights_only():
+    plain(light=False)
+    scene_parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")))
 
 
 def empty_meshes():
@@ -199,6 +128,22 @@ def missing_files():
     tree.links.new(node.outputs["Color"], principled.inputs["Base Color"])
 
 
+def lost_library():
+    """An object of another file, which then is no more."""
+    plain()
+    path = Path(bpy.app.tempdir) / "props.blend"
+    bpy.data.libraries.write(str(path), {bpy.data.objects.new("Prop", bpy.data.meshes.new("Prop"))})
+    with bpy.data.libraries.load(str(path), link=True) as (_, wanted):
+        wanted.objects = ["Prop"]
+    bpy.context.scene.collection.objects.link(wanted.objects[0])
+    path.unlink()
+
+
+def volume():
+    plain()
+    scene_parts.link(bpy.data.objects.new("Smoke", bpy.data.volumes.new("Smoke")))
+
+
 def scripts():
     """A text that registers itself and a driver that is Python: both leave a mark where they run."""
     plain()
@@ -208,3 +153,30 @@ def scripts():
     text.use_module = True
     curve = bpy.data.objects["Plane"].driver_add("location", 2)
     curve.driver.expression = f"len(open(__import__('os').environ['{MARK}'], 'a').name) * 0.0"
+
+
+# Scenes of one line; the others are functions of their names.
+SCENES = {
+    "no_camera": lambda: plain(camera=False),
+    "no_light": lambda: plain(light=False),
+    "nothing_at_all": lambda: plain(camera=False, light=False, plane=False),
+    "no_object": lambda: plain(plane=False),
+    "light_of_no_size": lambda: with_light(size=0.0, size_y=0.0),
+    "second_light_of_no_size": lambda: with_more(add_area_light, name="Dot", size=0.0, size_y=0.0),
+    "light_scaled_to_nothing": lambda: placed("Key", "scale", 0.0, 0.0, 0.0),
+    "light_without_power": lambda: with_light(energy=0.0),
+    "light_of_negative_power": lambda: with_light(energy=-50.0),
+    "light_of_endless_power": lambda: with_light(energy=INF),
+    "light_of_power_that_is_no_number": lambda: with_light(energy=NAN),
+    # Blender keeps what a driver or a simulation put there.
+    "light_that_is_nowhere": lambda: placed("Key", "location", NAN, 0.2, 1.5),
+    "second_light_that_is_nowhere": lambda: with_more(add_area_light, name="Lost", location=(INF, 0.0, 0.0)),
+    "object_that_is_nowhere": lambda: with_more(add_plane, name="Lost", location=(NAN, NAN, NAN)),
+    "object_of_endless_size": lambda: with_more(add_plane, name="Lost", scale=(INF, 1.0, 1.0)),
+    "object_of_no_size": lambda: with_more(add_plane, name="Flat", scale=(0.0, 0.0, 0.0)),
+    "camera_that_is_nowhere": lambda: placed("Camera", "location", NAN, 0.0, 5.0),
+    "vertices_that_are_nowhere": lambda: with_more(
+        add_mesh, name="Torn", vertices=[(NAN, 0, 1), (1, 0, 1), (0, 1, 1)], faces=[(0, 1, 2)]
+    ),
+    "far_away": lambda: with_more(add_plane, name="Far", location=(1e30, 1e30, -1e30), size=1e20),
+}

@@ -23,7 +23,7 @@ def start(width=24, height=16):
     return scene
 
 
-def compare(folder, samples=256, count=24):
+def compare(folder, samples=256, count=16):
     """Errors of the quadrature against Cycles as {lobe: (relative L2 beyond noise, bias)}, and the prepared scene."""
     prepared = scene_parts.prepare()
     ((surface, pixel, unusable),) = scene_parts.sample(folder, prepared)[0]
@@ -38,7 +38,7 @@ def compare(folder, samples=256, count=24):
     return errors, prepared
 
 
-def assert_agrees(folder, samples=256, count=24, tolerance=3e-3):
+def assert_agrees(folder, samples=256, count=16, tolerance=3e-3):
     """The prepared scene, after quadrature and Cycles agreed within `tolerance` beyond Cycles' noise.
 
     At 256 samples the noise of a lamp is about 1 %, of which some 2e-3 remain in the estimate and 1e-3 in the sum; a

@@ -14,15 +14,26 @@ from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
 
 SIZE = (24, 16)
+_seen: list[str] = []
 
 
 def empty_scene(width: int = SIZE[0], height: int = SIZE[1]):
-    """A factory-empty file with a small picture and no world."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
+    """A factory-empty file with a small picture and no world; the preferences become those of the factory once."""
+    if _seen:
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    else:
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        _seen.append("preferences")
     scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = width, height
     scene.render.resolution_percentage = 100
     return scene
+
+
+def save(path: Path) -> Path:
+    """Save the open file as `path`; the path."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    return path
 
 
 def link(ob, location=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0), scale=(1.0, 1.0, 1.0)):
@@ -126,6 +137,15 @@ def add_bump(tree, node, strength=1.0, scale=6.0, distance=0.3):
     tree.links.new(noise.outputs[0], bump.inputs["Height"])
     tree.links.new(bump.outputs["Normal"], node.inputs["Normal"])
     return bump
+
+
+def metal_room(path: Path) -> Path:
+    """Save a metal plane under an area light, seen from above, as `path`; the path."""
+    empty_scene()
+    add_plane(principled(Metallic=1.0, Roughness=0.4)[0])
+    add_area_light("Key")
+    add_top_camera()
+    return save(path)
 
 
 def prepare():

@@ -105,7 +105,7 @@ def test_instances_have_their_own_look_up_to_a_limit(tmp_path, monkeypatch):
     collection = into_collection("Lamps", add_picture_light())
     for x in (-0.8, 0.0, 0.9):
         add_instancer(collection, f"At {x}", location=(x, 0.0, 0.4), scale=(1.0 + abs(x),) * 3)
-    _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8, tolerance=5e-3)
+    _, _, inventory, warnings = assert_agrees(tmp_path, samples=2048, count=8, tolerance=5e-3)
     assert sum("'Light'" in line and "2 instances" in line for line in warnings) == 1
     assert len({round(float(np.linalg.norm(light.half_v)), 4) for light in inventory.lights}) > 1
 

@@ -10,7 +10,7 @@ import quadrature
 import scene_parts
 
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.scene import AreaLight, SceneError, SurfaceSamples
+from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 LAMBERT = "ShaderNodeBsdfDiffuse"
 CASES = {
@@ -47,7 +47,7 @@ def rendered(folder, samples=128):
 def test_radiance_shape_and_scale_are_those_of_cycles(tmp_path, name):
     inventory, _, surface, halves = plane_under(tmp_path, **CASES[name])
     assert len(inventory.lights) == 1 and len(surface) == 256
-    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert, count=32)
     # Monte Carlo noise of the sum at 128 samples and 256 pixels is 2e-4; a wrong factor is at least some per cent.
     assert abs(quadrature.bias(expected, halves)) < 2e-3
     assert quadrature.relative_l2(expected, halves) < 3e-3
@@ -56,65 +56,14 @@ def test_radiance_shape_and_scale_are_those_of_cycles(tmp_path, name):
 def test_negative_z_scale_turns_the_emission_round(tmp_path):
     inventory, _, surface, halves = plane_under(tmp_path, rotation=(math.pi, 0.0, 0.0), scale=(1.0, 1.0, -1.0))
     assert inventory.lights[0].direction[2] == pytest.approx(-1.0)
-    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert, count=32)
     assert expected.min() > 0.0 and abs(quadrature.bias(expected, halves)) < 2e-3
 
 
 def test_a_light_that_faces_away_lights_nothing(tmp_path):
     inventory, _, surface, halves = plane_under(tmp_path, samples=16, rotation=(math.pi, 0.0, 0.0))
     assert len(inventory.lights) == 1
-    assert not quadrature.radiance(surface, inventory.lights, quadrature.lambert).any() and not halves.any()
-
-
-def test_an_emission_node_multiplies(tmp_path):
-    scene_parts.empty_scene(16, 16)
-    scene_parts.add_camera()
-    scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
-    light = scene_parts.add_area_light().data
-    if bpy.app.version < (5, 0, 0):
-        light.use_nodes = True
-    emission = next(node for node in light.node_tree.nodes if node.bl_idname == "ShaderNodeEmission")
-    emission.inputs["Strength"].default_value = 2.5
-    emission.inputs["Color"].default_value = (1.0, 0.5, 0.25, 1.0)
-    inventory, warnings, surface, halves = rendered(tmp_path)
-    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
-    assert abs(quadrature.bias(expected, halves)) < 2e-3 and quadrature.relative_l2(expected, halves) < 3e-3
-    assert warnings == []
-
-
-def test_instances_of_a_light_count_one_by_one(tmp_path):
-    scene_parts.empty_scene(16, 16)
-    scene_parts.add_camera()
-    scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
-    light = scene_parts.add_area_light()
-    collection = bpy.data.collections.new("Lamps")
-    bpy.context.scene.collection.objects.unlink(light)
-    collection.objects.link(light)
-    for x in (-1.0, 0.7):
-        empty = scene_parts.link(bpy.data.objects.new("Empty", None), location=(x, 0.0, 0.4))
-        empty.instance_type, empty.instance_collection = "COLLECTION", collection
-    inventory, _, surface, halves = rendered(tmp_path)
-    assert sorted(round(light.center[0], 3) for light in inventory.lights) == [-0.7, 1.0]
-    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
-    assert abs(quadrature.bias(expected, halves)) < 2e-3 and quadrature.relative_l2(expected, halves) < 3e-3
-
-
-def test_lights_that_do_not_render_are_no_lights():
-    scene_parts.empty_scene()
-    scene_parts.add_camera()
-    scene_parts.add_plane()
-    scene_parts.add_area_light("Shown")
-    scene_parts.add_area_light("Off", energy=0.0)
-    scene_parts.add_area_light("Not in renders").hide_render = True
-    scene_parts.add_area_light("Hidden in the viewport").hide_viewport = True
-    excluded = bpy.data.collections.new("Excluded")
-    bpy.context.scene.collection.children.link(excluded)
-    light = scene_parts.add_area_light("In an excluded collection")
-    bpy.context.scene.collection.objects.unlink(light)
-    excluded.objects.link(light)
-    bpy.context.view_layer.layer_collection.children["Excluded"].exclude = True
-    shown = [light.name for light in scene_parts.prepare()[2].lights]
-    assert sorted(shown) == ["Hidden in the viewport", "Shown"]
+    assert not quadrature.radiance(surface, inventory.lights, quadrature.lambert, count=32).any() and not halves.any()
 
 
 def test_what_is_no_area_light_is_named_and_left_out(tmp_path):
@@ -136,7 +85,7 @@ def test_what_is_no_area_light_is_named_and_left_out(tmp_path):
     for name in ("'Flat'", "'Point'", "'Sun'", "'Spot'", "world 'Sky'"):
         assert text.count(name) == 1, text
     assert [light.name for light in inventory.lights] == ["Key"]
-    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert)
+    expected = quadrature.radiance(surface, inventory.lights, quadrature.lambert, count=32)
     assert abs(quadrature.bias(expected, halves)) < 2e-3
 
 
@@ -185,18 +134,6 @@ def test_light_records_survive_json():
     assert found.corners is None and found.receivers is None and found.spread == 1.0 / 7.0
 
 
-def test_many_lights_take_linear_time():
-    """Ten thousand lights, each with a warning of its own: nothing is searched once per light."""
-    scene_parts.empty_scene()
-    scene_parts.add_camera()
-    scene_parts.add_plane()
-    data = scene_parts.add_area_light("First", energy=-1.0).data
-    for number in range(9_999):
-        scene_parts.link(bpy.data.objects.new(f"Light {number}", data), location=(number, 0.0, 2.0))
-    inventory = scene_parts.prepare()[2]
-    assert len(inventory.lights) == len(inventory.warnings) == 10_000
-
-
 def test_light_groups_and_visibility_are_kept():
     scene_parts.empty_scene()
     scene_parts.add_camera()
@@ -213,15 +150,6 @@ def test_light_groups_and_visibility_are_kept():
     assert (lights["Key"].group, lights["Fill"].group) == ("Keys", "")
     assert (lights["Key"].affects_diffuse, lights["Key"].affects_specular) == (True, False)
     assert (lights["Fill"].affects_diffuse, lights["Fill"].affects_specular) == (False, True)
-
-
-def test_a_scene_without_area_light_is_refused():
-    scene_parts.empty_scene()
-    scene_parts.add_camera()
-    scene_parts.add_plane()
-    scene_parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")))
-    with pytest.raises(SceneError, match=r"no area light.*'Sun' \(SUN\)"):
-        scene_parts.prepare()
 
 
 def test_the_oracle_reproduces_the_form_factor_of_a_parallel_disk():

@@ -20,7 +20,6 @@ from lit_plane import (
 from ltsh_addon.blender.extract import pixels
 from ltsh_addon.blender.lights import meshes
 from ltsh_addon.scene import SceneError
-from ltsh_addon.shading import shade
 
 L_SHAPE = [(0, 0, 0), (1, 0, 0), (1, 0.3, 0), (0.3, 0.3, 0), (0.3, 1, 0), (0, 1, 0)]
 
@@ -55,7 +54,7 @@ def test_a_mesh_lights_as_in_cycles(tmp_path, name):
     start(16, 12)
     build, count = CASES[name]
     build()
-    _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8 if count == BALL else 24)
+    _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8 if count == BALL else 16)
     assert len(inventory.lights) == count and warnings == []
 
 
@@ -76,7 +75,7 @@ def test_a_shell_around_the_camera_shines_inward(tmp_path):
     add_surface(size=4.0)
     dome = scene_parts.add_sphere(lamp_material()[0], 9.0, "Dome", smooth=False, segments=6, location=(0.0, 0.0, 7.0))
     dome.visible_camera = False
-    prepared = assert_agrees(tmp_path, samples=1024)
+    prepared = assert_agrees(tmp_path, samples=1024, count=24)
     assert len(prepared[2].lights) == BALL
     assert all(np.dot(light.center - (0.0, 0.0, 7.0), light.direction) < 0.0 for light in prepared[2].lights)
 
@@ -90,20 +89,6 @@ def test_lamps_do_not_stand_in_the_light_of_others(tmp_path):
     ball.data.polygons.foreach_set("material_index", [int(face.center.z < -0.1) for face in ball.data.polygons])
     prepared = assert_agrees(tmp_path, samples=512, count=16)
     assert 1 < len(prepared[2].lights) < 1 + BALL
-
-
-def test_shading_agrees_with_cycles_on_a_mesh_light(tmp_path):
-    """Polygons, both sides and instances go through `shade`: the reference technique is exact."""
-    start(12, 8)
-    add_lamp_plane(scale=(-1.5, 0.7, 2.0))
-    prepared = scene_parts.prepare()
-    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    images = scene_parts.reference(tmp_path, prepared, 2048)
-    shaded = shade(surface, prepared[2].lights, "reference")
-    for lobe in ("diffuse", "specular"):
-        halves = images[lobe].reshape(2, -1, 3)[:, pixel].astype(np.float64)
-        difference = np.sum((getattr(shaded, lobe)[0] - halves[0]) * (getattr(shaded, lobe)[0] - halves[1]))
-        assert difference < (3e-3) ** 2 * np.sum(halves[0] * halves[1])
 
 
 def test_too_many_faces_are_refused_by_name(tmp_path, monkeypatch):

@@ -161,7 +161,7 @@ def bumped_parts():
 def test_mixes_reproduce_cycles(tmp_path, make):
     prepared = material_scenes.prepared_scene(make)
     assert prepared[3] == []
-    found = material_scenes.errors(tmp_path, prepared, 1024, techniques=("reference",))
+    found = material_scenes.errors(tmp_path, prepared, 512, techniques=("reference",))
     for name in ("specular", "diffuse"):
         squared = found[name, "reference"][0]
         # The estimate is free of the noise on average; what chance leaves of it at this size is 0.5 % (specular).

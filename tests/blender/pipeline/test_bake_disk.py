@@ -17,7 +17,10 @@ from ltsh_addon import cli
 OPTIONS = ["--size", "256", "--margin", "0", "--techniques", "ltc,ltsh2,ltsh4", "--quiet"]
 
 with_limit = pytest.mark.skipif(bool(bpy.app.binary_path), reason="Blender does not start under a limit of files")
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="limits and mounts of Unix")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="limits and mounts of Unix"),
+    pytest.mark.usefixtures("own_blender"),
+]
 
 
 def two_planes():

@@ -17,29 +17,9 @@ ALWAYS = ("report.json", "timing.json", ".ltsh")
 SMALL = ["--resolution", "32x18", "--cycles-samples", "8"]
 
 
-def saved(path, *, camera=True, light=True, plane=True, sky_only=False):
-    """A scene of one metal plane, one area light and a camera from above, saved as `path`."""
-    scene_parts.empty_scene()
-    if plane:
-        scene_parts.add_plane(scene_parts.principled(Metallic=1.0, Roughness=0.4)[0])
-    if light:
-        scene_parts.add_area_light("Key")
-    if camera:
-        scene_parts.add_top_camera()
-        if sky_only:
-            bpy.context.scene.camera.rotation_euler = (np.pi, 0.0, 0.0)
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    return path
-
-
 @pytest.fixture
 def room(tmp_path):
-    return saved(tmp_path / "room.blend")
-
-
-@pytest.fixture
-def out(tmp_path):
-    return tmp_path / "out"
+    return scene_parts.metal_room(tmp_path / "room.blend")
 
 
 def run(capsys, *arguments):
@@ -74,71 +54,9 @@ def test_shade_gives_the_open_file(capsys, room, out):
     assert {path.name for path in out.iterdir()} == {"shade.exr", *ALWAYS}
 
 
-def damaged_scene(folder, kind):
-    """A file that is no usable scene."""
-    path = folder / f"{kind}.blend"
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "cut":
-        whole = saved(path).read_bytes()
-        path.write_bytes(whole[: len(whole) // 2])
-    elif kind == "text":
-        path.write_text("not a scene\n" * 100)
-    elif kind == "no camera":
-        saved(path, camera=False)
-    elif kind == "no light":
-        saved(path, light=False)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("kind", "complaint"),
-    [
-        ("missing", "no such file"),
-        ("folder", "is a folder, expected a .blend"),
-        ("cut", "cannot open it"),
-        ("text", "is no .blend"),
-        ("no camera", "no active camera"),
-        ("no light", "no area light"),
-    ],
-)
-def test_a_scene_that_cannot_be_shaded_is_one_line_and_no_file(capsys, tmp_path, out, temporary_root, kind, complaint):
-    code, stdout, stderr = run(capsys, "compare", damaged_scene(tmp_path, kind), "-o", out, *SMALL, "--quiet")
-    assert (code, stdout) == (1, "") and complaint in stderr and len(stderr.splitlines()) == 1
-    assert stderr.startswith("ltsh: ") and list(out.iterdir()) == [] and left_over(temporary_root) == []
-
-
 def test_an_unknown_camera_is_one_line(capsys, room, out):
     code, _, stderr = run(capsys, "shade", room, "-o", out, "--camera", "Nobody", "--quiet")
     assert code == 1 and "'Nobody'" in stderr and "'Camera'" in stderr and list(out.iterdir()) == []
-
-
-@pytest.mark.parametrize("scene", ["sky_only", "no_surface"])
-def test_a_camera_that_sees_no_surface_is_a_warning(capsys, tmp_path, out, scene):
-    path = saved(tmp_path / "sky.blend", sky_only=scene == "sky_only", plane=scene != "no_surface")
-    code, _, stderr = run(capsys, "compare", path, "-o", out, *SMALL, "--quiet")
-    assert code == 0 and "warning: " in stderr and "sees no surface" in stderr
-    layers = imaging.read_layers(out / "compare.exr")
-    assert not layers["coverage.hit"].any() and not layers["ltsh4.specular"].any()
-
-
-def test_objects_without_material_or_faces_do_no_harm(capsys, tmp_path, out):
-    scene_parts.empty_scene()
-    scene_parts.add_plane()
-    scene_parts.add_mesh("Empty", [], [])
-    scene_parts.add_mesh("Edge", [(0, 0, 1), (1, 0, 1)], [])
-    bare_slot = scene_parts.add_plane(size=1.0, location=(0.0, 0.0, 0.1), name="Slot")
-    bare_slot.data.materials.append(None)
-    scene_parts.add_area_light("Key")
-    scene_parts.add_top_camera()
-    path = tmp_path / "bare.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    code, stdout, _ = run(capsys, "compare", path, "-o", out, *SMALL, "--json", "--quiet")
-    report = json.loads(stdout)
-    assert code == 0 and report["surface_samples"] == 32 * 18
-    for figures in report["passes"].values():
-        assert all(row["against_cycles"]["not_finite"] == 0 for row in figures["techniques"].values())
-    assert report["passes"]["diffuse"]["techniques"]["ltsh4"]["against_cycles"]["unbiased_relative_error"] < 0.1
 
 
 def test_the_demo_end_to_end(capsys, out):

@@ -1,6 +1,5 @@
 """Scenes that nobody meant: what cannot be done ends with one line, what is merely odd is done, with a warning."""
 
-import contextlib
 import gzip
 import json
 import os
@@ -11,10 +10,11 @@ import bpy
 import hostile_scenes
 import numpy as np
 import pytest
+import scene_parts
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.process import client
 from ltsh_addon.scene import SceneError
 
 # `make soak` takes 10,000.
@@ -55,6 +55,8 @@ CASES = {
     "no UV map": ("no_uv_map", "bake", 1, "object 'Plane' has no UV map, found none"),
     "UV NaN": ("uv_that_is_no_number", "bake", 1, "all of UV map 'UVMap' lies outside"),
     "missing files": ("missing_files", "shade", 0, "//nowhere/lost.png is missing"),
+    "missing library": ("lost_library", "shade", 0, "library 'props.blend': .* is missing"),
+    "volume": ("volume", "shade", 0, "volume 'Smoke' is not shaded"),
 }
 OPTIONS = {
     "shade": ["--techniques", "ltsh4"],
@@ -63,20 +65,8 @@ OPTIONS = {
 }
 
 
-@pytest.fixture(scope="module")
-def one_blender(tmp_path_factory):
-    """A Blender that goes on from one scene to the next, also after one that it could not do, to save its start."""
-    with blender_process.kept_blender(tmp_path_factory.mktemp("blender")):
-        process = blender_process._kept.get()
-        end, process.end = process.end, lambda: None
-        yield
-        process.end = end
-
-
 @pytest.fixture
-def run(one_blender, monkeypatch, capsys):
-    monkeypatch.setattr(blender_process, "kept_blender", lambda folder: contextlib.nullcontext())
-
+def run(capsys):
     def command(*arguments):
         capsys.readouterr()  # bpy tells on stdout that it saved a scene
         code = cli.main([str(argument) for argument in arguments])
@@ -87,10 +77,8 @@ def run(one_blender, monkeypatch, capsys):
 
 def saved(name: str, folder: Path, *arguments) -> Path:
     """A scene of hostile_scenes as a file."""
-    getattr(hostile_scenes, name)(*arguments)
-    path = folder / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    return path
+    (hostile_scenes.SCENES.get(name) or getattr(hostile_scenes, name))(*arguments)
+    return scene_parts.save(folder / "scene.blend")
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -169,7 +157,7 @@ def test_many_lights_add_up(run, tmp_path):
 
 @pytest.mark.parametrize("command", ["shade", "bake"])
 @pytest.mark.parametrize("allowed", [False, True])
-def test_scripts_in_a_file_run_only_when_asked_for(tmp_path, monkeypatch, command, allowed):
+def test_scripts_in_a_file_run_only_when_asked_for(tmp_path, monkeypatch, own_blender, command, allowed):
     mark = tmp_path / "mark"
     monkeypatch.setenv(hostile_scenes.MARK, str(mark))
     path = saved("scripts", tmp_path)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 
 import bake_scenes
-import bpy
 import fake_scene
 import kills
 import programs
@@ -39,18 +38,6 @@ def test_after_signals_at_random_moments_resume_gives_the_same_bytes(trial):
     trial.check("random")
     assert trial.end_while_writing("writing")
     trial.check("writing")
-
-
-@pytest.mark.skipif(bool(bpy.app.binary_path), reason="Blender does not start under a limit of files")
-def test_after_a_full_disk_resume_gives_the_same_bytes(trial):
-    """A file as large as may be is what stands for it where nobody may mount a small disk."""
-    # In KiB: the samples that Blender renders do not fit; of the pictures the last bytes do not.
-    largest = min(len(trial.expected[f"compare_000{frame}.exr"]) for frame in (1, 2)) // 1024
-    for limit, complaint in ((40, "no room for temporary files"), (largest, "exr: cannot be written")):
-        code, said = trial.end_by_limit(f"limit {limit}", limit)
-        assert code == 1 and said and all(complaint in line for line in said.splitlines()), said
-        assert trial.left(f"limit {limit}") == [] and list(trial.runs.temporary.iterdir()) == []
-        trial.check(f"limit {limit}")
 
 
 @pytest.fixture

@@ -132,13 +132,6 @@ def test_what_the_command_line_refuses_is_told(scene):
     assert "no area light" in faults_of(bpy.ops.ltsh.shade)
 
 
-def test_an_output_folder_that_is_a_file_is_told(scene, tmp_path):
-    (tmp_path / "taken").write_text("")
-    scene.ltsh.output_folder = "//taken/"
-    assert "taken" in faults_of(bpy.ops.ltsh.shade)
-    assert (tmp_path / "taken").read_text() == ""
-
-
 def test_an_unexpected_fault_ends_the_job_with_one_line(scene, monkeypatch):
     def fail(*arguments):
         raise RuntimeError("cannot\nread")

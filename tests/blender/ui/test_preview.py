@@ -2,6 +2,7 @@
 
 import bpy
 import pytest
+import scene_parts
 
 import ltsh_addon
 from ltsh_addon.blender.ui import preview
@@ -10,8 +11,7 @@ from ltsh_addon.blender.ui import preview
 def test_files_saved_during_a_preview_keep_the_artists_engine(addon, tmp_path):
     addon.render.engine = "BLENDER_WORKBENCH"
     bpy.ops.ltsh.preview()
-    path = tmp_path / "previewed.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(tmp_path / "previewed.blend")
     assert addon.render.engine == "LTSH" and addon.ltsh_view.artist_engine == "BLENDER_WORKBENCH"
     bpy.ops.wm.open_mainfile(filepath=str(path))
     scene = bpy.context.scene
@@ -85,8 +85,7 @@ def test_an_engine_chosen_by_hand_is_not_taken_for_a_preview(addon, tmp_path):
     addon.render.engine = "LTSH"
     bpy.ops.ltsh.preview()
     assert addon.render.engine == "LTSH" and not addon.ltsh_view.artist_engine
-    path = tmp_path / "own.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = scene_parts.save(tmp_path / "own.blend")
     bpy.ops.wm.open_mainfile(filepath=str(path))
     assert bpy.context.scene.render.engine == "LTSH"
 

@@ -11,13 +11,6 @@ import ltsh_addon
 from ltsh_addon.blender import registration
 
 
-@pytest.fixture
-def enabled():
-    ltsh_addon.register()
-    yield
-    ltsh_addon.unregister()
-
-
 def test_the_state_shows_whatever_an_add_on_adds():
     """The oracle itself: one thing of each kind, added and taken back."""
 
@@ -113,9 +106,3 @@ def test_the_command_is_there_while_enabled(monkeypatch):
     assert commands["ltsh"](["--version"]) == 0 and commands["ltsh"](["nonsense"]) == 2
     ltsh_addon.unregister()
     assert commands == {}
-
-
-def test_entry_point_of_the_extension_registers_the_package(enabled):
-    from ltsh_addon.blender.ui.settings import LTSH_AddonPreferences
-
-    assert LTSH_AddonPreferences.is_registered and LTSH_AddonPreferences.bl_idname == "ltsh_addon"

@@ -10,8 +10,10 @@ import scene_parts as parts
 
 import ltsh_addon
 from ltsh_addon import imaging
+from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.ui import comparison, results, view_operators
 from ltsh_addon.blender.ui import settings as settings_module
+from ltsh_addon.blender.ui.drawing import INK, PLATE
 from ltsh_addon.imaging.color import signed_error_colors
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.pipeline import display_layers
@@ -151,8 +153,7 @@ def test_the_probe_reads_every_picture_at_the_pixel(scene, tmp_path):
 def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path):
     scene.ltsh.mode, scene.ltsh.first = "WIPE", "ltc"
     before = seen().copy()
-    path = tmp_path / "room.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+    path = parts.save(tmp_path / "room.blend")
     np.testing.assert_array_equal(seen(), before)
     comparison.settle()
     bpy.ops.wm.open_mainfile(filepath=str(path))
@@ -291,3 +292,23 @@ def test_the_manual_names_what_the_panels_show(scene):
     skipped = {"A", "B", "groups", "View", "Pass", "Object"}
     assert [word for word in (*buttons, *names) if word not in text and word not in skipped] == []
     assert len(text.splitlines()) < 120 and max(map(len, text.splitlines())) <= 120
+
+
+# WCAG 2.2, success criterion 1.4.3, https://www.w3.org/TR/WCAG22/#contrast-minimum
+LEAST_CONTRAST = 4.5
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+def linear(value):
+    return value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4  # IEC 61966-2-1
+
+
+def luminance(color):
+    return sum(weight * linear(value) for weight, value in zip(LUMINANCE, color[:3], strict=True))
+
+
+@pytest.mark.parametrize("picture", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("color", [INK, view.CAPTION_COLOR, view.BRIGHTER_COLOR, view.DARKER_COLOR])
+def test_captions_stand_out_from_their_plates_on_dark_and_white_pictures(picture, color):
+    behind = PLATE[3] * luminance(PLATE) + (1.0 - PLATE[3]) * picture
+    assert (luminance(color) + 0.05) / (behind + 0.05) > LEAST_CONTRAST

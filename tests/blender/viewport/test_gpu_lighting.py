@@ -72,8 +72,8 @@ def test_radiance_is_that_of_the_integrator(surface):
 
 @pytest.mark.parametrize("surface", ["plain", "tilted"])
 def test_lights_with_a_spread_are_those_of_the_integrator(surface):
-    # One technique where there are more horizons: llvmpipe takes seconds to compile each.
-    check(surface, random_surfaces.FOCUSED_LIGHTS, TECHNIQUES if surface == "plain" else ("ltsh2",))
+    # One technique each: llvmpipe takes seconds to compile one.
+    check(surface, random_surfaces.FOCUSED_LIGHTS, ("ltsh4" if surface == "plain" else "ltsh2",))
 
 
 def test_no_input_gives_anything_but_finite_light():

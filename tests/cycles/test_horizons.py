@@ -1,0 +1,96 @@
+"""Horizons that end lobes, and normals as Cycles bends them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ltsh_addon.cycles import horizons
+from ltsh_addon.cycles.gbuffer import coarse_meshes
+from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
+from ltsh_addon.scene import AreaLight, SurfaceSamples
+
+
+def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
+    """Points at the origin, seen obliquely, whose geometric and smooth normals differ."""
+    tilted, up = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
+    view = np.array(view)
+    vectors = {"view": view, "normal": up, "diffuse_normal": up, "smooth_normal": up, "geometric_normal": tilted}
+    zero = np.zeros((count, 3))
+    return SurfaceSamples(
+        **{name: np.tile(vector, (count, 1)) for name, vector in vectors.items()},
+        position=zero,
+        roughness=np.full(count, roughness),
+        specular_f0=zero + 1.0,
+        specular_f90=zero + 1.0,
+        dielectric=zero,
+        ior=np.full(count, 1.5),
+        diffuse_albedo=zero,
+    )
+
+
+def light_at(distance, half):
+    """A square light on the x axis that faces the origin, its center on the horizon."""
+    axes = {"half_u": (0.0, half, 0.0), "half_v": (0.0, 0.0, half), "direction": (-1.0, 0.0, 0.0)}
+    return AreaLight("Light", "SQUARE", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
+
+
+@pytest.mark.parametrize(
+    "roughness, view, light, smooth",
+    [
+        (0.6, (-0.96, 0.0, 0.28), (3.0, 0.3), True),
+        # The mirror direction is 3 degrees above the horizon: 45 per sr for the lobe's choice, 0.2 for the light's.
+        (0.15, (-0.9987, 0.0, 0.05), (0.5, 3.0), False),
+    ],
+)
+def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, view, light, smooth):
+    samples = samples_near_the_horizon(roughness, view)
+    found = end_at_horizons_of_cycles(samples, (light_at(*light),)).geometric_normal
+    assert np.array_equal(found, samples.smooth_normal if smooth else samples.geometric_normal)
+
+
+def test_without_lights_or_differences_nothing_changes():
+    samples = samples_near_the_horizon(0.5)
+    assert end_at_horizons_of_cycles(samples, ()) is samples
+    flat = replace(samples, geometric_normal=samples.smooth_normal)
+    assert end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),)) is flat
+
+
+def test_coarse_meshes_are_named_where_they_fill_the_picture():
+    fine = samples_near_the_horizon(0.5, count=100)
+    assert coarse_meshes(fine) == []
+    normal = fine.geometric_normal.copy()
+    normal[:50] = (np.sin(0.7), 0.0, np.cos(0.7))
+    (line,) = coarse_meshes(replace(fine, geometric_normal=normal))
+    assert "50 of 100 samples" in line and "35 degrees" in line
+
+
+def test_reflections_of_valid_normals_leave_the_surface():
+    """Independent of Cycles: the mirrored view ends exactly at the threshold, and good normals stay."""
+    generator = np.random.default_rng(7)
+    true_normal, view, normal = (horizons.unit(generator.normal(size=(4000, 3))) for _ in range(3))
+    facing = np.sum(view * true_normal, axis=-1) > 0.02
+    true_normal, view, normal = true_normal[facing], view[facing], normal[facing]
+    valid = horizons.valid_specular_normal(normal, true_normal, view)
+    assert np.allclose(np.linalg.norm(valid, axis=-1), 1.0, atol=1e-12)
+
+    def elevation(axis):
+        mirrored = 2.0 * np.sum(axis * view, axis=-1, keepdims=True) * axis - view
+        return np.sum(mirrored * true_normal, axis=-1)
+
+    threshold = np.minimum(0.9 * np.sum(view * true_normal, axis=-1), 0.01)
+    good = elevation(normal) >= threshold
+    assert np.array_equal(valid[good], normal[good]) and good.any() and not good.all()
+    assert np.abs(elevation(valid) - threshold)[~good].max() < 1e-12
+    # Bent in the plane of both normals, towards the true one.
+    volume = np.linalg.det(np.stack([valid, normal, true_normal], axis=-2)[~good])
+    assert np.abs(volume).max() < 1e-12
+    assert np.all(np.sum(valid * true_normal, axis=-1)[~good] >= np.sum(normal * true_normal, axis=-1)[~good])
+
+
+def test_bump_alpha_is_an_eighth_of_the_squared_tangent():
+    angle = np.radians([0.0, 30.0, 60.0, 75.0, 90.0])
+    up = np.tile([0.0, 0.0, 1.0], (5, 1))
+    tilted = np.stack([np.sin(angle), np.zeros(5), np.cos(angle)], axis=-1)
+    expected = [0.0, 1.0 / 24.0, 3.0 / 8.0, 1.0, 1.0]
+    assert np.allclose(horizons.bump_alpha2(tilted, up), expected, atol=1e-12)

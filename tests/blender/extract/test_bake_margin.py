@@ -1,10 +1,11 @@
-"""Margins of adjacent faces: against a surface laid flat, and against what Blender's own bake fills in."""
+"""Covered texels and margins of adjacent faces: against Blender's own bake and a surface laid flat."""
 
 import bpy
 import numpy as np
 import pytest
 import scene_parts
 from bake_scenes import baked, save, start
+from mathutils import Vector
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
@@ -76,19 +77,56 @@ def position_material():
     return material
 
 
-def blender_bake(ob, margin):
-    """Positions (SIZE, SIZE, 3) as Blender bakes them, row 0 below; 0 beyond the margin."""
+def blender_bake(ob, margin, size=SIZE):
+    """Positions (size, size, 3) as Blender bakes them, row 0 below, 0 beyond the margin; which texels it bakes."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    image = bpy.data.images.new("Bake", SIZE, SIZE, alpha=True, float_buffer=True, is_data=True)
-    image.pixels.foreach_set(np.zeros(SIZE * SIZE * 4, np.float32))
+    if not ob.data.materials:
+        ob.data.materials.append(position_material())
+    image = bpy.data.images.new("Bake", size, size, alpha=True, float_buffer=True, is_data=True)
+    image.pixels.foreach_set(np.zeros(size * size * 4, np.float32))
     tree = ob.data.materials[0].node_tree
     tree.nodes.active = tree.nodes.new("ShaderNodeTexImage")
     tree.nodes.active.image = image
     bpy.ops.object.bake(type="EMIT", margin=margin, margin_type="ADJACENT_FACES", use_clear=False)
-    pixels = np.empty(SIZE * SIZE * 4, np.float32)
+    pixels = np.empty(size * size * 4, np.float32)
     image.pixels.foreach_get(pixels)
-    return pixels.reshape(SIZE, SIZE, 4)[..., :3]
+    pixels = pixels.reshape(size, size, 4)
+    return pixels[..., :3], pixels[..., 3] > 0.5
+
+
+def sphere():
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=64, ring_count=32)
+
+
+def suzanne():
+    bpy.ops.mesh.primitive_monkey_add()
+    modifier = bpy.context.object.modifiers.new("Subdivision", "SUBSURF")
+    modifier.levels = modifier.render_levels = 2
+
+
+def two_tiles():
+    """A plane over the tiles 1001 and 1002, in a small rotation."""
+    bpy.ops.mesh.primitive_plane_add()
+    corners = np.float32([(0.07, 0.11), (1.93, 0.05), (1.9, 0.93), (0.1, 0.88)])
+    bpy.context.object.data.uv_layers.active.uv.foreach_set("vector", corners.ravel())
+
+
+@pytest.mark.parametrize("size", [256, 1024])
+@pytest.mark.parametrize("make", [sphere, bpy.ops.mesh.primitive_cube_add, suzanne, two_tiles])
+def test_covered_texels_are_those_that_cycles_bakes(make, size):
+    scene_parts.empty_scene()
+    make()
+    ob = bpy.context.object
+    mesh, _, _ = bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+    layer = ob.data.uv_layers.active.uv
+    for tile in range(2 if make is two_tiles else 1):
+        _, baked_texels = blender_bake(ob, 0, size)
+        ours = np.zeros(size * size, bool)
+        ours[UvTriangles.in_tile(mesh.uv, size, size, (tile, 0)).texels(0, size).index] = True
+        assert baked_texels.any() and np.array_equal(ours.reshape(size, size), baked_texels)
+        # The next tile comes to where the first was.
+        layer.foreach_set("vector", np.float32([value for item in layer for value in item.vector - Vector((1.0, 0.0))]))
 
 
 @pytest.mark.parametrize(
@@ -101,9 +139,7 @@ def test_margins_agree_with_blenders_own(tmp_path, kind, share):
     scene_parts.empty_scene()
     getattr(bpy.ops.mesh, f"primitive_{kind}_add")()
     ob = bpy.context.object
-    ob.data.materials.clear()
-    ob.data.materials.append(position_material())
-    plain, wide = blender_bake(ob, 0), blender_bake(ob, MARGIN)
+    (plain, _), (wide, _) = blender_bake(ob, 0), blender_bake(ob, MARGIN)
     mesh, _, _ = bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
 
     def colors(texels):

@@ -9,7 +9,8 @@ import pytest
 import scene_parts
 import sheen_measurement
 from bake_scenes import baked, save
-from scene_parts import bsdf_material, new_material, principled
+from material_scenes import Build
+from scene_parts import bsdf_material, principled
 
 from ltsh_addon import imaging
 from ltsh_addon.cycles import closures
@@ -41,19 +42,15 @@ def sheen_node():
 
 def mix():
     """Of a varying metal and varying sheen, by a texture."""
-    made, tree, output = new_material("Mix")
-    first, second = tree.nodes.new("ShaderNodeBsdfPrincipled"), tree.nodes.new("ShaderNodeBsdfAnisotropic")
-    coordinates, noise = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeTexNoise")
-    noise.inputs["Detail"].default_value = 0.0
-    tree.links.new(coordinates.outputs["Object"], noise.inputs["Vector"])
-    mixed = tree.nodes.new("ShaderNodeMixShader")
-    for target in (mixed.inputs[0], first.inputs["Metallic"], first.inputs["Sheen Weight"], second.inputs["Roughness"]):
-        tree.links.new(noise.outputs[0], target)
-    tree.links.new(noise.outputs["Color"], first.inputs["Base Color"])
-    tree.links.new(first.outputs[0], mixed.inputs[1])
-    tree.links.new(second.outputs[0], mixed.inputs[2])
-    tree.links.new(mixed.outputs[0], output.inputs["Surface"])
-    return made
+    made = Build("Mix")
+    first, second = made.shader("BsdfPrincipled"), made.shader("BsdfAnisotropic")
+    first.node.distribution = second.node.distribution = "MULTI_GGX"
+    noise = made.new("ShaderNodeTexNoise", Detail=0.0)
+    made.link(made.new("ShaderNodeTexCoord").outputs["Object"], noise.inputs["Vector"])
+    for target in (first.node.inputs["Metallic"], first.node.inputs["Sheen Weight"], second.node.inputs["Roughness"]):
+        made.link(noise.outputs[0], target)
+    made.link(noise.outputs["Color"], first.node.inputs["Base Color"])
+    return made.show(made.mix(noise.outputs[0], first, second))
 
 
 def dielectric():

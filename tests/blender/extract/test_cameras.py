@@ -182,10 +182,6 @@ def test_cameras_with_other_projections_are_refused(tmp_path, kind, words):
     with pytest.raises(SceneError, match=f"camera 'Odd' is {words}.* expected a perspective or orthographic one"):
         extract(ExtractOptions(path))
     assert len(extract(ExtractOptions(path, camera=plain.name)).samples) > 0
-
-
-def test_what_is_no_camera_is_refused(tmp_path):
-    scene = room()
     scene.camera = bpy.data.objects["Key"]
     with pytest.raises(SceneError, match="'Key' is a LIGHT object"):
         extract(ExtractOptions(saved(tmp_path)))

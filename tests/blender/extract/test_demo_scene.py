@@ -1,7 +1,5 @@
 """The example scene: built in a child as a user's is, opened here and looked at."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import bpy
@@ -45,12 +43,6 @@ def surface_shader(material):
     return link.from_node
 
 
-def pixels(image):
-    values = np.empty(len(image.pixels), dtype=np.float32)
-    image.pixels.foreach_get(values)
-    return values.reshape(image.size[1], image.size[0], -1)[..., :3]
-
-
 def test_four_area_lights_of_the_four_shapes_shine(demo):
     lights = [ob.data for ob in demo.objects if ob.type == "LIGHT"]
     assert {light.type for light in lights} == {"AREA"}
@@ -59,12 +51,6 @@ def test_four_area_lights_of_the_four_shapes_shine(demo):
     # Between them they use what the radiance of a light depends on.
     assert any(light.use_temperature for light in lights) and any(light.exposure != 0.0 for light in lights)
     assert any(max(light.color) > 2.0 * min(light.color) for light in lights)
-
-
-def test_the_picture_is_480x270_through_a_camera(demo):
-    render = demo.render
-    assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (480, 270, 100)
-    assert demo.camera is not None and demo.camera.type == "CAMERA" and render.engine == "CYCLES"
 
 
 def test_every_material_is_a_single_scatter_ggx_lobe(demo):
@@ -94,31 +80,6 @@ def test_nothing_lies_outside_the_file(demo):
     assert all(str(Path.home()) not in path for path in bpy.utils.blend_paths(absolute=False, packed=True))
 
 
-def fingerprint_in_fresh_interpreter():
-    """Hash of all arrays of all parts and textures, computed in an interpreter with hash seed of its own."""
-    code = (
-        "import hashlib\n"
-        "import numpy as np\n"
-        "from ltsh_addon.blender import demo_meshes as t\n"
-        "digest = hashlib.sha256()\n"
-        "for part in t.everything():\n"
-        "    shape = part.shape\n"
-        "    digest.update(f'{part.name} {part.material} {part.location} {part.bevel}'.encode())\n"
-        "    digest.update(np.ascontiguousarray(shape.vertices).tobytes() + repr(shape.faces()).encode())\n"
-        "    digest.update(np.ascontiguousarray(part.rotation).tobytes())\n"
-        "for image in (*t.floor_textures(), t.quilted_normals(), t.screen_picture(), t.side_art()):\n"
-        "    digest.update(np.ascontiguousarray(image).tobytes())\n"
-        "print(digest.hexdigest())\n"
-    )
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
-    return done.stdout.strip()
-
-
-def test_parts_and_textures_are_the_same_in_every_run():
-    assert fingerprint_in_fresh_interpreter() == fingerprint_in_fresh_interpreter() != ""
-
-
 def scene_arrays():
     """All meshes, matrices, images, lights of the open file as arrays by name."""
     arrays = {}
@@ -131,7 +92,7 @@ def scene_arrays():
     for ob in bpy.data.objects:
         arrays[f"object {ob.name}"] = np.array(ob.matrix_world)
     for image in bpy.data.images:
-        arrays[f"image {image.name}"] = pixels(image)
+        arrays[f"image {image.name}"] = np.array(image.pixels[:], np.float32)
     for light in bpy.data.lights:
         arrays[f"light {light.name}"] = np.array([light.energy, light.size, light.size_y, *light.color])
     return arrays

@@ -4,14 +4,11 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from film_scenes import SIZE, compared, diffuse, plain_diffuse, tiles
+from film_scenes import SIZE, compared, diffuse, plain_diffuse
 from scene_parts import add_plane
 
-from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.process import blender_process
 from ltsh_addon.blender.process.client import ExtractOptions, extract
-from ltsh_addon.blender.render_settings import enable_passes, render_exr
 
 FILTERS = [("BOX", 4.0), ("GAUSSIAN", 1.0), ("BLACKMAN_HARRIS", 1.5), ("BLACKMAN_HARRIS", 3.0)]
 
@@ -72,8 +69,8 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
             scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 3.0
         found = extract(ExtractOptions(path, sub_samples=count))
         white = found.film.image(found.samples.diffuse_albedo)[..., 0]
-        plain = plain_albedo(tmp_path, scene)
-        errors[name] = np.abs(white - plain)
+        _, plain = plain_diffuse(tmp_path, scene, samples=1024)
+        errors[name] = np.abs(white - plain[..., 0])
     assert white.min() == 0.0 and white.max() > 0.9 and ((white > 0.1) & (white < 0.9)).sum() > 60
     # The discrepancy of n points for half-planes is about n^(-3/4) (Beck 1987), and a pixel sees up to two edges. On
     # average they do three times better than random ones, whose standard deviation is 0.5 n^(-1/2).
@@ -81,23 +78,12 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
     assert errors["other"].max() > 2.0 * count**-0.75 and errors["other"].mean() > 0.5 * count**-0.5 / 3.0
 
 
-def plain_albedo(folder, scene):
-    """Diffuse color of a plain render of 1024 samples through the scene's filter."""
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1024, False
-    scene.cycles.use_adaptive_sampling = False
-    enable_passes(scene.view_layers[0], ("combined", "diffuse_color"))
-    render_exr(scene, folder / "plain.exr")
-    layers = imaging.read_layers(folder / "plain.exr")
-    color = "DiffCol" if bpy.app.version < (5, 0, 0) else "Diffuse Color"
-    return layers[f"{scene.view_layers[0].name}.{color}"][..., 0]
-
-
 def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path):
     """All the way: radiance with --aa 64 in the filter that files have by default."""
     scene = stripes("BLACKMAN_HARRIS", 1.5)
     report, layers = compared(tmp_path, sub_samples=64, cycles_samples=1024)
     assert report["pixel_filter"] == "BLACKMAN_HARRIS 1.5 px"
-    plain = plain_diffuse(tmp_path, scene, samples=1024)
+    plain, _ = plain_diffuse(tmp_path, scene, samples=1024)
     peak = plain.max()
     for name in ("ltc.diffuse", "cycles.diffuse"):
         error = np.abs(layers[name] - plain) / peak
@@ -107,13 +93,3 @@ def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path)
     figures = report["passes"]["diffuse"]["techniques"]["ltc"]["against_cycles"]
     assert figures["unbiased_relative_error"] < 0.005
     assert np.abs(layers["ltc.diffuse"] - layers["cycles.diffuse"]).max() < 0.02 * peak
-
-
-def test_the_filter_of_the_file_is_put_back(tmp_path):
-    scene = tiles()
-    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 1.75
-    with pytest.raises(blender_process.SceneError):
-        with render_settings.pinned_pixel_filter(scene):
-            assert 0.0 < scene.cycles.filter_width < 1e-3
-            raise blender_process.SceneError("stopped")
-    assert (scene.cycles.pixel_filter_type, scene.cycles.filter_width) == ("GAUSSIAN", 1.75)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import bpy
 import scene_parts
+from material_scenes import Build
 from scene_parts import add_plane, add_sphere, principled
 
 from ltsh_addon import imaging
@@ -36,25 +36,19 @@ def textured_scene():
     start(camera=(0.0, -3.0, 3.0))
     scene_parts.add_area_light("Fill", (-1.5, 0.5, 1.2), (0.2, -0.8, 0.3), shape="DISK", energy=40.0)
     add_sphere(principled("Metal", Metallic=1.0, Roughness=0.7)[0], radius=0.5, location=(0.0, 0.0, 0.6), segments=48)
-    material, node = principled("Rough", Roughness=0.5)
-    tree = material.node_tree
-    noise = tree.nodes.new("ShaderNodeTexNoise")
-    noise.inputs["Scale"].default_value, noise.inputs["Detail"].default_value = 0.7, 0.0
-    group = bpy.data.node_groups.new("Group", "ShaderNodeTree")
-    group.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
-    inner = group.nodes.new("ShaderNodeBsdfPrincipled")
-    texture = group.nodes.new("ShaderNodeTexWave")
-    texture.inputs["Scale"].default_value, texture.inputs["Detail"].default_value = 0.2, 0.0
-    group.links.new(texture.outputs["Color"], inner.inputs["Base Color"])
-    group.links.new(inner.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
-    outer, mix = tree.nodes.new("ShaderNodeGroup"), tree.nodes.new("ShaderNodeMixShader")
-    outer.node_tree = group
-    tree.links.new(noise.outputs[0], node.inputs["Roughness"])
-    tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
-    tree.links.new(node.outputs[0], mix.inputs[1])
-    tree.links.new(outer.outputs[0], mix.inputs[2])
-    tree.links.new(mix.outputs[0], tree.nodes["Material Output"].inputs["Surface"])
-    scene_parts.add_bump(tree, node, strength=0.2, scale=0.7).inputs["Height"].links[0].from_node.inputs[
-        "Detail"
-    ].default_value = 0.0
-    add_plane(material, size=3.0)
+    made = Build("Rough")
+    noise = made.new("ShaderNodeTexNoise", Scale=0.7, Detail=0.0)
+    rough = made.shader("BsdfPrincipled", Roughness=0.5)
+
+    def fill():
+        inner, texture = made.shader("BsdfPrincipled"), made.new("ShaderNodeTexWave", Scale=0.2, Detail=0.0)
+        inner.node.distribution = "MULTI_GGX"
+        made.link(texture.outputs["Color"], inner.node.inputs["Base Color"])
+        return inner
+
+    made.link(noise.outputs[0], rough.node.inputs["Roughness"])
+    made.link(noise.outputs["Color"], rough.node.inputs["Base Color"])
+    made.show(made.mix(0.5, rough, *made.group(fill)))
+    bump = scene_parts.add_bump(made.tree, rough.node, strength=0.2, scale=0.7)
+    bump.inputs["Height"].links[0].from_node.inputs["Detail"].default_value = 0.0
+    add_plane(made.material, size=3.0)

@@ -8,25 +8,10 @@ import bpy
 import numpy as np
 
 # What Blender itself keeps changing, what repeats something else at great length, or what reading would load.
-SKIPPED = {
-    "rna_type",
-    "id_data",
-    "original",
-    "session_uid",
-    "bindcode",
-    "depsgraph",
-    "is_evaluated",
-    "preview",
-    "pixels",
-    "loop_triangles",
-    "loop_triangle_polygons",
-    "window_managers",
-    "windows",
-    "screens",
-    # Blender 4.5 makes these attributes of a mesh when somebody looks.
-    "uv_layer_clone",
-    "uv_layer_stencil",
-}
+SKIPPED = {"rna_type", "id_data", "original", "session_uid", "bindcode", "depsgraph", "is_evaluated", "preview"}
+SKIPPED |= {"pixels", "loop_triangles", "loop_triangle_polygons", "window_managers", "windows", "screens"}
+# Blender 4.5 makes these attributes of a mesh when somebody looks.
+SKIPPED |= {"uv_layer_clone", "uv_layer_stencil"}
 # Elements of geometry: `attributes` hold the same numbers, and give them as arrays.
 ELEMENTS = {"vertices", "edges", "loops", "polygons", "points", "curves", "position_data", "color_attributes"}
 ELEMENTS |= {"vertex_normals", "polygon_normals", "corner_normals", "normals", "uv_layers", "vertex_colors"}

@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 import scene_parts
+from lit_plane import into_collection
 from scene_parts import add_plane, bsdf_material
 
 from ltsh_addon import imaging
@@ -23,22 +24,16 @@ def tiles():
     scene_parts.add_area_light("Key", location=(0.3, 0.2, 2.5), rotation=(0.0, 0.0, 0.0))
     add_plane(diffuse("Floor", (0.5, 0.5, 0.5)), size=12.0, name="Floor")
     tile = add_plane(diffuse("Tile", (0.8, 0.1, 0.1)), size=2.0, name="Tile", location=(-1.5, 0.0, 0.1))
-    collection = bpy.data.collections.new("Tiles")
-    scene.collection.children.link(collection)
-    scene.collection.objects.unlink(tile)
-    collection.objects.link(tile)
+    scene.collection.children.link(into_collection("Tiles", tile))
     # A plain render has its shadow, which is left out here.
     tile.visible_shadow = tile.visible_diffuse = tile.visible_glossy = False
     scene.cycles.pixel_filter_type = "BOX"
     return scene
 
 
-def layer_collection(scene):
-    return scene.view_layers[0].layer_collection.children["Tiles"]
-
-
 def plain_diffuse(folder, scene, samples=256):
-    """Direct diffuse radiance (H, W, 3) of a plain render of the open file through its own pixel filter."""
+    """Direct diffuse radiance and diffuse color (H, W, 3) of a plain render of the open file through its own pixel
+    filter."""
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, False
     scene.cycles.use_adaptive_sampling = False
     layer = next(layer for layer in scene.view_layers if layer.use)
@@ -47,7 +42,7 @@ def plain_diffuse(folder, scene, samples=256):
     layers = imaging.read_layers(folder / "plain.exr")
     old = bpy.app.version < (5, 0, 0)
     light, color = ("DiffDir", "DiffCol") if old else ("Diffuse Direct", "Diffuse Color")
-    return layers[f"{layer.name}.{light}"] * layers[f"{layer.name}.{color}"]
+    return layers[f"{layer.name}.{light}"] * layers[f"{layer.name}.{color}"], layers[f"{layer.name}.{color}"]
 
 
 def compared(folder, **options):
@@ -61,7 +56,7 @@ def compared(folder, **options):
 def check_like_plain(folder, scene, **options):
     """All agree: technique, reference, and a plain render of the file; returns the report."""
     report, layers = compared(folder, **options)
-    plain = plain_diffuse(folder, scene)
+    plain, _ = plain_diffuse(folder, scene)
     for name in ("ltc.diffuse", "cycles.diffuse"):
         # The noise of 256 samples, and the mean over a pixel against its center; edges lie between pixels.
         assert np.linalg.norm(layers[name] - plain) < 0.02 * np.linalg.norm(plain), name

@@ -55,14 +55,22 @@ def lamp_material(name="Lamp", color=(1.0, 0.5, 0.2, 1.0), strength=20.0):
     return scene_parts.bsdf_material("ShaderNodeEmission", name, Color=color, Strength=strength)
 
 
-def add_lamp_plane(material=None, name="Lamp", location=(0.0, 1.0, 1.2), rotation=(-0.7, 0.0, 0.0), scale=(1, 1, 1)):
-    """An emissive rectangle of 1 x 0.6 m with a UV map that the camera does not see."""
-    corners = [(-0.5, -0.3, 0.0), (0.5, -0.3, 0.0), (0.5, 0.3, 0.0), (-0.5, 0.3, 0.0)]
-    ob = scene_parts.add_mesh(name, corners, [(0, 1, 2, 3)], location=location, rotation=rotation, scale=scale)
-    uv = ob.data.uv_layers.new(name="UVMap")
-    uv.data.foreach_set("uv", np.array([0, 0, 1, 0, 1, 1, 0, 1], dtype=np.float32))
+LAMP_CORNERS = [(-0.5, -0.3, 0.0), (0.5, -0.3, 0.0), (0.5, 0.3, 0.0), (-0.5, 0.3, 0.0)]
+
+
+def add_lamp(corners, faces, material=None, name="Lamp", location=(0.0, 1.0, 1.2), rotation=(-0.7, 0.0, 0.0), **more):
+    """An emissive mesh that the camera does not see."""
+    ob = scene_parts.add_mesh(name, corners, faces, location=location, rotation=rotation, **more)
     ob.data.materials.append(material or lamp_material()[0])
     ob.visible_camera = False
+    return ob
+
+
+def add_lamp_plane(material=None, name="Lamp", **placement):
+    """A rectangle of 1 x 0.6 m with a UV map."""
+    ob = add_lamp(LAMP_CORNERS, [(0, 1, 2, 3)], material, name, **placement)
+    uv = ob.data.uv_layers.new(name="UVMap")
+    uv.data.foreach_set("uv", np.array([0, 0, 1, 0, 1, 1, 0, 1], dtype=np.float32))
     return ob
 
 
@@ -103,6 +111,23 @@ def into_collection(name, *objects):
             other.objects.unlink(ob)
         collection.objects.link(ob)
     return collection
+
+
+def instance_on_points(maker, source):
+    """Let `maker` show instances of the object `source` on its points, beside its own geometry, by geometry nodes."""
+    tree = bpy.data.node_groups.new("Instances", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    kinds = ("InstanceOnPoints", "JoinGeometry", "ObjectInfo")
+    place, join, info = (tree.nodes.new(f"GeometryNode{kind}") for kind in kinds)
+    entry, leave = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = source, True
+    tree.links.new(entry.outputs[0], place.inputs["Points"])
+    tree.links.new(info.outputs["Geometry"], place.inputs["Instance"])
+    tree.links.new(place.outputs[0], join.inputs[0])
+    tree.links.new(entry.outputs[0], join.inputs[0])
+    tree.links.new(join.outputs[0], leave.inputs[0])
+    maker.modifiers.new("Instances", "NODES").node_group = tree
 
 
 def add_instancer(collection, name="Instancer", **placement):

@@ -1,9 +1,10 @@
-"""A ball on a floor under two lights, and the errors of techniques against Cycles there."""
+"""Materials under construction, a ball on a floor under two lights, and errors against Cycles there."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import bpy
 import numpy as np
 import scene_parts
 
@@ -14,6 +15,90 @@ from ltsh_addon.shading import shade
 SIZE = (24, 16)
 # Techniques are judged where the surface is not seen at a grazing angle.
 STEEP_COSINE = 0.2
+
+
+class Build:
+    """A material under construction: shaders are sockets, factors are numbers or sockets."""
+
+    def __init__(self, name="Mix", is_linked=False):
+        self.material, self.tree, self.output = scene_parts.new_material(name)
+        self.is_linked = is_linked  # factors come from Value nodes
+        self.inside = []  # trees of groups under construction
+
+    def new(self, kind, **inputs):
+        return scene_parts.add_node(self.inside[-1] if self.inside else self.tree, kind, **inputs)
+
+    def link(self, source, target):
+        source.id_data.links.new(source, target)
+
+    def shader(self, kind, **inputs):
+        return self.new(f"ShaderNode{kind}", **inputs).outputs[0]
+
+    def leaf(self, red, kind="BsdfDiffuse"):
+        return self.shader(kind, Color=(red, 0.5, 0.5, 1.0))
+
+    def clear(self):
+        return self.shader("BsdfTransparent")
+
+    def value(self, number):
+        socket = self.new("ShaderNodeValue").outputs[0]
+        socket.default_value = number
+        return socket
+
+    def texture_u(self):
+        """u of the UV map."""
+        separate = self.new("ShaderNodeSeparateXYZ")
+        self.link(self.new("ShaderNodeTexCoord").outputs["UV"], separate.inputs[0])
+        return separate.outputs[0]
+
+    def product(self, first, second):
+        """A socket times a number."""
+        node = self.new("ShaderNodeMath")
+        node.operation, node.inputs[1].default_value = "MULTIPLY", second
+        self.link(first, node.inputs[0])
+        return node.outputs[0]
+
+    def mix(self, factor, first, second):
+        node = self.new("ShaderNodeMixShader")
+        if isinstance(factor, float) and self.is_linked:
+            factor = self.value(factor)
+        if isinstance(factor, float):
+            node.inputs[0].default_value = factor
+        else:
+            self.link(factor, node.inputs[0])
+        return self._joined(node, first, second)
+
+    def add(self, first, second):
+        return self._joined(self.new("ShaderNodeAddShader"), first, second)
+
+    def _joined(self, node, first, second):
+        for shader, target in zip((first, second), list(node.inputs)[-2:], strict=True):
+            if shader is not None:
+                self.link(shader, target)
+        return node.outputs[0]
+
+    def group(self, fill, inputs=(), kind="ShaderNodeGroup", times=1):
+        """Outputs of group nodes whose tree `fill(inputs inside)` returns the shader of."""
+        tree = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
+        for socket in inputs:
+            type_inside = {"SHADER": "NodeSocketShader", "VALUE": "NodeSocketFloat"}[socket.type]
+            tree.interface.new_socket("In", in_out="INPUT", socket_type=type_inside)
+        tree.interface.new_socket("Out", in_out="OUTPUT", socket_type="NodeSocketShader")
+        self.inside.append(tree)
+        entry, end = self.new("NodeGroupInput"), self.new("NodeGroupOutput")
+        self.link(fill(*list(entry.outputs)[: len(inputs)]), end.inputs[0])
+        self.inside.pop()
+        nodes = [self.new(kind) for _ in range(times)]
+        for node in nodes:
+            node.node_tree = tree
+            for shader, target in zip(inputs, node.inputs, strict=False):
+                self.link(shader, target)
+        return [node.outputs[0] for node in nodes]
+
+    def show(self, shader):
+        """Link the shader to the output; the material."""
+        self.link(shader, self.output.inputs["Surface"])
+        return self.material
 
 
 def build(material):

@@ -109,14 +109,20 @@ def new_material(name="Material"):
     return material, material.node_tree, material.node_tree.nodes.new("ShaderNodeOutputMaterial")
 
 
-def bsdf_material(node_type, name="Material", **inputs):
-    """A material of one BSDF with GGX distribution; (material, node). Underscores in input names stand for spaces."""
-    material, tree, output = new_material(name)
+def add_node(tree, node_type, **inputs):
+    """A node, with GGX distribution where it has one. Underscores in input names stand for spaces."""
     node = tree.nodes.new(node_type)
     if hasattr(node, "distribution") and node_type != "ShaderNodeBsdfSheen":
         node.distribution = "GGX"
     for key, value in inputs.items():
         node.inputs[key.replace("_", " ")].default_value = value
+    return node
+
+
+def bsdf_material(node_type, name="Material", **inputs):
+    """A material of one `add_node`; (material, node)."""
+    material, tree, output = new_material(name)
+    node = add_node(tree, node_type, **inputs)
     tree.links.new(node.outputs[0], output.inputs["Surface"])
     return material, node
 

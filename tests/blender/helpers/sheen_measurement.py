@@ -1,6 +1,6 @@
 """Makes sheen_albedos.npy: measures in Cycles what sheen reflects (half a minute, needs pip's bpy).
 
-From the repository's root: python -m tests.blender.helpers.sheen_measurement
+From the repository's root: PYTHONPATH=. python tests/blender/helpers/sheen_measurement.py
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+import scene_parts
 
 from ltsh_addon.blender import render_settings
 from ltsh_addon.cycles import closures
@@ -25,11 +26,10 @@ def measure(pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     The roughness grows from left to right, the cosine of the view upwards.
     """
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, layer = bpy.context.scene, bpy.context.view_layer
-    _add_surface(scene)
-    _add_camera(scene)
-    scene.render.resolution_x = scene.render.resolution_y = pixels
+    scene, layer = scene_parts.empty_scene(pixels, pixels), bpy.context.view_layer
+    _add_surface()
+    camera = scene_parts.add_top_camera(1.0)
+    camera.location, camera.data.clip_end = (0.5, 0.5, 1.0), 1e3
     scene.render.engine, scene.cycles.samples = "CYCLES", 1
     scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
     layer.use_pass_normal = layer.use_pass_diffuse_color = True
@@ -57,42 +57,25 @@ def table_of(cosine: np.ndarray, roughness: np.ndarray, albedo: np.ndarray) -> n
     return np.maximum(table, 0.0).reshape(closures.SHEEN_NODES, -1).astype(np.float32)
 
 
-def _add_surface(scene) -> None:
+def _add_surface() -> None:
     """A ribbed sheet over the unit square, whose normals turn from sideways to upwards along y, as the cosine grows."""
     cosine = np.linspace(1e-4, 1.0, STRIPS + 1)
     slope = np.sqrt(1.0 - cosine**2) / cosine
     height = -np.concatenate([[0.0], np.cumsum(0.5 * (slope[1:] + slope[:-1]) * np.diff(cosine))])
     places = np.array([(x, y, z) for y, z in zip(cosine, height, strict=True) for x in (0.0, 1.0)])
     first = 2 * np.arange(STRIPS)[:, None]
-    mesh = bpy.data.meshes.new("Sheet")
-    mesh.from_pydata(places.tolist(), [], (first + [0, 1, 3, 2]).tolist())
+    mesh = scene_parts.add_mesh("Sheet", places.tolist(), (first + [0, 1, 3, 2]).tolist()).data
     mesh.polygons.foreach_set("use_smooth", [True] * STRIPS)
     normals = np.stack([np.zeros_like(cosine), np.sqrt(1.0 - cosine**2), cosine], axis=-1)
     mesh.normals_split_custom_set_from_vertices(np.repeat(normals, 2, axis=0).tolist())
-    mesh.materials.append(_material())
-    scene.collection.objects.link(bpy.data.objects.new("Sheet", mesh))
-
-
-def _material():
-    material = bpy.data.materials.new("Sheen")
-    if bpy.app.version < (5, 0, 0):
-        material.use_nodes = True
-    tree = material.node_tree
-    node, position = tree.nodes["Principled BSDF"], tree.nodes.new("ShaderNodeNewGeometry")
-    separate = tree.nodes.new("ShaderNodeSeparateXYZ")
-    tree.links.new(position.outputs["Position"], separate.inputs[0])
-    tree.links.new(separate.outputs["X"], node.inputs["Sheen Roughness"])
-    node.inputs["Sheen Weight"].default_value, node.inputs["Specular IOR Level"].default_value = 1.0, 0.0
-    node.inputs["Sheen Tint"].default_value = (1.0, 1.0, 1.0, 1.0)
-    node.inputs["Base Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-    return material
-
-
-def _add_camera(scene) -> None:
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    camera.location, scene.camera = (0.5, 0.5, 1.0), camera
-    camera.data.type, camera.data.ortho_scale, camera.data.clip_end = "ORTHO", 1.0, 1e3
+    white, black = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+    inputs = {"Sheen_Weight": 1.0, "Specular_IOR_Level": 0.0, "Sheen_Tint": white, "Base_Color": black}
+    material, node = scene_parts.principled("Sheen", **inputs)
+    separate = scene_parts.add_node(material.node_tree, "ShaderNodeSeparateXYZ")
+    position = scene_parts.add_node(material.node_tree, "ShaderNodeNewGeometry").outputs["Position"]
+    material.node_tree.links.new(position, separate.inputs[0])
+    material.node_tree.links.new(separate.outputs["X"], node.inputs["Sheen Roughness"])
+    mesh.materials.append(material)
 
 
 if __name__ == "__main__":

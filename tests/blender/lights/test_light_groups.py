@@ -47,8 +47,8 @@ def grouped_scene():
 def test_groups_are_those_of_cycles_and_sum_up(tmp_path, grouped_scene):
     prepared = scene_parts.prepare()
     lights = prepared[2].lights
-    assert {light.name: light.group for light in lights} == {
-        **{"Key": "Keys", "Second key": "Keys", "Loose": "", "Lamp": "Lamps"}
+    assert {light.name: light.group for light in lights} == dict(Key="Keys", Loose="", Lamp="Lamps") | {
+        "Second key": "Keys"
     }
     ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
     found = combined_by_group(tmp_path, prepared, 512)
@@ -62,12 +62,14 @@ def test_groups_are_those_of_cycles_and_sum_up(tmp_path, grouped_scene):
         assert difference < (4e-3) ** 2 * np.sum(halves[0] * halves[1])
 
 
-def test_an_object_keeps_its_own_group_inside_an_instancer_with_another():
+@pytest.mark.parametrize("is_instanced", [False, True])
+def test_a_light_keeps_its_own_group_without_a_pass_and_inside_an_instancer_with_another(is_instanced):
     start()
     key = scene_parts.add_area_light("Key")
     key.lightgroup = "Own"
-    outer = add_instancer(into_collection("Of key", key))
-    outer.lightgroup = "Instancer's"
+    if is_instanced:
+        add_instancer(into_collection("Of key", key)).lightgroup = "Instancer's"
+    assert bpy.context.view_layer.lightgroups.get("Own") is None
     assert [light.group for light in scene_parts.prepare()[2].lights] == ["Own"]
 
 
@@ -85,10 +87,3 @@ def test_of_nested_instancers_the_outermost_gives_group_and_lobes(tmp_path):
     everything = shade(scene_parts.sample(tmp_path, prepared)[0][0][0], [light], "ltsh4")
     assert images["diffuse"].sum() / 2.0 == pytest.approx(everything.diffuse.sum(), rel=0.01)
     assert images["specular"].sum() < 0.01 * images["diffuse"].sum() and not everything.specular.any()
-
-
-def test_groups_without_a_pass_in_the_file_are_kept():
-    start()
-    scene_parts.add_area_light("Key").lightgroup = "Nowhere else"
-    assert bpy.context.view_layer.lightgroups.get("Nowhere else") is None
-    assert [light.group for light in scene_parts.prepare()[2].lights] == ["Nowhere else"]

@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from lit_plane import add_instancer, add_lamp_plane, assert_agrees, compare, into_collection
+from lit_plane import add_instancer, add_lamp_plane, assert_agrees, compare, instance_on_points, into_collection
 
 TILES = 4
 
@@ -22,132 +22,63 @@ def start():
     return light, tiles
 
 
-def receivers_of(light, *objects, children=()):
-    """Give `light` a receiver collection with `objects` and child collections; the collection."""
-    collection = bpy.data.collections.new(f"Receivers of {light.name}")
-    for ob in objects:
-        collection.objects.link(ob)
-    for child in children:
-        collection.children.link(child)
-    light.light_linking.receiver_collection = collection
-    return collection
+def group(name, *members):
+    """A collection with objects and collections."""
+    made = bpy.data.collections.new(name)
+    for member in members:
+        (made.children if isinstance(member, bpy.types.Collection) else made.objects).link(member)
+    return made
 
 
-def exclude(collection, *names):
-    """Set the items `names` of a receiver collection to "exclude"."""
-    for item, ob in zip(collection.collection_objects, collection.objects, strict=True):
-        if ob.name in names:
-            item.light_linking.link_state = "EXCLUDE"
-    for item, child in zip(collection.collection_children, collection.children, strict=True):
-        if child.name in names:
-            item.light_linking.link_state = "EXCLUDE"
+def receivers_of(light, *members):
+    """Give `light` a receiver collection with objects and collections; the state of one inside a list is "exclude"."""
+    out = [member[0] for member in members if isinstance(member, list)]
+    every = [member[0] if isinstance(member, list) else member for member in members]
+    made = light.light_linking.receiver_collection = group(f"Receivers of {light.name}", *every)
+    for items, members in ((made.collection_objects, made.objects), (made.collection_children, made.children)):
+        for item, member in zip(items, members, strict=True):
+            if member in out:
+                item.light_linking.link_state = "EXCLUDE"
 
 
-def lit(inventory, *names):
-    """Whether the light `inventory.lights[0]` lights the objects `names`."""
-    (light, *_) = inventory.lights
-    numbers = [bpy.data.objects[name].get("ltsh_receiver", 0) for name in names]
-    return [light.receivers is None or number in light.receivers for number in numbers]
-
-
-def included_tile():
-    light, tiles = start()
-    receivers_of(light, tiles[0], tiles[2])
-
-
-def excluded_tile():
-    light, tiles = start()
-    exclude(receivers_of(light, tiles[0], tiles[2]), "Tile 0", "Tile 2")
-
-
-def both_states():
-    light, tiles = start()
-    exclude(receivers_of(light, tiles[0], tiles[1]), "Tile 1")
-
-
-def empty_collection():
-    receivers_of(start()[0])
-
-
-def nested_collections():
-    light, tiles = start()
-    outer, inner = (bpy.data.collections.new(name) for name in ("Outer", "Inner"))
-    outer.children.link(inner)
-    outer.objects.link(tiles[0])
-    inner.objects.link(tiles[1])
-    receivers_of(light, tiles[3], children=[outer])
-
-
-def excluded_child_against_included_item():
-    light, tiles = start()
-    child = bpy.data.collections.new("Child")
-    child.objects.link(tiles[0])
-    child.objects.link(tiles[1])
-    exclude(receivers_of(light, tiles[0], tiles[2], children=[child]), "Child")
-
-
-def children_that_disagree(first, last):
-    light, tiles = start()
-    children = [bpy.data.collections.new(name) for name in ("First", "Last")]
-    for child in children:
-        child.objects.link(tiles[0])
-    children[0].objects.link(tiles[1])
-    children[1].objects.link(tiles[2])
-    exclude(receivers_of(light, tiles[3], children=children), *(["First"] * first + ["Last"] * last))
-
-
-def last_child_excluded():
-    children_that_disagree(False, True)
-
-
-def first_child_excluded():
-    children_that_disagree(True, False)
-
-
-def two_lights_with_overlapping_sets():
-    light, tiles = start()
+def two_lights_with_overlapping_sets(light, tiles):
     receivers_of(light, tiles[0], tiles[1])
     other = scene_parts.add_area_light("Fill", location=(0.0, 1.0, 2.0), size=6.0, color=(1.0, 0.2, 0.1))
-    exclude(receivers_of(other, tiles[1], tiles[3]), "Tile 3")
+    receivers_of(other, tiles[1], [tiles[3]])
     scene_parts.add_area_light("Everywhere", location=(0.0, -1.0, 2.0), size=6.0, color=(0.1, 0.2, 1.0))
 
 
-def linked_mesh_light():
-    light, tiles = start()
+def linked_mesh_light(light, tiles):
     light.data.energy = 10.0
     lamp = add_lamp_plane(location=(0.0, 0.0, 1.0), rotation=(0.0, 0.0, 0.0))
     receivers_of(lamp, tiles[1], tiles[2])
 
 
-CASES = [
-    included_tile,
-    excluded_tile,
-    both_states,
-    empty_collection,
-    nested_collections,
-    excluded_child_against_included_item,
-    last_child_excluded,
-    first_child_excluded,
-    two_lights_with_overlapping_sets,
-    linked_mesh_light,
-]
+# Each is called with the light and the four tiles.
+CASES = {
+    "included": lambda light, t: receivers_of(light, t[0], t[2]),
+    "excluded": lambda light, t: receivers_of(light, [t[0]], [t[2]]),
+    "both states": lambda light, t: receivers_of(light, t[0], [t[1]]),
+    "empty": lambda light, t: receivers_of(light),
+    "nested": lambda light, t: receivers_of(light, t[3], group("Outer", group("Inner", t[1]), t[0])),
+    "excluded child": lambda light, t: receivers_of(light, t[0], t[2], [group("Child", t[0], t[1])]),
+    "last child excluded": lambda light, t: receivers_of(
+        light, t[3], group("First", t[0], t[1]), [group("Last", t[0], t[2])]
+    ),
+    "first child excluded": lambda light, t: receivers_of(
+        light, t[3], [group("First", t[0], t[1])], group("Last", t[0], t[2])
+    ),
+    "overlapping": two_lights_with_overlapping_sets,
+    "mesh light": linked_mesh_light,
+}
 
 
-@pytest.mark.parametrize("build", CASES, ids=lambda build: build.__name__)
-def test_linked_lights_light_what_they_light_in_cycles(tmp_path, build):
-    build()
+@pytest.mark.parametrize("name", CASES)
+def test_linked_lights_light_what_they_light_in_cycles(tmp_path, name):
+    CASES[name](*start())
     # Whole tiles are lit or not; a wrong set is off by tens of per cents, the noise of the highlights by one.
     prepared = assert_agrees(tmp_path, samples=512, count=32, tolerance=0.02)
     assert prepared[3] == []
-
-
-def test_the_states_are_understood_as_stated():
-    both_states()
-    assert lit(scene_parts.prepare()[2], "Tile 0", "Tile 1", "Tile 2") == [True, False, False]
-    excluded_tile()
-    assert lit(scene_parts.prepare()[2], "Tile 0", "Tile 1") == [False, True]
-    nested_collections()
-    assert lit(scene_parts.prepare()[2], "Tile 0", "Tile 1", "Tile 2", "Tile 3") == [True, True, False, True]
 
 
 def instanced(k, tiles, nested=False):
@@ -168,7 +99,7 @@ def test_instances_follow_their_instancer_where_it_is_linked(tmp_path, nested):
     instancers = [instanced(k, tiles, nested) for k in range(TILES)]
     receivers_of(light, tiles[0], instancers[1], tiles[2])
     other = scene_parts.add_area_light("Fill", location=(0.0, 1.0, 2.0), size=6.0, color=(1.0, 0.2, 0.1), energy=10.0)
-    exclude(receivers_of(other, instancers[2]), "Instancer 2")
+    receivers_of(other, [instancers[2]])
     prepared = assert_agrees(tmp_path, samples=128, count=32, tolerance=6e-3)
     ((surface, _, _),) = scene_parts.sample(tmp_path, prepared)[0]
     key = next(light for light in prepared[2].lights if light.name == "Key")
@@ -181,17 +112,7 @@ def test_instances_follow_their_instancer_where_it_is_linked(tmp_path, nested):
 def test_geometry_nodes_instances_follow_the_object_that_makes_them(tmp_path):
     light, tiles = start()
     maker = scene_parts.add_mesh("Maker", [(-3.0, 0.0, 0.0), (-1.0, 0.0, 0.0)], [])
-    tree = bpy.data.node_groups.new("Instances", "GeometryNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    nodes = [tree.nodes.new(kind) for kind in ("NodeGroupInput", "GeometryNodeInstanceOnPoints", "NodeGroupOutput")]
-    info = tree.nodes.new("GeometryNodeObjectInfo")
-    info.inputs["Object"].default_value = tiles[0]
-    info.inputs["As Instance"].default_value = True
-    tree.links.new(nodes[0].outputs[0], nodes[1].inputs["Points"])
-    tree.links.new(info.outputs["Geometry"], nodes[1].inputs["Instance"])
-    tree.links.new(nodes[1].outputs[0], nodes[2].inputs[0])
-    maker.modifiers.new("Instances", "NODES").node_group = tree
+    instance_on_points(maker, tiles[0])
     for k in (0, 1):
         tiles[k].location = (50.0, 0.0, 0.0)
     receivers_of(light, maker, tiles[2])

@@ -6,13 +6,9 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from lit_plane import add_instancer, add_lamp_plane, assert_agrees, into_collection, start
+from lit_plane import add_instancer, add_lamp_plane, assert_agrees, instance_on_points, into_collection, start
 
 from ltsh_addon.blender.process.client import ExtractOptions, extract
-
-
-def names_of_lights():
-    return sorted(light.name for light in scene_parts.prepare()[2].lights)
 
 
 @pytest.mark.parametrize("add", [scene_parts.add_area_light, add_lamp_plane], ids=["area light", "mesh light"])
@@ -32,12 +28,8 @@ def test_what_does_not_render_does_not_shine(tmp_path, add):
         setattr(owner, attribute, True)
     prepared = assert_agrees(tmp_path, samples=512, count=16, tolerance=0.03)
     # One light too many or too few is off by a fifth. "Indirect only" collections still light other objects directly.
-    assert sorted({light.name for light in prepared[2].lights}) == [
-        "Closed eye",
-        "Indirect",
-        "Not in the viewport",
-        "Shown",
-    ]
+    shining = {"Closed eye", "Indirect", "Not in the viewport", "Shown"}
+    assert {light.name for light in prepared[2].lights} == shining
 
 
 def test_only_the_view_layer_that_renders_counts():
@@ -47,7 +39,7 @@ def test_only_the_view_layer_that_renders_counts():
     scene_parts.add_area_light("First")
     scene.view_layers[0].layer_collection.children["Of layer 2"].exclude = True
     scene.view_layers.new("Layer 2")
-    assert names_of_lights() == ["First"]
+    assert [light.name for light in scene_parts.prepare()[2].lights] == ["First"]
 
 
 def test_parents_and_constraints_move_lights(tmp_path):
@@ -68,35 +60,14 @@ def test_parents_and_constraints_move_lights(tmp_path):
 def test_lights_instanced_by_geometry_nodes(tmp_path):
     """Lights and lamps on the points of a visible mesh that would stand in their light."""
     start()
-    for kind, source in (
-        ("LIGHT", scene_parts.add_area_light(size=0.4)),
-        ("MESH", add_lamp_plane(scale=(0.4, 0.4, 1))),
+    for x, source in (
+        (0.5, scene_parts.add_area_light(size=0.4)),
+        (-0.5, add_lamp_plane(scale=(0.4, 0.4, 1))),
     ):
-        source.location = (0.0, 0.0, 50.0)
-        source.rotation_euler = (0.0, 0.0, 0.0)
-        x = 0.5 if kind == "LIGHT" else -0.5
-        maker = scene_parts.add_mesh(kind, [(x, 0.4, 1.2), (x, 1.2, 1.4), (x + 0.4, 1.2, 1.5)], [(0, 1, 2)])
+        source.location, source.rotation_euler = (0.0, 0.0, 50.0), (0.0, 0.0, 0.0)
+        maker = scene_parts.add_mesh("Maker", [(x, 0.4, 1.2), (x, 1.2, 1.4), (x + 0.4, 1.2, 1.5)], [(0, 1, 2)])
         maker.visible_camera = False
-        tree = bpy.data.node_groups.new(kind, "GeometryNodeTree")
-        for way in ("INPUT", "OUTPUT"):
-            tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-        entry, place, join, leave, info = (
-            tree.nodes.new(node)
-            for node in (
-                "NodeGroupInput",
-                "GeometryNodeInstanceOnPoints",
-                "GeometryNodeJoinGeometry",
-                "NodeGroupOutput",
-                "GeometryNodeObjectInfo",
-            )
-        )
-        info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = source, True
-        tree.links.new(entry.outputs[0], place.inputs["Points"])
-        tree.links.new(info.outputs["Geometry"], place.inputs["Instance"])
-        tree.links.new(place.outputs[0], join.inputs[0])
-        tree.links.new(entry.outputs[0], join.inputs[0])
-        tree.links.new(join.outputs[0], leave.inputs[0])
-        maker.modifiers.new("Instances", "NODES").node_group = tree
+        instance_on_points(maker, source)
     prepared = assert_agrees(tmp_path, samples=512, count=16)
     # Three instances of the light, three of the two-sided lamp, and both originals far above.
     assert [light.name for light in prepared[2].lights].count("Light") == 4

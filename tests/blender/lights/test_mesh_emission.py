@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 import scene_parts
-from lit_plane import (
-    add_image,
-    add_lamp_ball,
-    add_lamp_plane,
-    assert_agrees,
-    lamp_material,
-    start,
-)
+from lit_plane import add_image, add_lamp_ball, add_lamp_plane, assert_agrees, lamp_material, start
+from material_scenes import Build
 
 from ltsh_addon.blender.lights import meshes
 
@@ -20,23 +14,11 @@ FACES_OF_THE_BALL = 18
 
 def test_emission_through_mixes_sums_and_groups_is_what_cycles_sees(tmp_path):
     start()
-    material, tree, output = scene_parts.new_material("Mixed")
-    nodes = {kind: tree.nodes.new("ShaderNode" + kind) for kind in ("MixShader", "AddShader", "Blackbody", "Math")}
-    emitters = [tree.nodes.new("ShaderNodeEmission") for _ in range(2)]
-    surface = tree.nodes.new("ShaderNodeBsdfDiffuse")
-    nodes["MixShader"].inputs[0].default_value = 0.25
-    nodes["Blackbody"].inputs[0].default_value = 3000.0
-    nodes["Math"].operation = "MULTIPLY"
-    nodes["Math"].inputs[0].default_value, nodes["Math"].inputs[1].default_value = 5.0, 3.0
-    tree.links.new(nodes["Blackbody"].outputs[0], emitters[0].inputs["Color"])
-    tree.links.new(nodes["Math"].outputs[0], emitters[0].inputs["Strength"])
-    tree.links.new(surface.outputs[0], nodes["MixShader"].inputs[1])
-    tree.links.new(emitters[0].outputs[0], nodes["MixShader"].inputs[2])
-    tree.links.new(nodes["MixShader"].outputs[0], nodes["AddShader"].inputs[0])
-    tree.links.new(emitters[1].outputs[0], nodes["AddShader"].inputs[1])
-    tree.links.new(nodes["AddShader"].outputs[0], output.inputs["Surface"])
-    emitters[1].inputs["Color"].default_value = (0.0, 0.0, 4.0, 1.0)
-    add_lamp_plane(material)
+    made = Build("Mixed")
+    warm, blue = made.shader("Emission"), made.shader("Emission", Color=(0.0, 0.0, 4.0, 1.0))
+    made.link(made.shader("Blackbody", Temperature=3000.0), warm.node.inputs["Color"])
+    made.link(made.product(made.value(5.0), 3.0), warm.node.inputs["Strength"])
+    add_lamp_plane(made.show(made.add(made.mix(0.25, made.shader("BsdfDiffuse"), warm), blue)))
     inventory = assert_agrees(tmp_path)[2]
     # Cycles' black body of 3000 K is (1.77, 0.84, 0.27) in the linear colors of Rec.709.
     assert np.allclose(
@@ -65,13 +47,11 @@ def test_how_cycles_samples_the_emission_changes_nothing(tmp_path, sampling):
 
 def test_emission_of_one_side_only(tmp_path):
     start()
-    material, node = lamp_material()
-    tree = material.node_tree
-    scaled = tree.nodes.new("ShaderNodeMath")
-    scaled.operation, scaled.inputs[1].default_value = "MULTIPLY", 20.0
-    tree.links.new(tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"], scaled.inputs[0])
-    tree.links.new(scaled.outputs[0], node.inputs["Strength"])
-    add_lamp_plane(material)
+    made = Build("Lamp")
+    emission = made.shader("Emission", Color=(1.0, 0.5, 0.2, 1.0))
+    backfacing = made.new("ShaderNodeNewGeometry").outputs["Backfacing"]
+    made.link(made.product(backfacing, 20.0), emission.node.inputs["Strength"])
+    add_lamp_plane(made.show(emission))
     (light,) = assert_agrees(tmp_path)[2].lights
     assert light.direction[2] < 0.0
 

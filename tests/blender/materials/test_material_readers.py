@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
+from material_scenes import Build
 
 from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.materials.aovs import inject_aovs
@@ -36,13 +37,9 @@ CHOICES = ("distribution", "component", "fresnel_type", "model", "falloff")
 
 
 @pytest.fixture(autouse=True)
-def _empty_scene():
+def _custom_group():
+    """An empty scene, and group nodes as add-ons define them."""
     scene_parts.empty_scene()
-
-
-@pytest.fixture(autouse=True)
-def _custom_group(_empty_scene):
-    """Group nodes as add-ons define them."""
 
     class CustomGroup(bpy.types.ShaderNodeCustomGroup):
         bl_idname, bl_label = "TestCustomGroup", "Custom group"
@@ -188,66 +185,6 @@ def test_all_readers_shade_every_node_in_every_variant_alike():
 # ---- mixes, sums and groups
 
 
-class Build:
-    """A material under construction: shaders are sockets; each BSDF has a color of its own."""
-
-    def __init__(self, is_linked):
-        self.material, self.tree, self.output = scene_parts.new_material("Mix")
-        self.is_linked = is_linked  # factors come from Value nodes
-        self.inside = []  # trees of groups under construction
-
-    def new(self, kind):
-        return (self.inside[-1] if self.inside else self.tree).nodes.new(kind)
-
-    def link(self, source, target):
-        source.id_data.links.new(source, target)
-
-    def leaf(self, red, kind="BsdfDiffuse"):
-        node = self.new(f"ShaderNode{kind}")
-        node.inputs["Color"].default_value = (red, 0.5, 0.5, 1.0)
-        return node.outputs[0]
-
-    def clear(self):
-        return self.new("ShaderNodeBsdfTransparent").outputs[0]
-
-    def mix(self, factor, first, second):
-        node = self.new("ShaderNodeMixShader")
-        if isinstance(factor, float) and self.is_linked:
-            value = self.new("ShaderNodeValue").outputs[0]
-            value.default_value, factor = factor, value
-        if isinstance(factor, float):
-            node.inputs[0].default_value = factor
-        else:
-            self.link(factor, node.inputs[0])
-        return self._joined(node, first, second)
-
-    def add(self, first, second):
-        return self._joined(self.new("ShaderNodeAddShader"), first, second)
-
-    def _joined(self, node, first, second):
-        for shader, target in zip((first, second), list(node.inputs)[-2:], strict=True):
-            if shader is not None:
-                self.link(shader, target)
-        return node.outputs[0]
-
-    def group(self, fill, inputs=(), kind="ShaderNodeGroup", times=1):
-        """Outputs of group nodes whose tree `fill(inputs inside)` returns the shader of; `inputs` are shaders."""
-        tree = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-        for _ in inputs:
-            tree.interface.new_socket("In", in_out="INPUT", socket_type="NodeSocketShader")
-        tree.interface.new_socket("Out", in_out="OUTPUT", socket_type="NodeSocketShader")
-        self.inside.append(tree)
-        entry, end = self.new("NodeGroupInput"), self.new("NodeGroupOutput")
-        self.link(fill(*list(entry.outputs)[: len(inputs)]), end.inputs[0])
-        self.inside.pop()
-        nodes = [self.new(kind) for _ in range(times)]
-        for node in nodes:
-            node.node_tree = tree
-            for shader, target in zip(inputs, node.inputs, strict=False):
-                self.link(shader, target)
-        return [node.outputs[0] for node in nodes]
-
-
 def twice_the_same(b):
     leaf = b.leaf(0.1)
     return b.mix(0.25, b.mix(0.5, leaf, b.leaf(0.2)), leaf)
@@ -342,9 +279,8 @@ def toon(b):
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_all_readers_weigh_the_lobes_of_mixes_sums_and_groups_alike(name, is_linked):
     make, expected = STRUCTURES[name]
-    build = Build(is_linked)
-    build.link(make(build), build.output.inputs["Surface"])
-    lobes, _ = agreed_lobes(build.material)
+    build = Build(is_linked=is_linked)
+    lobes, _ = agreed_lobes(build.show(make(build)))
     found = {}
     for _, weight, red, _ in lobes:
         red = round(float(red), 3)
@@ -354,13 +290,12 @@ def test_all_readers_weigh_the_lobes_of_mixes_sums_and_groups_alike(name, is_lin
 
 @pytest.mark.parametrize("kind", ["ShaderNodeGroup", "TestCustomGroup"])
 def test_lights_and_the_viewport_see_the_same_emission_in_groups(kind):
-    build = Build(True)
+    build = Build(is_linked=True)
 
     def fill(shader):
         return build.mix(0.25, shader, build.mix(0.5, build.clear(), build.leaf(1.0, "Emission")))
 
-    (both,) = build.group(fill, [build.leaf(0.1)], kind)
-    build.link(both, build.output.inputs["Surface"])
+    build.show(*build.group(fill, [build.leaf(0.1)], kind))
     found = emission_of(build.material)
     assert found.emits and not (found.plain or found.varies or found.directional)
     # Transparency takes half of what shines and nothing of what is lit.
@@ -368,8 +303,8 @@ def test_lights_and_the_viewport_see_the_same_emission_in_groups(kind):
 
 
 def test_no_reader_but_aovs_changes_a_material():
-    build = Build(True)
-    build.link(nested_groups("ShaderNodeGroup")(build), build.output.inputs["Surface"])
+    build = Build(is_linked=True)
+    build.show(nested_groups("ShaderNodeGroup")(build))
     trees = [build.tree, *bpy.data.node_groups]
 
     def state():

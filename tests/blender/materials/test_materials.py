@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from scene_parts import add_plane, bsdf_material, new_material, principled
+from material_scenes import Build
+from scene_parts import add_plane, bsdf_material, principled
 
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.aovs import inject_aovs
@@ -14,6 +15,9 @@ from ltsh_addon.cycles import horizons, lobes
 
 # Texture coordinates and colors pass through float32 a few times.
 EXACT = 2e-6
+
+
+GLOSSY, DIFFUSE = "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfDiffuse"
 
 
 @pytest.fixture
@@ -34,46 +38,26 @@ def plane_scene():
     return make
 
 
-def uv_of(surface):
-    """Texture coordinates (P, 2) of the plane that `add_plane` makes."""
-    return surface.position[:, :2] / 6.0 + 0.5
-
-
-def feed_uv(tree, color_socket, value_socket):
-    """(u, v, 0) into a color socket, u into a value socket."""
-    coordinates = tree.nodes.new("ShaderNodeTexCoord")
-    separate = tree.nodes.new("ShaderNodeSeparateXYZ")
-    tree.links.new(coordinates.outputs["UV"], separate.inputs[0])
-    tree.links.new(coordinates.outputs["UV"], color_socket)
-    tree.links.new(separate.outputs[0], value_socket)
-
-
-def test_textures_on_principled(tmp_path, plane_scene):
-    material, node = principled(Metallic=1.0)
-    feed_uv(material.node_tree, node.inputs["Base Color"], node.inputs["Roughness"])
+@pytest.mark.parametrize(
+    ("kind", "color", "f0", "f90", "albedo"),
+    [("ShaderNodeBsdfPrincipled", "Base Color", 1, 1, 0), (GLOSSY, "Color", 1, None, 0), (DIFFUSE, "Color", 0, 0, 1)],
+)
+def test_samples_have_the_values_of_textures(tmp_path, plane_scene, kind, color, f0, f90, albedo):
+    """The texture's color is in `f0` or `albedo`; an f90 of None is the same as f0."""
+    material, node = bsdf_material(kind, **({"Metallic": 1.0} if color == "Base Color" else {}))
+    coordinates = material.node_tree.nodes.new("ShaderNodeTexCoord").outputs["UV"]
+    separate = material.node_tree.nodes.new("ShaderNodeSeparateXYZ")
+    material.node_tree.links.new(coordinates, separate.inputs[0])
+    material.node_tree.links.new(coordinates, node.inputs[color])
+    if kind != DIFFUSE:
+        material.node_tree.links.new(separate.outputs[0], node.inputs["Roughness"])
     surface, warnings = plane_scene(tmp_path, material)
-    uv = uv_of(surface)
-    assert np.abs(surface.specular_f0[:, :2] - uv).max() < EXACT and not surface.specular_f0[:, 2].any()
-    assert np.abs(surface.roughness - uv[:, 0]).max() < EXACT
-    assert np.all(surface.specular_f90 == 1.0) and np.all(surface.dielectric == 0.0)
-    assert surface.diffuse_albedo.max() == 0.0 and warnings == []
-
-
-def test_textures_on_glossy(tmp_path, plane_scene):
-    material, node = bsdf_material("ShaderNodeBsdfAnisotropic")
-    feed_uv(material.node_tree, node.inputs["Color"], node.inputs["Roughness"])
-    surface, warnings = plane_scene(tmp_path, material)
-    uv = uv_of(surface)
-    assert np.abs(surface.specular_f0[:, :2] - uv).max() < EXACT
-    assert np.array_equal(surface.specular_f0, surface.specular_f90)
-    assert np.abs(surface.roughness - uv[:, 0]).max() < EXACT and warnings == []
-
-
-def test_a_diffuse_bsdf_has_no_specular_part(tmp_path, plane_scene):
-    surface, warnings = plane_scene(tmp_path, bsdf_material("ShaderNodeBsdfDiffuse", Color=(0.3, 0.5, 0.7, 1.0))[0])
-    assert np.allclose(surface.diffuse_albedo, (0.3, 0.5, 0.7), atol=EXACT)
-    assert not surface.specular_f0.any() and not surface.specular_f90.any() and not surface.dielectric.any()
-    assert warnings == []
+    texture = surface.position / 6.0 + (0.5, 0.5, 0.0)
+    assert np.abs(surface.specular_f0 - f0 * texture).max() < EXACT
+    assert np.abs(surface.specular_f90 - (surface.specular_f0 if f90 is None else f90)).max() == 0.0
+    assert np.abs(surface.diffuse_albedo - albedo * texture).max() < EXACT
+    assert kind == DIFFUSE or np.abs(surface.roughness - texture[:, 0]).max() < EXACT
+    assert not surface.dielectric.any() and warnings == []
 
 
 def test_a_normal_map_turns_the_normal(tmp_path, plane_scene):
@@ -88,62 +72,20 @@ def test_a_normal_map_turns_the_normal(tmp_path, plane_scene):
     assert np.array_equal(surface.normal, surface.diffuse_normal)
 
 
-def test_principled_weights_reproduce_cycles(tmp_path):
-    """Metal, dielectric and diffuse share one material; the oracle sees only the samples."""
-    scene_parts.empty_scene()
-    scene_parts.add_camera()
-    scene_parts.add_area_light()
-    material, _ = principled(
-        Base_Color=(0.8, 0.5, 0.2, 1.0), Metallic=0.4, Roughness=0.5, IOR=1.6, **{"Specular IOR Level": 0.8}
-    )
-    add_plane(material, size=12.0)
-    prepared = scene_parts.prepare()
-    ((surface, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
-    halves = scene_parts.reference(tmp_path, prepared, 512)
-    for lobe, brdf in (("specular", quadrature.ggx), ("diffuse", quadrature.lambert)):
-        image = quadrature.radiance(surface, prepared[2].lights, brdf)
-        cycles = halves[lobe].reshape(2, -1, 3)[:, pixel]
-        # Cycles' tabulated albedo of the specular layer is good to about 0.3 %; a wrong weight shows as 5 % and more.
-        assert quadrature.relative_l2(image, cycles) < 4e-3 and abs(quadrature.bias(image, cycles)) < 4e-3
-
-
 def test_a_group_is_followed_for_each_of_its_users(tmp_path, plane_scene):
     tree = scene_parts.group_with_principled()
-    materials = []
     for value, x in ((0.77, -1.5), (0.33, 1.5)):
-        material, nodes, output = new_material(f"Uses group {value}")
+        b = Build(f"Uses group {value}")
         # The unused second node of the same group must not write into the samples.
         for roughness in (0.1, value):
-            node = nodes.nodes.new("ShaderNodeGroup")
+            node = b.new("ShaderNodeGroup")
             node.node_tree = tree
             node.inputs["Roughness"].default_value = roughness
-        nodes.links.new(node.outputs[0], output.inputs["Surface"])
-        materials.append(material)
-        add_plane(material, size=3.0, location=(x, 0.0, 0.1))
+        add_plane(b.show(node.outputs[0]), size=3.0, location=(x, 0.0, 0.1))
     surface, warnings = plane_scene(tmp_path, principled()[0])
     left, right = (np.abs(surface.position - (x, 0.0, 0.1)).max(axis=-1) < 1.49 for x in (-1.5, 1.5))
     assert left.any() and right.any() and len(tree.nodes) == 3
     assert np.allclose(surface.roughness[left], 0.77) and np.allclose(surface.roughness[right], 0.33)
-
-
-def test_a_shader_that_goes_through_a_group_reroutes_and_a_muted_node(tmp_path, plane_scene):
-    tree = bpy.data.node_groups.new("Pass", "ShaderNodeTree")
-    tree.interface.new_socket("In", in_out="INPUT", socket_type="NodeSocketShader")
-    tree.interface.new_socket("Out", in_out="OUTPUT", socket_type="NodeSocketShader")
-    tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
-    material, nodes, output = new_material()
-    shader = nodes.nodes.new("ShaderNodeBsdfPrincipled")
-    shader.distribution, shader.inputs["Roughness"].default_value = "GGX", 0.61
-    group, reroute, muted = (
-        nodes.nodes.new(name) for name in ("ShaderNodeGroup", "NodeReroute", "ShaderNodeMixShader")
-    )
-    group.node_tree, muted.mute = tree, True
-    nodes.links.new(shader.outputs[0], group.inputs[0])
-    nodes.links.new(group.outputs[0], reroute.inputs[0])
-    nodes.links.new(reroute.outputs[0], muted.inputs[1])
-    nodes.links.new(muted.outputs[0], output.inputs["Surface"])
-    surface, warnings = plane_scene(tmp_path, material)
-    assert np.allclose(surface.roughness, 0.61) and np.all(surface.dielectric == 1.0) and warnings == []
 
 
 @pytest.mark.parametrize("slots", ["none", "empty"])
@@ -180,62 +122,29 @@ def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path, plane_scene):
     assert np.allclose(surface.roughness, 0.42) and np.all(surface.dielectric == 1.0)
 
 
-def test_a_view_layer_override_is_what_counts(tmp_path, plane_scene):
-    bpy.context.view_layer.material_override = principled("Clay", Roughness=0.9)[0]
-    surface, _ = plane_scene(tmp_path, principled(Roughness=0.1)[0], None)
-    assert np.allclose(surface.roughness, 0.9)
-
-
-def test_a_linked_material_is_sampled(tmp_path, plane_scene):
-    library = tmp_path / "library.blend"
-    bpy.data.libraries.write(str(library), {principled("Far", Roughness=0.37)[0]}, fake_user=True)
-    before = library.read_bytes()
-    scene_parts.empty_scene()
-    scene_parts.add_top_camera()
-    with bpy.data.libraries.load(str(library), link=True) as (_, wanted):
-        wanted.materials = ["Far"]
-    surface, warnings = plane_scene(tmp_path, bpy.data.materials["Far"])
-    assert np.allclose(surface.roughness, 0.37) and warnings == [] and library.read_bytes() == before
-
-
 def test_displacement_as_bump_is_in_the_normal(tmp_path, plane_scene):
     material, node = principled(Metallic=1.0)
     tree = material.node_tree
     noise, displacement = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeDisplacement")
     displacement.inputs["Scale"].default_value = 30.0
     tree.links.new(noise.outputs[0], displacement.inputs["Height"])
-    output = next(item for item in tree.nodes if item.bl_idname == "ShaderNodeOutputMaterial")
-    tree.links.new(displacement.outputs[0], output.inputs["Displacement"])
+    tree.links.new(displacement.outputs[0], tree.nodes["Material Output"].inputs["Displacement"])
     surface, _ = plane_scene(tmp_path, material)
     assert np.abs(surface.normal[:, :2]).max() > 0.1
 
 
-def transparent_material(kind):
-    """A red surface that lets half of the light through, built in three ways."""
-    if kind == "alpha":
-        material, _ = principled("Veil", Base_Color=(0.8, 0.1, 0.1, 1.0), Alpha=0.5)
-        return material
-    material, node = principled("Veil", Base_Color=(0.8, 0.1, 0.1, 1.0))
-    tree = material.node_tree
-    output = next(item for item in tree.nodes if item.bl_idname == "ShaderNodeOutputMaterial")
-    mix, transparent = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeBsdfTransparent")
-    order = (node, transparent) if kind == "mix" else (transparent, node)
-    for index, item in enumerate(order):
-        tree.links.new(item.outputs[0], mix.inputs[1 + index])
-    tree.links.new(mix.outputs[0], output.inputs["Surface"])
-    return material
-
-
-@pytest.mark.parametrize("kind", ["alpha", "mix", "mix, other way round"])
+@pytest.mark.parametrize("kind", ["alpha", "mix", "group"])
 def test_transparency_is_cut_in_samples_and_reference(tmp_path, plane_scene, kind):
-    add_plane(transparent_material(kind), name="Front", location=(0.0, 0.0, 0.5))
+    b = Build("Veil")
+    surface = b.shader("BsdfPrincipled", Base_Color=(0.8, 0.1, 0.1, 1.0), Alpha=0.5 if kind == "alpha" else 1.0)
+    if kind != "alpha":
+        surface = b.mix(0.5, surface, b.clear() if kind == "mix" else b.group(b.clear)[0])
+    add_plane(b.show(surface), name="Front", location=(0.0, 0.0, 0.5))
     surface, warnings = plane_scene(tmp_path, principled("Back", Metallic=1.0)[0])
     assert np.allclose(surface.position[:, 2], 0.5) and np.all(surface.dielectric == 1.0)
     assert len(warnings) == 1 and "'Veil'" in warnings[0] and "opaque" in warnings[0]
-    layer = bpy.context.view_layer
-    halves = scene_parts.reference(tmp_path, (bpy.context.scene, layer), 32)
-    lights = [light for light in scene_parts.prepare()[2].lights]
-    expected = quadrature.radiance(surface, lights, quadrature.lambert)
+    halves = scene_parts.reference(tmp_path, (bpy.context.scene, bpy.context.view_layer), 32)
+    expected = quadrature.radiance(surface, list(scene_parts.prepare()[2].lights), quadrature.lambert)
     # 32 samples leave 1e-3 of noise in the sum; half of the light would be missing.
     assert abs(quadrature.bias(expected, halves["diffuse"].reshape(2, -1, 3))) < 1e-2
 
@@ -300,23 +209,6 @@ def test_an_index_of_refraction_that_varies_is_named():
         material.node_tree.links.new(value, node.inputs["IOR"])
         found += notes_of(node)
     assert sum("IOR of '" in line and "varies" in line for line in found) == 2
-
-
-def test_other_shaders_are_named_and_shaded_as_the_nearest(tmp_path, plane_scene):
-    kinds = {
-        "ShaderNodeBsdfGlass": "only its reflection",
-        "ShaderNodeBsdfRefraction": "not shaded",
-        "ShaderNodeBsdfHair": "not shaded",
-        "ShaderNodeBsdfSheen": "as a Diffuse BSDF",
-        "ShaderNodeSubsurfaceScattering": "as a Diffuse BSDF",
-        "ShaderNodeBsdfToon": "as a Diffuse BSDF",
-    }
-    for number, kind in enumerate(kinds):
-        add_plane(bsdf_material(kind, f"Material {number}")[0])
-    surface, warnings = plane_scene(tmp_path, principled()[0])
-    assert len(warnings) == len(kinds) and len(surface) == 24 * 16
-    for number, (line, done) in enumerate(zip(warnings, kinds.values(), strict=True)):
-        assert line.startswith(f"material 'Material {number}': node '") and done in line
 
 
 def test_materials_that_shine_into_the_scene_keep_their_emission():

@@ -5,7 +5,8 @@ import material_scenes
 import numpy as np
 import pytest
 import scene_parts
-from scene_parts import add_plane, new_material
+from material_scenes import Build
+from scene_parts import add_plane
 
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.cycles.lobes import MAX_LOBES
@@ -15,80 +16,17 @@ EXACT = 2e-6
 METAL, GLOSSY, DIFFUSE = (0.9, 0.6, 0.3, 1.0), (0.2, 0.5, 0.8, 1.0), (0.3, 0.6, 0.2, 1.0)
 
 
-class Shaders:
-    """A material under construction."""
+class Shaders(Build):
+    """A material under construction of three BSDFs."""
 
-    def __init__(self, name="Mix"):
-        self.material, self.tree, self.output = new_material(name)
+    def metal(self):
+        return self.shader("BsdfPrincipled", Base_Color=METAL, Metallic=1.0, Roughness=0.35)
 
-    def node(self, kind, tree=None, **inputs):
-        """A node, by default in the material's tree, with GGX distribution."""
-        node = (tree or self.tree).nodes.new(f"ShaderNode{kind}")
-        if hasattr(node, "distribution"):
-            node.distribution = "GGX"
-        for name, value in inputs.items():
-            node.inputs[name.replace("_", " ")].default_value = value
-        return node
+    def glossy(self, roughness=0.6):
+        return self.shader("BsdfAnisotropic", Color=GLOSSY, Roughness=roughness)
 
-    def metal(self, tree=None):
-        """A metal of roughness 0.35."""
-        return self.node("BsdfPrincipled", tree, Base_Color=METAL, Metallic=1.0, Roughness=0.35)
-
-    def glossy(self, tree=None):
-        """A glossy lobe of roughness 0.6."""
-        return self.node("BsdfAnisotropic", tree, Color=GLOSSY, Roughness=0.6)
-
-    def diffuse(self, tree=None):
-        """A diffuse lobe."""
-        return self.node("BsdfDiffuse", tree, Color=DIFFUSE)
-
-    def mix(self, first, second, factor, tree=None):
-        """A mix of two shaders; the factor is a number or a socket."""
-        tree = tree or self.tree
-        node = tree.nodes.new("ShaderNodeMixShader")
-        if isinstance(factor, float):
-            node.inputs[0].default_value = factor
-        else:
-            tree.links.new(factor, node.inputs[0])
-        for shader, socket in zip((first, second), node.inputs[1:], strict=True):
-            tree.links.new(shader if isinstance(shader, bpy.types.NodeSocket) else shader.outputs[0], socket)
-        return node
-
-    def add(self, first, second):
-        """The sum of two shaders."""
-        node = self.tree.nodes.new("ShaderNodeAddShader")
-        for shader, socket in zip((first, second), node.inputs, strict=True):
-            self.tree.links.new(shader.outputs[0], socket)
-        return node
-
-    def texture_u(self):
-        """A socket with u of the UV map."""
-        coordinates = self.tree.nodes.new("ShaderNodeTexCoord")
-        separate = self.tree.nodes.new("ShaderNodeSeparateXYZ")
-        self.tree.links.new(coordinates.outputs["UV"], separate.inputs[0])
-        return separate.outputs[0]
-
-    def show(self, shader):
-        """Link the shader to the output; the material."""
-        self.tree.links.new(shader.outputs[0], self.output.inputs["Surface"])
-        return self.material
-
-
-def group_tree(name, inputs=(), outputs=("Shader",)):
-    """(tree, input node, output node) of a node group; sockets are shaders, but for an input called Factor."""
-    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
-    for direction, names in (("INPUT", inputs), ("OUTPUT", outputs)):
-        for socket in names:
-            kind = "NodeSocketFloat" if socket == "Factor" else "NodeSocketShader"
-            tree.interface.new_socket(socket, in_out=direction, socket_type=kind)
-    return tree, tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
-
-
-def group_node(tree, inner):
-    """A node in `tree` that shows the group tree `inner`."""
-    node = tree.nodes.new("ShaderNodeGroup")
-    node.node_tree = inner
-    return node
+    def diffuse(self):
+        return self.shader("BsdfDiffuse", Color=DIFFUSE)
 
 
 def seen_from_above(folder, material):
@@ -109,50 +47,42 @@ def _empty_scene():
 
 def plain_mix():
     s = Shaders()
-    return s.show(s.mix(s.metal(), s.diffuse(), 0.3))
+    return s.show(s.mix(0.3, s.metal(), s.diffuse()))
 
 
 def textured_mix_and_sum():
     s = Shaders()
-    return s.show(s.add(s.mix(s.metal(), s.diffuse(), s.texture_u()), s.mix(s.glossy(), s.diffuse(), 0.8)))
+    return s.show(s.add(s.mix(s.texture_u(), s.metal(), s.diffuse()), s.mix(0.8, s.glossy(), s.diffuse())))
 
 
 def fresnel_mix():
     s = Shaders()
-    return s.show(s.mix(s.diffuse(), s.glossy(), s.node("Fresnel", IOR=1.6).outputs[0]))
+    return s.show(s.mix(s.shader("Fresnel", IOR=1.6), s.diffuse(), s.glossy()))
 
 
 def factor_beyond_one():
     s = Shaders()
-    doubled = s.node("Math")
-    doubled.operation = "MULTIPLY"
-    s.tree.links.new(s.texture_u(), doubled.inputs[0])
-    doubled.inputs[1].default_value = 2.0
-    return s.show(s.mix(s.metal(), s.glossy(), doubled.outputs[0]))
+    return s.show(s.mix(s.product(s.texture_u(), 2.0), s.metal(), s.glossy()))
 
 
 def nested_groups():
     """The factor comes from outside into both levels; a shader of the outermost tree is mixed in the innermost."""
     s = Shaders()
-    inner, entry, end = group_tree("Inner", ("Factor", "Shader"))
-    inner.links.new(s.mix(s.glossy(inner), entry.outputs[1], entry.outputs[0], inner).outputs[0], end.inputs[0])
-    outer, entry, end = group_tree("Outer", ("Factor", "Shader"))
-    deep = group_node(outer, inner)
-    for socket in range(2):
-        outer.links.new(entry.outputs[socket], deep.inputs[socket])
-    outer.links.new(s.mix(deep, s.diffuse(outer), 0.25, outer).outputs[0], end.inputs[0])
-    node = group_node(s.tree, outer)
-    s.tree.links.new(s.texture_u(), node.inputs[0])
-    s.tree.links.new(s.metal().outputs[0], node.inputs[1])
-    return s.show(s.mix(node, s.glossy(), s.texture_u()))
+
+    def outer(factor, shader):
+        (deep,) = s.group(lambda factor, shader: s.mix(factor, s.glossy(), shader), [factor, shader])
+        return s.mix(0.25, deep, s.diffuse())
+
+    (both,) = s.group(outer, [s.texture_u(), s.metal()])
+    return s.show(s.mix(s.texture_u(), both, s.glossy()))
 
 
 def bumped_parts():
     """Two diffuse lobes with different normals: the albedo that Cycles gives for both is split between them."""
     s = Shaders()
-    rough, smooth = s.node("BsdfPrincipled", Base_Color=DIFFUSE, Roughness=0.5), s.diffuse()
-    scene_parts.add_bump(s.tree, rough, strength=0.4)
-    return s.show(s.mix(rough, smooth, 0.4))
+    rough, smooth = s.shader("BsdfPrincipled", Base_Color=DIFFUSE, Roughness=0.5), s.diffuse()
+    scene_parts.add_bump(s.tree, rough.node, strength=0.4)
+    return s.show(s.mix(0.4, rough, smooth))
 
 
 @pytest.mark.parametrize(
@@ -170,14 +100,12 @@ def test_mixes_reproduce_cycles(tmp_path, make):
 
 def test_weights_are_products_of_factors(tmp_path):
     s = Shaders()
-    both = s.add(s.mix(s.metal(), s.glossy(), s.texture_u()), s.diffuse())
-    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.mix(both, s.glossy(), 0.25)))
+    both = s.add(s.mix(s.texture_u(), s.metal(), s.glossy()), s.diffuse())
+    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.mix(0.25, both, s.glossy())))
     assert warnings == [] and np.array_equal(np.bincount(pixel), np.full(24 * 16, 4))
     u = samples.position[::4, 0] / 6.0 + 0.5
-    expected = {0: 0.75 * (1.0 - u), 1: 0.75 * u, 3: np.full_like(u, 0.25)}
-    colors = {0: METAL, 1: GLOSSY, 3: GLOSSY}
-    for lobe, weight in expected.items():
-        assert np.abs(samples.specular_f0[lobe::4] - weight[:, None] * colors[lobe][:3]).max() < EXACT
+    for lobe, weight, color in ((0, 0.75 * (1.0 - u), METAL), (1, 0.75 * u, GLOSSY), (3, 0.25 + 0.0 * u, GLOSSY)):
+        assert np.abs(samples.specular_f0[lobe::4] - weight[:, None] * color[:3]).max() < EXACT
     assert np.abs(samples.specular_f90[0::4] - 0.75 * (1.0 - u)[:, None]).max() < EXACT
     assert np.abs(samples.diffuse_albedo[2::4] - 0.75 * np.array(DIFFUSE[:3])).max() < EXACT
     assert not samples.diffuse_albedo.reshape(-1, 4, 3)[:, [0, 1, 3]].any()
@@ -192,23 +120,15 @@ def test_a_film_counts_hits_and_not_lobes(tmp_path):
 
 def test_lobes_without_weight_leave_one_sample(tmp_path):
     s = Shaders()
-    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(s.metal(), s.glossy(), s.node("Value").outputs[0])))
+    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(s.value(0.0), s.metal(), s.glossy())))
     assert np.array_equal(pixel, np.arange(24 * 16)) and np.abs(samples.roughness - 0.35).max() < EXACT
     assert np.abs(samples.specular_f0 - METAL[:3]).max() < EXACT
-
-
-def test_a_surface_without_lobes_has_one_black_sample(tmp_path):
-    s = Shaders()
-    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.node("Emission")))
-    assert np.array_equal(pixel, np.arange(24 * 16)) and warnings == []
-    assert not samples.specular_f90.any() and not samples.dielectric.any() and not samples.diffuse_albedo.any()
 
 
 def test_a_shader_that_is_used_twice_is_one_lobe(tmp_path):
     s = Shaders()
     metal = s.metal()
-    shader = s.mix(s.mix(metal, s.diffuse(), s.texture_u()), metal, 0.5)
-    samples, pixel, _ = seen_from_above(tmp_path, s.show(shader))
+    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(0.5, s.mix(s.texture_u(), metal, s.diffuse()), metal)))
     u = samples.position[::2, 0] / 6.0 + 0.5
     assert np.array_equal(np.bincount(pixel), np.full(24 * 16, 2))
     assert np.abs(samples.specular_f90[::2] - (0.5 * (1.0 - u) + 0.5)[:, None]).max() < EXACT
@@ -216,17 +136,17 @@ def test_a_shader_that_is_used_twice_is_one_lobe(tmp_path):
 
 def test_a_group_that_is_used_twice_has_its_own_values_in_each_place(tmp_path):
     s = Shaders()
-    tree, entry, end = group_tree("Twice", ("Factor",), ("Shader", "Other"))
-    glossy = s.glossy(tree)
-    tree.links.new(entry.outputs[0], glossy.inputs["Roughness"])
-    tree.links.new(glossy.outputs[0], end.inputs[0])
-    tree.links.new(s.diffuse(tree).outputs[0], end.inputs[1])
-    nodes = [group_node(s.tree, tree) for _ in range(2)]
-    for node, value in zip(nodes, (0.2, 0.7), strict=True):
-        node.inputs[0].default_value = value
-    both = s.mix(nodes[0].outputs[0], nodes[0].outputs[1], 0.5)
-    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(both, nodes[1], s.texture_u())))
-    assert np.array_equal(np.bincount(pixel), np.full(24 * 16, 3)) and len(tree.nodes) == 4
+
+    def fill(roughness):
+        glossy = s.glossy()
+        s.link(roughness, glossy.node.inputs["Roughness"])
+        return glossy
+
+    first, second = s.group(fill, [s.value(0.2)], times=2)
+    s.link(s.value(0.7), second.node.inputs[0])
+    tree = first.node.node_tree
+    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(s.texture_u(), s.mix(0.5, first, s.diffuse()), second)))
+    assert np.array_equal(np.bincount(pixel), np.full(24 * 16, 3)) and len(tree.nodes) == 3
     assert np.abs(samples.roughness.reshape(-1, 3)[:, [0, 2]] - (0.2, 0.7)).max() < EXACT
 
 
@@ -234,9 +154,7 @@ def test_more_lobes_than_slots_keep_the_largest(tmp_path):
     s = Shaders()
     shader = s.glossy()
     for index in range(MAX_LOBES + 1):
-        lobe = s.glossy()
-        lobe.inputs["Roughness"].default_value = 0.05 + 0.1 * index
-        shader = s.mix(shader, lobe, 0.5)
+        shader = s.mix(0.5, shader, s.glossy(0.05 + 0.1 * index))
     samples, pixel, warnings = seen_from_above(tmp_path, s.show(shader))
     assert np.array_equal(np.bincount(pixel), np.full(24 * 16, MAX_LOBES))
     assert len(warnings) == 1 and "'Mix'" in warnings[0] and "'Glossy BSDF'" in warnings[0]
@@ -245,41 +163,26 @@ def test_more_lobes_than_slots_keep_the_largest(tmp_path):
     assert np.abs(total / GLOSSY[:3] - (1.0 - 2.0**-8)).max() < EXACT
 
 
-def test_transparency_inside_a_group_is_cut(tmp_path):
-    s = Shaders("Veil")
-    tree, _, end = group_tree("Clear")
-    tree.links.new(s.node("BsdfTransparent", tree).outputs[0], end.inputs[0])
-    shader = s.mix(group_node(s.tree, tree), s.add(s.metal(), s.node("BsdfTransparent")), s.texture_u())
-    samples, pixel, warnings = seen_from_above(tmp_path, s.show(shader))
-    assert np.array_equal(pixel, np.arange(24 * 16)) and np.abs(samples.specular_f90 - 1.0).max() < EXACT
-    assert len(warnings) == 2 and all("'Veil'" in line and "opaque" in line for line in warnings)
-
-
 def test_emission_beside_a_bsdf_is_a_light_and_never_a_lobe(tmp_path):
     s = Shaders("Lamp")
-    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.add(s.node("Emission"), s.metal())))
+    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.add(s.shader("Emission"), s.metal())))
     assert np.array_equal(pixel, np.arange(24 * 16)) and np.abs(samples.specular_f90 - 1.0).max() < EXACT
     assert warnings == [] and "Plane" in {light.name for light in scene_parts.prepare()[2].lights}
 
 
-def test_a_color_as_surface_is_emission(tmp_path):
-    s = Shaders("Glow")
-    samples, pixel, warnings = seen_from_above(tmp_path, s.show(s.node("RGB")))
-    assert np.array_equal(pixel, np.arange(24 * 16)) and len(warnings) == 1 and "emission" in warnings[0]
-    assert not samples.specular_f90.any() and not samples.diffuse_albedo.any()
-
-
-@pytest.mark.parametrize("front", ["no output", "nothing linked", "a mix of nothing"])
-def test_what_has_no_surface_shader_is_black(tmp_path, front):
+@pytest.mark.parametrize("front", ["Emission", "RGB", "MixShader", "nothing linked", "no output"])
+def test_what_has_no_lobes_has_one_black_sample(tmp_path, front):
     s = Shaders("Nothing")
     if front == "no output":
         s.tree.nodes.clear()
-    elif front == "a mix of nothing":
-        s.show(s.node("MixShader"))
+    elif front != "nothing linked":
+        s.show(s.shader(front))
     add_plane(s.material, location=(0.0, 0.0, 0.5))
     behind = Shaders("Behind")
     samples, pixel, warnings = seen_from_above(tmp_path, behind.show(behind.metal()))
-    assert warnings == [] and np.array_equal(pixel, np.arange(24 * 16)) and np.allclose(samples.position[:, 2], 0.5)
+    # A color as surface is emission, and said to be.
+    assert ["emission" in line for line in warnings] == ([True] if front == "RGB" else [])
+    assert np.array_equal(pixel, np.arange(24 * 16)) and np.allclose(samples.position[:, 2], 0.5)
     assert not samples.specular_f90.any() and not samples.dielectric.any() and not samples.diffuse_albedo.any()
 
 

@@ -18,16 +18,12 @@ from ltsh_addon.pipeline import bake
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
-def plane_positions(size=SIZE, side=6.0):
-    """World positions (size, size, 3) of the texel centers of `scene_parts.add_plane`, row 0 on top."""
-    step = (np.arange(size) + 0.5) / size * side - side / 2.0
-    x, y = np.meshgrid(step, step[::-1])
-    return np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-
 def plane_samples(view, f0=0.0, f90=0.0, albedo=0.0):
-    """Samples at the texels, of roughness 0.4, seen from the point or along the direction `view`."""
-    position = plane_positions().reshape(-1, 3)
+    """Samples of roughness 0.4 at the texels of `scene_parts.add_plane`, row 0 on top; seen ("from", a point) or
+    ("along", a direction)."""
+    step = ((np.arange(SIZE) + 0.5) / SIZE - 0.5) * 6.0
+    x, y = np.meshgrid(step, step[::-1])
+    position = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
     offset = np.array(view[1]) - (position if view[0] == "from" else 0.0)
     vectors = np.broadcast_to(offset / np.linalg.norm(offset, axis=-1, keepdims=True), position.shape)
     one, up = np.ones((len(position), 3)), np.broadcast_to((0.0, 0.0, 1.0), position.shape)

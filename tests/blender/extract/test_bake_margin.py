@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scene_parts
 from bake_scenes import baked, save, start
+from material_scenes import Build
 from mathutils import Vector
 from scene_parts import add_plane, principled
 
@@ -70,11 +71,10 @@ def test_beyond_a_cut_the_margin_continues_the_surface_laid_flat(tmp_path, turn)
 
 
 def position_material():
-    material, tree, output = scene_parts.new_material("Position")
-    geometry, emission = tree.nodes.new("ShaderNodeNewGeometry"), tree.nodes.new("ShaderNodeEmission")
-    tree.links.new(geometry.outputs["Position"], emission.inputs["Color"])
-    tree.links.new(emission.outputs[0], output.inputs["Surface"])
-    return material
+    made = Build("Position")
+    emission = made.shader("Emission")
+    made.link(made.new("ShaderNodeNewGeometry").outputs["Position"], emission.node.inputs["Color"])
+    return made.show(emission)
 
 
 def blender_bake(ob, margin, size=SIZE):

@@ -24,19 +24,13 @@ def squares(name, *uv_corners):
     return ob
 
 
-def library(folder):
-    """A file with an object, and a material."""
-    start()
-    ob = add_plane(principled("Shared", Metallic=1.0, Roughness=0.5)[0], name="Linked")
-    ob.data.name = "Linked mesh"
-    return scene_parts.save(folder / "library.blend")
-
-
 @pytest.fixture(scope="module")
 def odd(tmp_path_factory):
     """Report and layers of a bake of odd objects, and whether the library is as it was."""
     folder = tmp_path_factory.mktemp("odd")
-    path = library(folder)
+    start()
+    add_plane(principled("Shared", Metallic=1.0, Roughness=0.5)[0], name="Linked").data.name = "Linked mesh"
+    path = scene_parts.save(folder / "library.blend")
     before = hashlib.sha256(path.read_bytes()).digest()
     start()
     with bpy.data.libraries.load(str(path), link=True) as (_, wanted):
@@ -102,7 +96,9 @@ def test_light_groups_are_layers_and_each_is_the_light_of_its_own_lights(tmp_pat
         assert np.array_equal(parts[0], files["Plane.exr"][layer]) and parts[0].max() > 0.0
 
 
-def broken_scene():
+def test_broken_objects_are_named_and_the_rest_is_baked(tmp_path, capsys):
+    from ltsh_addon import cli
+
     start()
     add_plane(name="Good")
     bare = add_plane(name="No map", location=(0, 0, 0.1))
@@ -117,12 +113,6 @@ def broken_scene():
     add_plane(name="Hidden").hide_render = True
     scene_parts.add_mesh("No faces", [(0, 0, 0)], []).data.uv_layers.new(name="UVMap")
     add_plane(name="Flat", scale=(1.0, 0.0, 0.0))
-
-
-def test_broken_objects_are_named_and_the_rest_is_baked(tmp_path, capsys):
-    from ltsh_addon import cli
-
-    broken_scene()
     path = save(tmp_path)
     names = [ob.name for ob in bpy.data.objects if ob.type == "MESH"]
     arguments = [value for name in names for value in ("--object", name)]

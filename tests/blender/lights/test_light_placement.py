@@ -89,12 +89,6 @@ def animate(owner, path, values, index=-1):
             key.interpolation = "LINEAR"
 
 
-def drive(owner, path, expression):
-    """Drive `path` of `owner` by an expression of the frame."""
-    driver = owner.driver_add(path).driver
-    driver.type, driver.expression = "SCRIPTED", expression
-
-
 def test_animated_and_driven_lights_are_those_of_the_frame(tmp_path):
     """At frame 6 everything is half way; simple driver expressions need no scripts."""
     scene = start()
@@ -102,7 +96,7 @@ def test_animated_and_driven_lights_are_those_of_the_frame(tmp_path):
     animate(light.data, "energy", (10.0, 90.0))
     animate(light.data, "color", (0.0, 1.0), index=1)
     animate(light, "location", (1.0, 2.0), index=2)
-    drive(light.data, "size", "frame / 4")
+    light.data.driver_add("size").driver.expression = "frame / 4"
     scene_parts.add_camera()
     path = scene_parts.save(tmp_path / "animated.blend")
     first, middle = (extract(ExtractOptions(path, frame=frame)).lights[0] for frame in (1, 6))

@@ -71,13 +71,6 @@ APPROXIMATED = {
 }
 
 
-def scene_of(kind):
-    def make():
-        return material(**kind)
-
-    return material_scenes.prepared_scene(make)
-
-
 def percent(squared):
     """The error of a squared one in percent, negative where the square is."""
     return 100.0 * np.sign(squared) * np.sqrt(abs(squared))
@@ -85,7 +78,7 @@ def percent(squared):
 
 @pytest.mark.parametrize("name", EXACT)
 def test_a_material_is_shaded_as_cycles_does(tmp_path, name):
-    prepared = scene_of(EXACT[name])
+    prepared = material_scenes.prepared_scene(lambda: material(**EXACT[name]))
     assert prepared[3] == []
     found = material_scenes.errors(tmp_path, prepared, CYCLES_SAMPLES)
     for lobe in ("specular", "diffuse"):
@@ -101,7 +94,7 @@ def test_a_material_is_shaded_as_cycles_does(tmp_path, name):
 @pytest.mark.parametrize("name", APPROXIMATED)
 def test_an_approximated_material_is_named_and_near(tmp_path, name):
     kind, tolerances = APPROXIMATED[name]
-    prepared = scene_of(kind)
+    prepared = material_scenes.prepared_scene(lambda: material(**kind))
     assert len(prepared[3]) == 1 and "'Material'" in prepared[3][0] and "BSDF'" in prepared[3][0]
     found = material_scenes.errors(tmp_path, prepared, CYCLES_SAMPLES, techniques=("reference",))
     for lobe, tolerance in zip(("specular", "diffuse"), tolerances, strict=True):

@@ -110,6 +110,18 @@ def build(material):
     scene_parts.add_sphere(material, radius=0.6, location=(0.3, 0.2, 0.6))
 
 
+def seen_from_above(folder: Path, *materials):
+    """(samples, pixel, warnings) of planes of 6 m, one of each material, that fill the picture."""
+    scene_parts.add_top_camera()
+    scene_parts.add_area_light()
+    for material in materials:
+        scene_parts.add_plane(material)
+    prepared = scene_parts.prepare()
+    ((samples, pixel, unusable),), _ = scene_parts.sample(folder, prepared)
+    assert unusable == 0 and np.array_equal(np.unique(pixel), np.arange(SIZE[0] * SIZE[1]))
+    return samples, pixel, prepared[3]
+
+
 def prepared_scene(make):
     """An empty scene with the material that `make()` returns, prepared as the child does it."""
     scene_parts.empty_scene(*SIZE)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from material_scenes import Build
+from material_scenes import Build, seen_from_above
 from scene_parts import add_plane, bsdf_material, principled
 
 from ltsh_addon.blender import render_settings
@@ -20,29 +20,16 @@ EXACT = 2e-6
 GLOSSY, DIFFUSE = "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfDiffuse"
 
 
-@pytest.fixture
-def plane_scene():
-    """A plane of 6 m seen from above, one light; call with its material for (surface samples, warnings)."""
-
-    def make(folder, *materials):
-        scene_parts.add_area_light()
-        for material in materials:
-            add_plane(material)
-        prepared = scene_parts.prepare()
-        ((surface, _, unusable),), _ = scene_parts.sample(folder, prepared)
-        assert unusable == 0 and len(surface) == scene_parts.SIZE[0] * scene_parts.SIZE[1]
-        return surface, prepared[3]
-
+@pytest.fixture(autouse=True)
+def _empty_scene():
     scene_parts.empty_scene()
-    scene_parts.add_top_camera()
-    return make
 
 
 @pytest.mark.parametrize(
     ("kind", "color", "f0", "f90", "albedo"),
     [("ShaderNodeBsdfPrincipled", "Base Color", 1, 1, 0), (GLOSSY, "Color", 1, None, 0), (DIFFUSE, "Color", 0, 0, 1)],
 )
-def test_samples_have_the_values_of_textures(tmp_path, plane_scene, kind, color, f0, f90, albedo):
+def test_samples_have_the_values_of_textures(tmp_path, kind, color, f0, f90, albedo):
     """The texture's color is in `f0` or `albedo`; an f90 of None is the same as f0."""
     material, node = bsdf_material(kind, **({"Metallic": 1.0} if color == "Base Color" else {}))
     coordinates = material.node_tree.nodes.new("ShaderNodeTexCoord").outputs["UV"]
@@ -51,7 +38,7 @@ def test_samples_have_the_values_of_textures(tmp_path, plane_scene, kind, color,
     material.node_tree.links.new(coordinates, node.inputs[color])
     if kind != DIFFUSE:
         material.node_tree.links.new(separate.outputs[0], node.inputs["Roughness"])
-    surface, warnings = plane_scene(tmp_path, material)
+    surface, _, warnings = seen_from_above(tmp_path, material)
     texture = surface.position / 6.0 + (0.5, 0.5, 0.0)
     assert np.abs(surface.specular_f0 - f0 * texture).max() < EXACT
     assert np.abs(surface.specular_f90 - (surface.specular_f0 if f90 is None else f90)).max() == 0.0
@@ -60,19 +47,19 @@ def test_samples_have_the_values_of_textures(tmp_path, plane_scene, kind, color,
     assert not surface.dielectric.any() and warnings == []
 
 
-def test_a_normal_map_turns_the_normal(tmp_path, plane_scene):
+def test_a_normal_map_turns_the_normal(tmp_path):
     material, node = principled()
     normal_map = material.node_tree.nodes.new("ShaderNodeNormalMap")
     normal_map.inputs["Color"].default_value = (0.65, 0.4, 0.95, 1.0)
     material.node_tree.links.new(normal_map.outputs[0], node.inputs["Normal"])
-    surface, _ = plane_scene(tmp_path, material)
+    surface, _, _ = seen_from_above(tmp_path, material)
     # The plane's tangent is x and its bitangent y.
     expected = horizons.unit(2.0 * np.array([[0.65, 0.4, 0.95]]) - 1.0)
     assert np.abs(surface.normal - expected).max() < 1e-5
     assert np.array_equal(surface.normal, surface.diffuse_normal)
 
 
-def test_a_group_is_followed_for_each_of_its_users(tmp_path, plane_scene):
+def test_a_group_is_followed_for_each_of_its_users(tmp_path):
     tree = scene_parts.group_with_principled()
     for value, x in ((0.77, -1.5), (0.33, 1.5)):
         b = Build(f"Uses group {value}")
@@ -82,18 +69,19 @@ def test_a_group_is_followed_for_each_of_its_users(tmp_path, plane_scene):
             node.node_tree = tree
             node.inputs["Roughness"].default_value = roughness
         add_plane(b.show(node.outputs[0]), size=3.0, location=(x, 0.0, 0.1))
-    surface, warnings = plane_scene(tmp_path, principled()[0])
+    surface, _, warnings = seen_from_above(tmp_path, principled()[0])
     left, right = (np.abs(surface.position - (x, 0.0, 0.1)).max(axis=-1) < 1.49 for x in (-1.5, 1.5))
     assert left.any() and right.any() and len(tree.nodes) == 3
     assert np.allclose(surface.roughness[left], 0.77) and np.allclose(surface.roughness[right], 0.33)
 
 
 @pytest.mark.parametrize("slots", ["none", "empty"])
-def test_without_material_the_surface_is_cycles_default(tmp_path, plane_scene, slots):
+def test_without_material_the_surface_is_cycles_default(tmp_path, slots):
     plane = add_plane()
     if slots == "empty":
         plane.data.materials.append(None)
     scene_parts.add_area_light("Other")
+    scene_parts.add_top_camera()
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 1, 0
     render_settings.enable_passes(bpy.context.view_layer, ("combined", "diffuse_color", "glossy_color"))
@@ -102,13 +90,13 @@ def test_without_material_the_surface_is_cycles_default(tmp_path, plane_scene, s
     names = render_settings.pass_names()
     expected = lobes.read_layer(untouched, names["diffuse_color"], "RGB").reshape(-1, 3)
     glossy = lobes.read_layer(untouched, names["specular_color"], "RGB").any()
-    surface, _ = plane_scene(tmp_path)
+    surface, _, _ = seen_from_above(tmp_path)
     assert np.abs(surface.diffuse_albedo - expected).max() < EXACT and expected.min() > 0.5
     # Multiple scattering adds less than a percent to a dielectric.
     assert not surface.specular_f90.any() and np.allclose(surface.dielectric, float(glossy), atol=0.02)
 
 
-def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path, plane_scene):
+def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path):
     plane = add_plane(size=6.0)
     tree = bpy.data.node_groups.new("Set", "GeometryNodeTree")
     for direction in ("INPUT", "OUTPUT"):
@@ -118,29 +106,29 @@ def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path, plane_scene):
     tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], node.inputs["Geometry"])
     tree.links.new(node.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
     plane.modifiers.new("Set", "NODES").node_group = tree
-    surface, _ = plane_scene(tmp_path)
+    surface, _, _ = seen_from_above(tmp_path)
     assert np.allclose(surface.roughness, 0.42) and np.all(surface.dielectric == 1.0)
 
 
-def test_displacement_as_bump_is_in_the_normal(tmp_path, plane_scene):
+def test_displacement_as_bump_is_in_the_normal(tmp_path):
     material, node = principled(Metallic=1.0)
     tree = material.node_tree
     noise, displacement = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeDisplacement")
     displacement.inputs["Scale"].default_value = 30.0
     tree.links.new(noise.outputs[0], displacement.inputs["Height"])
     tree.links.new(displacement.outputs[0], tree.nodes["Material Output"].inputs["Displacement"])
-    surface, _ = plane_scene(tmp_path, material)
+    surface, _, _ = seen_from_above(tmp_path, material)
     assert np.abs(surface.normal[:, :2]).max() > 0.1
 
 
 @pytest.mark.parametrize("kind", ["alpha", "mix", "group"])
-def test_transparency_is_cut_in_samples_and_reference(tmp_path, plane_scene, kind):
+def test_transparency_is_cut_in_samples_and_reference(tmp_path, kind):
     b = Build("Veil")
     surface = b.shader("BsdfPrincipled", Base_Color=(0.8, 0.1, 0.1, 1.0), Alpha=0.5 if kind == "alpha" else 1.0)
     if kind != "alpha":
         surface = b.mix(0.5, surface, b.clear() if kind == "mix" else b.group(b.clear)[0])
     add_plane(b.show(surface), name="Front", location=(0.0, 0.0, 0.5))
-    surface, warnings = plane_scene(tmp_path, principled("Back", Metallic=1.0)[0])
+    surface, _, warnings = seen_from_above(tmp_path, principled("Back", Metallic=1.0)[0])
     assert np.allclose(surface.position[:, 2], 0.5) and np.all(surface.dielectric == 1.0)
     assert len(warnings) == 1 and "'Veil'" in warnings[0] and "opaque" in warnings[0]
     halves = scene_parts.reference(tmp_path, (bpy.context.scene, bpy.context.view_layer), 32)
@@ -149,7 +137,7 @@ def test_transparency_is_cut_in_samples_and_reference(tmp_path, plane_scene, kin
     assert abs(quadrature.bias(expected, halves["diffuse"].reshape(2, -1, 3))) < 1e-2
 
 
-def test_every_unsupported_input_is_named_once(tmp_path, plane_scene):
+def test_every_unsupported_input_is_named_once(tmp_path):
     wanted = {
         "Diffuse Roughness": 0.5,
         "Subsurface Weight": 0.2,
@@ -166,6 +154,7 @@ def test_every_unsupported_input_is_named_once(tmp_path, plane_scene):
         node.inputs[name].default_value = value
     node.inputs["Coat Weight"].default_value, node.inputs["Specular Tint"].default_value = 0.2, (1.0, 0.5, 0.5, 1.0)
     node.inputs["Emission Strength"].default_value = 2.0
+    scene_parts.add_top_camera()
     scene_parts.add_area_light()
     add_plane(material)
     warnings = scene_parts.prepare()[3]

@@ -5,7 +5,7 @@ import material_scenes
 import numpy as np
 import pytest
 import scene_parts
-from material_scenes import Build
+from material_scenes import Build, seen_from_above
 from scene_parts import add_plane
 
 from ltsh_addon.cycles import gbuffer
@@ -27,17 +27,6 @@ class Shaders(Build):
 
     def diffuse(self):
         return self.shader("BsdfDiffuse", Color=DIFFUSE)
-
-
-def seen_from_above(folder, material):
-    """(samples, pixel, warnings) of a plane of 6 m."""
-    scene_parts.add_top_camera()
-    scene_parts.add_area_light()
-    add_plane(material)
-    prepared = scene_parts.prepare()
-    ((samples, pixel, unusable),), _ = scene_parts.sample(folder, prepared)
-    assert unusable == 0
-    return samples, pixel, prepared[3]
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,8 @@ import numpy as np
 
 from ltsh_addon import cli, shading
 from ltsh_addon.blender.process import client
+from ltsh_addon.pipeline import PictureOptions
+from ltsh_addon.pipeline.tasks import Job
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
@@ -110,3 +112,9 @@ class FakeChild:
             camera=options.camera or "Camera",
             seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
         )
+
+
+def small_job(room, output, command="shade", **changes) -> Job:
+    """A job of one technique and one pass."""
+    options = PictureOptions(room, output, techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
+    return Job(command, options, **{"scenes": (room,), **changes})

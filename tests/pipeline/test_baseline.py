@@ -107,7 +107,7 @@ def test_several_pictures_are_told_apart_and_a_technique_without_baseline_is_ref
     assert "frame 8" in line and before.worse(report, Tolerance(0.0)) == []
     del second["passes"]["specular"]["techniques"]["ltc"]
     with pytest.raises(ValueError, match="has no specular of ltc against Cycles"):
-        baseline(tmp_path, second).worse(now, Tolerance())
+        baseline(tmp_path, second).worse(now["reports"][1], Tolerance())
 
 
 def test_the_command_ends_with_1_where_something_got_worse(capsys, child, room, tmp_path):

@@ -101,17 +101,21 @@ def test_tables_given_by_path_get_short_names_of_their_own(child, tmp_path):
     assert not np.array_equal(layers["ltc.specular"], layers["ltc_2.specular"])
 
 
-@pytest.mark.parametrize("stage", ["samples", "LTC", "write"])
-@pytest.mark.parametrize("error", [Cancelled, RuntimeError])
-def test_stopping_at_any_stage_leaves_no_file(child, tmp_path, stage, error):
-    def progress(now, fraction):
-        if now == stage and error is RuntimeError:
-            raise RuntimeError("the window is gone")
-        return now != stage
-
-    with pytest.raises(error):
-        compare_scene(options(tmp_path), progress)
+@pytest.mark.parametrize("stage", ["samples", "LTC", "write", "sheet"])
+def test_stopping_or_failing_at_any_stage_leaves_no_file(child, tmp_path, monkeypatch, stage):
+    if stage == "sheet":
+        monkeypatch.setattr(imaging, "comparison_sheet", None)
+    with pytest.raises(TypeError if stage == "sheet" else Cancelled):
+        compare_scene(options(tmp_path), lambda name, fraction: name != stage)
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_progress_tells_every_stage_from_beginning_to_end(child, tmp_path):
+    seen = {}
+    compare_scene(options(tmp_path), lambda stage, fraction: seen.setdefault(stage, []).append(fraction))
+    assert list(seen)[-4:] == ["LTC", "LTSH N=4", "Reference quadrature", "write"]
+    for stage in list(seen)[-4:]:
+        assert seen[stage][0] == 0.0 and seen[stage][-1] == 1.0 and seen[stage] == sorted(seen[stage])
 
 
 def test_a_comparison_needs_two_cycles_samples(child, tmp_path):

@@ -9,8 +9,9 @@ import numpy as np
 import programs
 import pytest
 import scene_parts
+from fake_scene import run
 
-from ltsh_addon import cli, imaging
+from ltsh_addon import imaging
 
 ROOT = Path(__file__).resolve().parents[3]
 ALWAYS = ("report.json", "timing.json", ".ltsh")
@@ -20,12 +21,6 @@ SMALL = ["--resolution", "32x18", "--cycles-samples", "8"]
 @pytest.fixture
 def room(tmp_path):
     return scene_parts.metal_room(tmp_path / "room.blend")
-
-
-def run(capsys, *arguments):
-    capsys.readouterr()  # bpy tells on stdout that it saved a scene
-    code = cli.main([str(argument) for argument in arguments])
-    return code, *capsys.readouterr()
 
 
 def test_compare_as_a_program(room, out, temporary_root):

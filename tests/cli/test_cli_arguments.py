@@ -73,9 +73,7 @@ def test_wrong_calls_are_misuse(capsys, child, tmp_path, monkeypatch, arguments,
 
 def test_the_open_file_is_the_scene(capsys, child, room, out):
     """Blender's bpy.data.filepath is "" before a file is saved or opened."""
-    assert_misuse(
-        run(capsys, "compare", room, "-o", out, open_file="/scenes/a.blend"), "'/scenes/a.blend' open already"
-    )
+    assert_misuse(run(capsys, "shade", room, "-o", out, open_file="/a.blend"), "'/a.blend' open already")
     assert_misuse(run(capsys, "shade", "-o", out, open_file=""), "SCENE.blend is missing")
     assert child.asked == [] and not out.exists()
     assert run(capsys, "shade", "-o", out, "--quiet", open_file=room)[0] == 0

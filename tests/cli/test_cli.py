@@ -19,19 +19,6 @@ from ltsh_addon.scene import Cancelled, SceneError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def run_python(code):
-    """Run `code` in an interpreter of its own."""
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
-
-
-def assert_failure(result, complaint):
-    """Code 1 and, quiet, one line alone."""
-    code, stdout, stderr = result
-    assert (code, stdout) == (1, "") and len(stderr.splitlines()) == 1
-    assert stderr.startswith("ltsh: ") and complaint in stderr
-
-
 def test_with_json_a_mistake_is_a_document_too(capsys, child, room, out, tmp_path):
     cases = [
         (2, "--aa", ["shade", room, "-o", out, "--aa", "x"]),
@@ -56,10 +43,12 @@ def test_the_demo_is_built_and_compared(capsys, child, out):
     assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html", "timing.json", ".ltsh"}
 
 
-def test_json_is_one_document_on_stdout_and_the_same_as_the_file(capsys, child, room, out):
-    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--json")
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+def test_json_is_one_document_on_stdout_and_the_same_as_the_file(capsys, child, room, out, quiet):
+    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--json", *quiet)
     assert code == 0 and json.loads(stdout) == json.loads((out / "report.json").read_text(encoding="utf-8"))
-    assert "samples: 100 %" in stderr
+    assert stderr == "" if quiet else "samples: 100 %" in stderr
+    assert json.loads(stdout)["warnings"] == [fake_scene.WARNING]
 
 
 def test_what_stands_on_stdout_does_not_hang_on_its_encoding(monkeypatch, room, out):
@@ -98,11 +87,6 @@ def test_without_json_a_table_of_errors_is_printed_and_warnings_go_to_stderr(cap
     assert rows == ["specular,", *table, "diffuse,", *table, "written"]
 
 
-def test_quiet_keeps_stderr_empty(capsys, child, room, out):
-    code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet", "--json")
-    assert code == 0 and stderr == "" and json.loads(stdout)["warnings"] == [fake_scene.WARNING]
-
-
 @pytest.mark.skipif(os.name != "posix", reason="permissions of folders as in POSIX")
 def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path, monkeypatch):
     """The system's refusal is imitated: root, who may run the tests, is refused nothing."""
@@ -111,34 +95,31 @@ def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
     monkeypatch.setattr(files.os, "open", refuse)
-    assert_failure(run(capsys, "shade", room, "-o", tmp_path, "--quiet"), "Permission denied")
-    assert child.asked == []
+    code, _, stderr = run(capsys, "shade", room, "-o", tmp_path, "--quiet")
+    assert code == 1 and len(stderr.splitlines()) == 1 and "Permission denied" in stderr and child.asked == []
 
 
 @pytest.mark.parametrize(
-    "error", [SceneError("room.blend: no active camera"), OSError("disk\nis full"), Cancelled("x is full")]
+    ("error", "expected", "complaint"),
+    [
+        (SceneError("room.blend: no active camera"), 1, "room.blend: no active camera"),
+        (OSError("disk\nis full"), 1, "disk is full"),
+        (Cancelled("x is full"), 1, "x is full"),
+        (MemoryError(), 1, "MemoryError"),
+        (KeyboardInterrupt(), 130, "ltsh: interrupted\n"),
+    ],
 )
-def test_what_is_wrong_with_the_world_is_one_line(capsys, monkeypatch, room, out, error):
+def test_what_is_wrong_with_the_world_is_one_line(capsys, monkeypatch, room, out, error, expected, complaint):
     fake_scene.FakeChild(error=error).install(monkeypatch)
-    assert_failure(run(capsys, "compare", room, "-o", out, "--quiet"), " ".join(str(error).split()))
-    assert list(out.iterdir()) == []
-
-
-def test_interrupting_is_130(capsys, monkeypatch, room, out):
-    fake_scene.FakeChild(error=KeyboardInterrupt()).install(monkeypatch)
     code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
-    assert (code, stdout, stderr) == (130, "", "ltsh: interrupted\n") and list(out.iterdir()) == []
+    assert (code, stdout) == (expected, "") and len(stderr.splitlines()) == 1 and list(out.iterdir()) == []
+    assert stderr.startswith("ltsh: ") and complaint in stderr
 
 
 def test_a_defect_of_ours_shows_its_traceback(capsys, monkeypatch, room, out, caplog):
     fake_scene.FakeChild(error=RuntimeError("this cannot be")).install(monkeypatch)
     assert run(capsys, "compare", room, "-o", out, "--quiet")[0] == 1
     assert "this cannot be" in caplog.text and "Traceback" in caplog.text
-
-
-def test_memory_that_runs_out_has_a_line(capsys, monkeypatch, room, out):
-    fake_scene.FakeChild(error=MemoryError()).install(monkeypatch)
-    assert_failure(run(capsys, "compare", room, "-o", out, "--quiet"), "MemoryError")
 
 
 def test_without_bpy_a_line_says_what_to_install(room, out):
@@ -149,7 +130,8 @@ util.find_spec = lambda name, *rest: None if name == "bpy" else find(name, *rest
 from ltsh_addon import cli
 sys.exit(cli.main(["compare", {str(room)!r}, "-o", {str(out)!r}, "--quiet"]))
 """
-    done = run_python(code)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert (done.returncode, done.stdout) == (1, "") and len(done.stderr.splitlines()) == 1
     assert "no module bpy" in done.stderr and "pip install" in done.stderr and list(out.iterdir()) == []
 

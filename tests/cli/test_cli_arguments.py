@@ -7,9 +7,7 @@ import pytest
 from fake_scene import run
 
 from ltsh_addon import shading
-from ltsh_addon.cli import commands
-from ltsh_addon.pipeline.options import techniques
-from ltsh_addon.scene import VERSION
+from ltsh_addon.scene import VERSION, listed
 
 
 def assert_misuse(result, complaint):
@@ -19,7 +17,6 @@ def assert_misuse(result, complaint):
     assert stderr.startswith("ltsh") and complaint in stderr
 
 
-@pytest.mark.parametrize("command", ["compare", "shade"])
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
@@ -36,11 +33,10 @@ def assert_misuse(result, complaint):
         (["--frame", "1.5"], "frame is '1.5', expected a whole number"),
         (["--frame", "1048575"], "frame is '1048575'"),
         (["--reference-samples", "0"], "'0' was given"),
-        (["--no-such-option"], "--no-such-option"),
     ],
 )  # fmt: skip
-def test_wrong_values_are_misuse(capsys, child, room, out, command, arguments, complaint):
-    assert_misuse(run(capsys, command, room, "-o", out, *arguments), complaint)
+def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint):
+    assert_misuse(run(capsys, "compare", room, "-o", out, *arguments), complaint)
     assert child.asked == [] and not out.exists()
 
 
@@ -48,45 +44,40 @@ def test_wrong_values_are_misuse(capsys, child, room, out, command, arguments, c
     ("arguments", "complaint"),
     [
         ([], "COMMAND"),
-        (["render"], "'render'"),
         (["compare", "room.blend"], "-o"),
         (["compare", "-o", "out"], "SCENE.blend is missing"),
         (["shade", "-o", "out"], "SCENE.blend is missing"),
         (["demo"], "-o"),
-        (["demo", "room.blend", "-o", "out"], "room.blend"),
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "1"], "expected at least 2"),
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "0"], "'0' was given"),
-        (["shade", "room.blend", "-o", "out", "--cycles-samples", "8"], "--cycles-samples"),
         (["tables"], "action"),
         (["tables", "burn"], "'burn'"),
+        ("shad room.blend -o out".split(), "ltsh: command 'shad' is unknown (expected one of demo, compare, "
+         "shade, bake, run, merge, tables); see ltsh --help"),
+        ("shade room.blend -o out --techniqes ltc".split(), "ltsh shade: option --techniqes is unknown here; see ltsh "
+         "shade --help"),
+        ("shade room.blend -o out --techniqes=ltc".split(), "option --techniqes is unknown here"),
+        ("shade room.blend -o out --cycles-samples 8".split(),
+         "--cycles-samples is unknown here (an option of demo, compare, bake)"),
+        ("shade room.blend -o out hall.blend".split(),
+         "'hall.blend' is not expected here (name all files one after another); see"),
+        ("demo room.blend -o out".split(), "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
+        ("tables export -o out --jsn".split(), "option --jsn is unknown here"),
     ],
-)
+)  # fmt: skip
 def test_wrong_calls_are_misuse(capsys, child, tmp_path, monkeypatch, arguments, complaint):
     monkeypatch.chdir(tmp_path)
     assert_misuse(run(capsys, *arguments), complaint)
     assert child.asked == [] and list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["compare", "shade"])
-def test_a_scene_beside_an_open_file_is_misuse(capsys, child, room, out, command):
-    result = run(capsys, command, room, "-o", out, open_file="/scenes/open.blend")
-    assert_misuse(result, "'/scenes/open.blend' open already")
-    assert child.asked == [] and not out.exists()
-
-
 def test_the_open_file_is_the_scene(capsys, child, room, out):
+    """Blender's bpy.data.filepath is "" before a file is saved or opened."""
+    assert_misuse(run(capsys, "shade", room, "-o", out, open_file="/a.blend"), "'/a.blend' open already")
+    assert_misuse(run(capsys, "shade", "-o", out, open_file=""), "SCENE.blend is missing")
+    assert child.asked == [] and not out.exists()
     assert run(capsys, "shade", "-o", out, "--quiet", open_file=room)[0] == 0
     assert child.asked[0].scene == Path(room)
-
-
-def test_an_empty_name_of_the_open_file_means_none(capsys, child, out):
-    """Blender's bpy.data.filepath is "" before a file is saved or opened."""
-    assert_misuse(run(capsys, "shade", "-o", out, open_file=""), "SCENE.blend is missing")
-
-
-def test_tables_outside_a_checkout_are_misuse(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(commands, "__file__", str(tmp_path / "site" / "ltsh_addon" / "commands" / "tables_command.py"))
-    assert_misuse(run(capsys, "tables", "fit"), "needs the source checkout")
 
 
 def test_options_reach_the_scene(capsys, child, room, out):
@@ -106,31 +97,30 @@ def test_left_out_options_mean_as_in_the_file(capsys, child, room, out):
     assert (asked.width, asked.height, asked.sub_samples, asked.frame, asked.camera) == (None, None, 1, None, None)
 
 
-def test_the_program_is_named_as_it_was_called(capsys, out):
-    stderr = run(capsys, "shade", "-o", out, program="blender --command ltsh")[2]
-    assert stderr.startswith("blender --command ltsh: ")
+@pytest.mark.parametrize("command", ["demo", "compare", "shade", "bake", "run", "merge", "tables", "tables export"])
+def test_help_says_what_a_command_does_with_its_options_defaults_and_examples(capsys, command):
+    code, stdout, stderr = run(capsys, *command.split(), "--help")
+    description = stdout.split("\n\n")[1]
+    assert (code, stderr) == (0, "") and description[0].isupper() and description.endswith(".")
+    assert f"\n  ltsh {command} " in stdout.partition("examples:")[2]
+    if command in ("demo", "compare", "shade"):
+        options = "-o --techniques --passes --resolution --aa --frame --camera --json --quiet".split()
+        options += [] if command == "shade" else ["--cycles-samples"]
+        assert not [option for option in options if option not in stdout]
+        assert ",".join((*shading.SHIPPED_TABLES, "reference")) in stdout
+        assert ("480x270" in stdout) == (command == "demo")
 
 
-def test_version(capsys):
-    code, stdout, _ = run(capsys, "--version")
-    assert (code, stdout) == (0, f"ltsh {VERSION}\n")
-
-
-@pytest.mark.parametrize("command", ["demo", "compare", "shade"])
-def test_help_names_every_option_and_default(capsys, command):
-    code, stdout, stderr = run(capsys, command, "--help")
-    assert (code, stderr) == (0, "")
-    options = ["-o", "--techniques", "--passes", "--resolution", "--aa", "--frame", "--camera", "--json", "--quiet"]
-    options += [] if command == "shade" else ["--cycles-samples"]
-    assert not [option for option in options if option not in stdout]
-    assert "ltc,ltsh2,ltsh4,reference" in stdout and ("480x270" in stdout) == (command == "demo")
-
-
-def test_the_main_help_names_the_commands_and_examples(capsys):
-    code, stdout, _ = run(capsys, "--help", program="blender --command ltsh")
+def test_the_main_help_names_the_commands_and_the_program_as_it_was_called(capsys, out):
+    program = "blender --command ltsh"
+    code, stdout, _ = run(capsys, "--help", program=program)
     assert code == 0 and all(f"\n    {command} " in stdout for command in ("demo", "compare", "shade", "tables"))
-    assert "blender --command ltsh demo -o out/demo" in stdout
+    assert f"{program} demo -o out/demo" in stdout
+    assert run(capsys, "shade", "-o", out, program=program)[2].startswith(f"{program}: ")
+    assert run(capsys, "--version")[:2] == (0, f"ltsh {VERSION}\n")
 
 
-def test_every_shipped_table_is_a_technique():
-    assert techniques(",".join(shading.SHIPPED_TABLES)) == shading.SHIPPED_TABLES
+def test_some_of_many_names_are_listed_and_counted():
+    text = listed(repr(f"Chair {number}") for number in range(20))
+    assert text.startswith("'Chair 0', 'Chair 1', ") and text.count("'") == 2 * 8 and text.endswith(" and 12 more")
+    assert listed(iter(("A", "B"))) == "A, B" and listed(()) == "none"

@@ -3,8 +3,7 @@
 import json
 
 import pytest
-
-from ltsh_addon import cli
+from fake_scene import run
 
 
 @pytest.fixture
@@ -12,11 +11,6 @@ def folder(tmp_path):
     for name in ("room", "hall"):
         (tmp_path / f"{name}.blend").write_bytes(b"BLENDER")
     return tmp_path
-
-
-def run(capsys, *arguments):
-    code = cli.main([str(argument) for argument in arguments])
-    return code, *capsys.readouterr()
 
 
 def written(folder, text):
@@ -39,10 +33,7 @@ frames = [3, 1]
 
 [[job]]
 command = "compare"
-scenes = [
-    "room.blend",
-    "hall.blend",
-]
+scenes = ["room.blend", "hall.blend"]
 output = "out/compare"
 camera = ["A", "B"]
 techniques = "ltc,reference"
@@ -96,10 +87,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
         ("", ["night.toml: no job is there, expected at least one [[job]]"]),
         ("[[job]]\n", ["job 1: command is None, expected one of shade, compare, bake"]),
         ('\n[[job]]\ncommand = "render"\n', ["job 1: command is 'render'"]),
-        (
-            SHADE + "frams = 3\n",
-            ["job 1: option 'frams' is unknown here; expected some of", "frames", "scene"],
-        ),
+        (SHADE + "frams = 3\n", ["job 1: option 'frams' is unknown here; expected some of", "frames", "scene"]),
         (SHADE + 'frames = "1-"\n', ["job 1: frames: frame is '1-', expected a whole number"]),
         (SHADE + "frames = 1.5\n", ["job 1: frames: frame is '1.5'"]),
         (SHADE + "frames = true\n", ["job 1: frames is True, expected text, a number or a list"]),
@@ -107,10 +95,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
         (SHADE + 'resolution = "480"\n', ["job 1: resolution is '480', expected WIDTHxHEIGHT"]),
         (SHADE + "cycles-samples = 4\n", ["job 1: option 'cycles-samples' is unknown here"]),
         (SHADE + "resume = true\n", ["job 1: option 'resume' is unknown here; give it to `ltsh run`"]),
-        (
-            SHADE + "[defaults]\ntechnique = 1\n",
-            ["defaults: option 'technique' is unknown here", "techniques"],
-        ),
+        (SHADE + "[defaults]\ntechnique = 1\n", ["defaults: option 'technique' is unknown here", "techniques"]),
         (SHADE + '[defaults]\naa = "x"\n', ["defaults: aa: 'x' was given, expected a whole number"]),
         (SHADE + "[job2]\n", ["night.toml: table 'job2' is unknown here; expected defaults and job"]),
         (SHADE.replace("room.blend", "cellar.blend"), ["job 1:", "cellar.blend: no such file"]),
@@ -147,8 +132,3 @@ def test_all_mistakes_are_named_in_the_order_of_jobs(capsys, child, folder):
         ["job", "1:", "aa:"], ["job", "1:", "option"], ["job", "2:", "output"], ["job", "2:", "size"],
         ["defaults:", "margin", "is"], ["job", "3:", "output"], ["job", "3:", "size"],
     ]  # fmt: skip
-
-
-def test_a_missing_job_file_is_one_line(capsys, tmp_path):
-    code, _, stderr = run(capsys, "run", tmp_path / "night.toml")
-    assert code == 1 and len(stderr.splitlines()) == 1 and "expected a job file" in stderr

@@ -1,16 +1,14 @@
 """The Flamenco job type, run by a JavaScript engine against a stub of Flamenco's interface; its tasks are commands that
-our command line takes and whose results are those of a single run."""
+our command line takes. That shards merged are the single run: tests/pipeline/test_jobs.py."""
 
 import json
 import shutil
 import subprocess
 from pathlib import Path
 
-import fake_scene
 import pytest
-from kills import contents
 
-from ltsh_addon import cli
+from ltsh_addon.cli import commands as cli_commands
 
 ROOT = Path(__file__).resolve().parents[2]
 ENGINE = shutil.which("node") or shutil.which("qjs") or shutil.which("nodejs")
@@ -42,12 +40,14 @@ def commands(found):
     return arguments
 
 
-def test_settings_have_labels_and_descriptions(tmp_path):
+def test_settings_have_labels_and_descriptions_and_are_refused_where_they_make_no_sense(tmp_path):
     settings = compiled(tmp_path)["settings"]
     assert all(setting["label"] for setting in settings)
     assert all(setting["description"] for setting in settings if setting.get("visible") != "hidden")
     keys = [setting["key"] for setting in settings]
     assert len(set(keys)) == len(keys) and {"blendfile", "output", "shards"} <= set(keys)
+    for name, found in (("shards", "0, expected 1 or more"), ("output", "empty"), ("blendfile", "empty")):
+        assert f"{name} is {found}" in compiled(tmp_path, **{name: 0 if name == "shards" else ""})["error"]
 
 
 @pytest.mark.parametrize("count", [1, 4, 17])
@@ -67,45 +67,21 @@ BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, {"techniques": ("ltsh4",), "passes": ("specular", "diffuse"), "object": None, "frames": ()}),
-        (BAKE, {"object": ["Floor", "Big Wall"], "size": (256, 256), "error": True, "apply": True,
+        ({}, {"techniques": ("ltsh4",), "passes": ("specular", "diffuse"), "objects": "all", "frames": ()}),
+        (BAKE, {"objects": ("Floor", "Big Wall"), "size": (256, 256), "error": True, "apply": True,
                 "cycles_samples": 64, "frames": (-3,)}),
         ({"passes": "diffuse_light,combined"}, {"passes": ("diffuse_light", "combined"), "error": False}),
         ({"command": "compare", "frames": "-2-1", "cycles_samples": 32, "arguments": " --aa 4  --camera Left"},
-         {"frames": (-2, -1, 0, 1), "cycles_samples": 32, "aa": 4, "camera": ["Left"]}),
+         {"frames": (-2, -1, 0, 1), "cycles_samples": 32, "sub_samples": 4, "cameras": ("Left",)}),
         ({"command": "shade", "techniques": "ltc,ltsh2", "arguments": "--resolution=96x54", "frames": ""},
          {"techniques": ("ltc", "ltsh2"), "resolution": (96, 54), "frames": ()}),
     ],
 )  # fmt: skip
 def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expected):
-    for number, arguments in enumerate(commands(compiled(tmp_path, shards=2, **settings))[:-1], 1):
-        parsed = vars(cli._parser("ltsh")[0].parse_args(arguments))
-        assert parsed["command"] == settings.get("command", "bake") and parsed["scenes"] == [SCENE]
-        assert parsed["shard"] == (number, 2) and parsed["output"] == Path("/shared/out")
-        assert {name: parsed[name] for name in expected} == expected
-
-
-@pytest.mark.parametrize(
-    ("settings", "complaint"),
-    [({"shards": 0}, "shards is 0, expected 1 or more"), ({"output": ""}, "output is empty"),
-     ({"blendfile": ""}, "blendfile is empty")],
-)  # fmt: skip
-def test_settings_that_make_no_sense_are_refused(tmp_path, settings, complaint):
-    assert complaint in compiled(tmp_path, **settings)["error"]
-
-
-def test_all_tasks_together_are_the_single_run_byte_for_byte(tmp_path, monkeypatch, capsys):
-    """Done in the order that dependencies allow, one of them twice, without Blender."""
-    fake_scene.FakeChild().install(monkeypatch)
-    room, out = tmp_path / "room.blend", tmp_path / "out"
-    room.write_bytes(b"BLENDER")
-    found = compiled(
-        tmp_path, command="compare", blendfile=str(room), output=str(out), frames="1-5", techniques="ltc",
-        passes="diffuse", cycles_samples=4, shards=3,
-    )  # fmt: skip
-    *shards, last = commands(found)
-    for arguments in (shards[2], shards[0], shards[1], shards[0], last):
-        assert cli.main([*arguments, "--quiet"]) == 0
-    single = ["compare", str(room), "-o", str(tmp_path / "one"), "--frames", "1-5", "--techniques", "ltc"]
-    assert cli.main([*single, "--passes", "diffuse", "--cycles-samples", "4", "--quiet"]) == 0
-    assert contents(out) == contents(tmp_path / "one") and len(contents(out)) > 10
+    for number, (command, *arguments) in enumerate(commands(compiled(tmp_path, shards=2, **settings))[:-1], 1):
+        given = cli_commands.job_parsers()[command].parse_args(arguments)
+        job = cli_commands.job_of(given, given.scenes)
+        assert command == settings.get("command", "bake") and job.scenes == [SCENE]
+        assert given.shard == (number, 2) and job.options.output == Path("/shared/out")
+        found = {**vars(job.options), "frames": job.frames, "cameras": job.cameras}
+        assert {name: found[name] for name in expected} == expected

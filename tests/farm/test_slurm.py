@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import slurm_cluster
+from kills import contents
 
 ROOT = Path(__file__).resolve().parents[2]
 FARM = ROOT / "farm"
@@ -25,21 +26,25 @@ def script(name, *arguments, **environment):
     )  # fmt: skip
 
 
+def program(path, text):
+    path.write_text(text)
+    path.chmod(0o755)
+    return path
+
+
 ARRAY = {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_MAX": "4",
          "SLURM_ARRAY_TASK_COUNT": "4"}  # fmt: skip
 ONE = {**ARRAY, "SLURM_ARRAY_TASK_MIN": "3", "SLURM_ARRAY_TASK_MAX": "3", "SLURM_ARRAY_TASK_COUNT": "1"}
 
 
-@pytest.mark.parametrize("environment", [ARRAY, {**ONE, "LTSH_SHARDS": "4"}])
-def test_a_task_of_an_array_is_a_shard(environment):
+@pytest.mark.parametrize(
+    ("environment", "complaint"),
+    [(ARRAY, ""), ({**ONE, "LTSH_SHARDS": "4"}, ""), ({}, "is no task of an array"), (ONE, "LTSH_SHARDS")],
+)
+def test_a_task_of_an_array_is_a_shard_where_their_number_is_known(environment, complaint):
     done = script("slurm_bake.sh", "bake", "a b.blend", "-o", "out", LTSH="printf %s|", **environment)
-    assert (done.returncode, done.stdout) == (0, "bake|a b.blend|-o|out|--shard|3/4|--resume|")
-
-
-@pytest.mark.parametrize(("environment", "complaint"), [({}, "is no task of an array"), (ONE, "LTSH_SHARDS")])
-def test_without_a_number_of_shards_there_is_no_task(environment, complaint):
-    done = script("slurm_bake.sh", "bake", "a.blend", "-o", "out", LTSH="echo", **environment)
-    assert (done.returncode, done.stdout) == (2, "") and complaint in done.stderr
+    expected = (2, "") if complaint else (0, "bake|a b.blend|-o|out|--shard|3/4|--resume|")
+    assert (done.returncode, done.stdout) == expected and complaint in done.stderr
 
 
 @pytest.mark.parametrize(("code", "restarts", "requeued"), [
@@ -47,8 +52,7 @@ def test_without_a_number_of_shards_there_is_no_task(environment, complaint):
 ])  # fmt: skip
 def test_a_failed_task_goes_back_into_the_queue_but_for_wrong_arguments(tmp_path, code, restarts, requeued):
     for name, text in (("ltsh", f"exit {code}"), ("scontrol", f'echo "$@" >{tmp_path}/called'), ("sleep", "")):
-        (tmp_path / name).write_text(f"#!/bin/bash\n{text}\n")
-        (tmp_path / name).chmod(0o755)
+        program(tmp_path / name, f"#!/bin/bash\n{text}\n")
     path = f"{tmp_path}:{os.environ['PATH']}"
     environment = {**ARRAY, "SLURM_JOB_ID": "77", "SLURM_RESTART_COUNT": str(restarts), "PATH": path, "LTSH": "ltsh"}
     assert script("slurm_bake.sh", "bake", "a.blend", **environment).returncode == code
@@ -87,9 +91,8 @@ OBJECTS += [f"cabinet left {number} plastic screen" for number in (1, 2, 3, 4)]
 )
 def test_an_array_and_a_merge_that_waits_for_it_are_submitted(tmp_path, arguments, logs, merged):
     (tmp_path / "night.toml").write_text("")
-    sbatch = tmp_path / "sbatch"
-    sbatch.write_text(f'#!/bin/bash\necho "${{LTSH_SHARDS:-}}" "${{@@Q}}" >>{tmp_path}/called\necho "7$#;farm"\n')
-    sbatch.chmod(0o755)
+    answer = 'echo "7$#;farm"\n'
+    program(tmp_path / "sbatch", f'#!/bin/bash\necho "${{LTSH_SHARDS:-}}" "${{@@Q}}" >>{tmp_path}/called\n{answer}')
     *arguments, logs, merged = (text.format(out=tmp_path) for text in (*arguments, logs, merged))
     path = f"{tmp_path}:{os.environ['PATH']}"
     done = script("slurm_submit.sh", 3, *arguments, PATH=path, SBATCH_OPTIONS="--partition=night --mem=8G")
@@ -127,9 +130,7 @@ def test_an_array_with_failing_tasks_is_the_single_run_byte_for_byte():
         scene = folder / "one" / "demo.blend"
         quick = ["--resolution", "16x9", "--techniques", "ltc", "--cycles-samples", "2", "--quiet"]
         subprocess.run([*LTSH, "demo", "-o", scene.parent, *quick], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
-        ltsh = folder / "ltsh"
-        ltsh.write_text(FAILS_AT_FIRST.format(folder=folder, ltsh=" ".join(LTSH)))
-        ltsh.chmod(0o755)
+        ltsh = program(folder / "ltsh", FAILS_AT_FIRST.format(folder=folder, ltsh=" ".join(LTSH)))
         wanted = ["bake", scene, "--size", "64", "--margin", "2", *(f"--object={name}" for name in OBJECTS)]
         (folder / "slurm").mkdir()
         with slurm_cluster.cluster(folder / "slurm") as farm:
@@ -145,13 +146,8 @@ def test_an_array_with_failing_tasks_is_the_single_run_byte_for_byte():
         assert [states[f"{array}_{number}"][2] for number in (1, 2, 3, 4)] == [0, 1, 1, 0], said
         assert "exit code 1, back into the queue" in said and "exit code 137, back into the queue" in said
         subprocess.run([*LTSH, *wanted, "-o", folder / "single", "--quiet"], cwd=ROOT, check=True)
+        for path in (folder / "four").glob("slurm_*"):
+            path.unlink()
         single, merged = contents(folder / "single"), contents(folder / "four")
         assert merged == single and sum(name.endswith(".exr") for name in single) == len(OBJECTS)
         print(f"{len(single)} files of {sum(map(len, single.values()))} bytes are those of the single run")
-
-
-def contents(folder):
-    """Bytes by name of all files below `folder` but for times and what Slurm writes."""
-    files = (path for path in folder.rglob("*") if path.is_file())
-    found = {str(path.relative_to(folder)): path.read_bytes() for path in files}
-    return {name: data for name, data in found.items() if "timing" not in name and not name.startswith("slurm_")}

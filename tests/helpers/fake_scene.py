@@ -6,6 +6,8 @@ import numpy as np
 
 from ltsh_addon import cli, shading
 from ltsh_addon.blender.process import client
+from ltsh_addon.pipeline import PictureOptions
+from ltsh_addon.pipeline.tasks import Job
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
@@ -15,7 +17,8 @@ WARNING = "material 'Glass': transmission is not shaded"
 
 
 def run(capsys, *arguments, **options):
-    """Exit code, stdout and stderr of a command line."""
+    """Exit code, stdout and stderr of a command line; bpy tells on stdout that a test saved a scene before."""
+    capsys.readouterr()
     code = cli.main([str(argument) for argument in arguments], **options)
     return code, *capsys.readouterr()
 
@@ -110,3 +113,9 @@ class FakeChild:
             camera=options.camera or "Camera",
             seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
         )
+
+
+def small_job(room, output, command="shade", **changes) -> Job:
+    """A job of one technique and one pass."""
+    options = PictureOptions(room, output, techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
+    return Job(command, options, **{"scenes": (room,), **changes})

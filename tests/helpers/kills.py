@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +114,24 @@ def is_running(pid):
         return False
     status = Path(f"/proc/{pid}/stat")
     return not status.is_file() or status.read_text().rpartition(")")[2].split()[0] != "Z"
+
+
+def children(process: int) -> list[int]:
+    """Ids of the children of all threads of a process; needs Linux."""
+    threads = Path(f"/proc/{process}/task").iterdir()
+    return [int(word) for thread in threads for word in (thread / "children").read_text().split()]
+
+
+def small_disk(folder: Path, size: str) -> Iterator[Path]:
+    """What a fixture needs that mounts a disk of this size as `folder`; skips where this user may not."""
+    import pytest
+
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", folder]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only root may mount a small disk")
+    yield folder
+    subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 def is_blenders_own(path: Path) -> bool:

@@ -1,5 +1,7 @@
 """Surface samples and area lights for the tests of shading."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from ltsh_addon.scene import AreaLight, SurfaceSamples
@@ -74,17 +76,12 @@ def moved(samples, lights, rotation=None, shift=(0.0, 0.0, 0.0)):
     fields.update({name: fields[name] @ rotation.T for name in vectors})
     fields["position"] = samples.position @ rotation.T + np.asarray(shift)
     turned = [
-        AreaLight(
-            light.name,
-            light.shape,
-            rotation @ light.center + np.asarray(shift),
-            rotation @ light.half_u,
-            rotation @ light.half_v,
-            rotation @ light.direction,
-            light.radiance,
-            light.group,
-            light.affects_diffuse,
-            light.affects_specular,
+        replace(
+            light,
+            center=rotation @ light.center + np.asarray(shift),
+            half_u=rotation @ light.half_u,
+            half_v=rotation @ light.half_v,
+            direction=rotation @ light.direction,
         )
         for light in lights
     ]

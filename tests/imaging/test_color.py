@@ -23,11 +23,8 @@ def test_the_matrix_of_rec2020_is_the_published_one():
     matrix = color.matrix_to_rec709(color.CHROMATICITIES["Linear Rec.2020"])
     assert np.abs(matrix - REC2020_TO_REC709).max() < 1e-4
     assert np.allclose(color.matrix_to_rec709(color.CHROMATICITIES["Linear Rec.709"]), np.eye(3))
-
-
-def test_luminance_is_the_second_row():
-    weights = color.rgb_to_xyz(color.CHROMATICITIES["Linear Rec.709"])[1]
-    assert np.abs(weights - [0.2126, 0.7152, 0.0722]).max() < 1e-4
+    luminance = color.rgb_to_xyz(color.CHROMATICITIES["Linear Rec.709"])[1]
+    assert np.abs(luminance - [0.2126, 0.7152, 0.0722]).max() < 1e-4
 
 
 def test_a_space_without_a_known_name_has_the_chromaticities_of_its_matrix():
@@ -43,9 +40,6 @@ def test_colors_are_column_vectors():
     image[1, 2] = (0.0, 1.0, 0.0)
     assert np.allclose(space.rec709(image)[1, 2], [-0.5876, 1.1329, -0.1006])
     assert np.array_equal(REC709.rec709(image), image)
-
-
-def test_a_matrix_of_another_shape_is_refused():
     with pytest.raises(ValueError, match="color space 'odd'"):
         ColorSpace("odd", np.eye(4))
 
@@ -61,15 +55,13 @@ def gray(value):
     return np.full((1, 1, 3), value)
 
 
-def test_zero_is_nearly_white_and_neutral():
-    color = signed_error_colors(gray(0.0), 1.0)[0, 0]
-    assert color.min() > 0.95 and np.ptp(color) < 0.01
-
-
-def test_too_bright_is_red_and_too_dark_is_blue():
-    red, blue = signed_error_colors(gray(0.6), 1.0)[0, 0], signed_error_colors(gray(-0.6), 1.0)[0, 0]
+def test_zero_is_nearly_white_too_bright_is_red_and_too_dark_is_blue_up_to_the_scale():
+    white, red, blue = (signed_error_colors(gray(value), 1.0)[0, 0] for value in (0.0, 0.6, -0.6))
+    assert white.min() > 0.95 and np.ptp(white) < 0.01
     assert red[0] > red[1] + 0.3 and red[0] > red[2] + 0.3
     assert blue[2] > blue[0] + 0.3 and blue[2] > blue[1] + 0.1
+    for sign in (1.0, -1.0):
+        assert np.array_equal(signed_error_colors(gray(7.0 * sign), 2.0), signed_error_colors(gray(2.0 * sign), 2.0))
 
 
 def test_equal_errors_of_either_sign_are_equally_dark():
@@ -77,11 +69,6 @@ def test_equal_errors_of_either_sign_are_equally_dark():
     bright, dark = (lightness(signed_error_colors(sign * errors[None], 1.0))[0] for sign in (1.0, -1.0))
     assert np.abs(bright - dark).max() < 8.0  # L*; a difference of 10 is plainly seen, 2 hardly
     assert (np.diff(bright) < 0.0).all() and (np.diff(dark) < 0.0).all()
-
-
-def test_beyond_the_scale_colors_saturate():
-    assert np.array_equal(signed_error_colors(gray(7.0), 2.0), signed_error_colors(gray(2.0), 2.0))
-    assert np.array_equal(signed_error_colors(gray(-7.0), 2.0), signed_error_colors(gray(-2.0), 2.0))
 
 
 def test_not_finite_has_a_color_of_its_own():

@@ -7,7 +7,7 @@ from ltsh_addon.imaging.margin import nearest_covered
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.02, 0.4, 1.0])
-@pytest.mark.parametrize("margin", [1, 5, 12])
+@pytest.mark.parametrize("margin", [0, 1, 5, 12])
 def test_every_texel_within_the_margin_gets_the_nearest_covered_one(share, margin):
     coverage = np.random.default_rng(3).random((37, 53)) < share
     covered = np.argwhere(coverage)
@@ -24,10 +24,3 @@ def test_every_texel_within_the_margin_gets_the_nearest_covered_one(share, margi
     expected = np.full(coverage.size, -1)
     expected[np.ravel_multi_index(empty.T, coverage.shape)] = distance
     assert np.array_equal(found, expected[target])
-
-
-def test_no_margin_fills_nothing():
-    coverage = np.zeros((4, 4), bool)
-    coverage[1, 1] = True
-    target, source = nearest_covered(coverage, 0)
-    assert len(target) == len(source) == 0

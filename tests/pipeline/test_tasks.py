@@ -1,39 +1,27 @@
 """Which tasks a job has, without Blender: frames, names of files, shards."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 from fake_scene import run
+from fake_scene import small_job as job
 
 from ltsh_addon.pipeline import PictureOptions, tasks
-from ltsh_addon.pipeline import options as options_module
-from ltsh_addon.pipeline import tasks as tasks_module
-from ltsh_addon.pipeline.tasks import Job, shard_of, tasks_of
+from ltsh_addon.pipeline.options import frames
+from ltsh_addon.pipeline.tasks import shard_of, tasks_of
 
 SMALL = ["--techniques", "ltc", "--passes", "diffuse", "--quiet"]
-
-
-def job(room, output, command="shade", **changes):
-    options = PictureOptions(room, Path(output), techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
-    return Job(command, options, **{"scenes": (room,), **changes})
 
 
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("7", (7,)),
-        ("-3", (-3,)),
-        ("1-4", (1, 2, 3, 4)),
-        ("1-9:3,300", (1, 4, 7, 300)),
-        ("-2-1", (-2, -1, 0, 1)),
-        ("-4--2", (-4, -3, -2)),
-        ("3,1,2-3", (3, 1, 2)),
-        ("5-5", (5,)),
+        *(("7", (7,)), ("-3", (-3,)), ("1-4", (1, 2, 3, 4)), ("5-5", (5,)), ("3,1,2-3", (3, 1, 2))),
+        *(("1-9:3,300", (1, 4, 7, 300)), ("-2-1", (-2, -1, 0, 1)), ("-4--2", (-4, -3, -2))),
     ],
 )
 def test_frames_are_ranges_and_single_ones_each_once(text, expected):
-    assert options_module.frames(text) == expected
+    assert frames(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -58,7 +46,7 @@ def test_wrong_values_are_misuse(capsys, child, room, tmp_path, option, text, co
 
 def test_stems_differ_in_any_case_and_hold_no_separators():
     names = ["Floor", "floor", "a/b", "a:b", "../../x", "", "Bücher", "x" * 300, "x" * 301]
-    stems = tasks_module.file_stems(names)
+    stems = tasks.file_stems(names)
     assert len({stem.casefold() for stem in stems}) == len(names) and stems[0] == "Floor" and stems[6] == "Bücher"
     assert not [stem for stem in stems if set(stem) & set("/\\:.") or not stem.strip() or len(stem) > 110]
 
@@ -80,9 +68,8 @@ def test_names_have_what_there_is_several_of(room, tmp_path, changes, expected):
 
 
 def test_scenes_of_one_name_get_different_names(room, tmp_path):
-    other = tmp_path / "other" / "room.blend"
-    other.parent.mkdir()
-    shutil.copy(room, other)
+    (tmp_path / "other").mkdir()
+    other = shutil.copy(room, tmp_path / "other")
     assert [task.name for task in tasks_of(job(room, tmp_path, scenes=(room, other)))] == ["shade_room", "shade_room_2"]
 
 

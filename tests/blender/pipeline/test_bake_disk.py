@@ -1,6 +1,5 @@
 """Bakes on disks that are full or cannot be written: one line, nothing half written, and the rest is baked."""
 
-import os
 import subprocess
 import sys
 
@@ -44,18 +43,7 @@ def bake(scene, output, *more):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A disk of 600 KiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=600k", "none", str(folder)]
-    if (
-        not hasattr(os, "geteuid")
-        or os.geteuid()
-        or subprocess.run(command, capture_output=True, check=False).returncode
-    ):
-        pytest.skip("only root may mount a small disk")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+    yield from kills.small_disk(tmp_path / "disk", "600k")
 
 
 @with_limit
@@ -122,16 +110,14 @@ def test_a_full_disk_for_temporary_files_is_one_line(small_disk, tmp_path, capfd
     assert list(small_disk.iterdir()) == [] and list((tmp_path / "out").rglob("*")) == []
 
 
-def test_a_folder_that_cannot_be_written_is_named_before_anything_starts(scene, small_disk, capsys, monkeypatch):
-    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
-    monkeypatch.setattr(
-        "ltsh_addon.blender.process.blender_process.start", lambda *_: pytest.fail("Blender was started")
-    )
-    assert cli.main(["bake", str(scene), "-o", str(small_disk / "out"), "--quiet"]) == 1
-    expected = (
-        f"ltsh: output folder {small_disk}/out: cannot be written (Read-only file system); choose another with -o\n"
-    )
-    assert capsys.readouterr().err == expected
+@pytest.mark.parametrize("command", ["shade", "compare", "bake"])
+def test_a_read_only_disk_is_named_before_anything_starts(scene, small_disk, capsys, monkeypatch, command):
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    start = "ltsh_addon.blender.process.blender_process.start"
+    monkeypatch.setattr(start, lambda *_: pytest.fail("Blender was started"))
+    assert cli.main([command, str(scene), "-o", str(small_disk / "out"), "--quiet"]) == 1
+    expected = f"output folder {small_disk}/out: cannot be written (Read-only file system); choose another with -o"
+    assert capsys.readouterr().err == f"ltsh: {expected}\n"
 
 
 def test_a_texture_whose_name_is_taken_by_a_folder_does_not_keep_others_from_being_baked(scene, tmp_path, capsys):

@@ -11,6 +11,7 @@ import hostile_scenes
 import numpy as np
 import pytest
 import scene_parts
+from fake_scene import run
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.extract import pixels
@@ -65,16 +66,6 @@ OPTIONS = {
 }
 
 
-@pytest.fixture
-def run(capsys):
-    def command(*arguments):
-        capsys.readouterr()  # bpy tells on stdout that it saved a scene
-        code = cli.main([str(argument) for argument in arguments])
-        return code, *capsys.readouterr()
-
-    return command
-
-
 def saved(name: str, folder: Path, *arguments) -> Path:
     """A scene of hostile_scenes as a file."""
     (hostile_scenes.SCENES.get(name) or getattr(hostile_scenes, name))(*arguments)
@@ -82,11 +73,11 @@ def saved(name: str, folder: Path, *arguments) -> Path:
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_hostile_scene(run, tmp_path, case):
+def test_a_hostile_scene(capsys, tmp_path, case):
     scene, command, expected, complaint = CASES[case]
     path, out = saved(scene, tmp_path), tmp_path / "a" / "b"
     before = path.read_bytes()
-    code, stdout, stderr = run(command, path, "-o", out, "--quiet", *OPTIONS[command])
+    code, stdout, stderr = run(capsys, command, path, "-o", out, "--quiet", *OPTIONS[command])
     assert code == expected and re.search(complaint, stderr) and "Traceback" not in stderr, stderr
     assert bool(stderr) == bool(complaint) and stdout.isprintable() == ("\n" not in stdout), stderr
     assert path.read_bytes() == before and {item.name for item in tmp_path.iterdir()} == {"scene.blend", "a"}
@@ -109,7 +100,7 @@ PACKING = {"plain": bytes, "gzip": gzip.compress, "Zstandard": zstandard_packed}
 
 @pytest.mark.parametrize("packing", PACKING)
 @pytest.mark.parametrize("share", [1.0, 0.5, 40])
-def test_a_scene_is_opened_however_it_is_packed_and_refused_where_it_is_cut(run, tmp_path, packing, share):
+def test_a_scene_is_opened_however_it_is_packed_and_refused_where_it_is_cut(capsys, tmp_path, packing, share):
     """All of it, half of it, or its first bytes."""
     hostile_scenes.plain()
     path, out = tmp_path / "scene.blend", tmp_path / "out"
@@ -117,7 +108,7 @@ def test_a_scene_is_opened_however_it_is_packed_and_refused_where_it_is_cut(run,
     whole = PACKING[packing](path.read_bytes())
     cut = whole[: int(share if share > 1 else share * len(whole))]
     path.write_bytes(cut)
-    code, _, stderr = run("shade", path, "-o", out, "--quiet", *OPTIONS["shade"])
+    code, _, stderr = run(capsys, "shade", path, "-o", out, "--quiet", *OPTIONS["shade"])
     if cut == whole:
         assert (code, stderr) == (0, "") and (out / "shade.exr").is_file()
         return
@@ -141,11 +132,11 @@ def test_a_newer_file_is_refused_also_where_its_header_cannot_be_read_before(tmp
         pixels.open_scene(path, [])
 
 
-def test_many_lights_add_up(run, tmp_path):
+def test_many_lights_add_up(capsys, tmp_path):
     """The sum over small lights in closed form: each sends P / (pi d^2) (h / d)^2 to a point of the plane below, which
     reflects 1 / pi of it. 1 % leaves room for their size, 0.02 m at 1.5 m, and for what the specular lobe takes off."""
     path, out = saved("many_lights", tmp_path, MANY), tmp_path / "out"
-    code, _, stderr = run("shade", path, "-o", out, "--techniques", "ltsh4", "--passes", "diffuse", "--quiet")
+    code, _, stderr = run(capsys, "shade", path, "-o", out, "--techniques", "ltsh4", "--passes", "diffuse", "--quiet")
     assert (code, stderr) == (0, "")
     layers = imaging.read_layers(out / "shade.exr")
     position, albedo = layers["samples.position"], layers["samples.diffuse_albedo"]

@@ -75,10 +75,7 @@ def run_command(path):
 OPERATIONS = {
     "shade": (lambda path: shade_scene(options(path)), None),
     "compare": (lambda path: compare_scene(options(path)), None),
-    "another frame, camera and size": (
-        lambda path: shade_scene(options(path, frame=9, camera="Camera", resolution=(20, 12))),
-        None,
-    ),
+    "another frame and size": (lambda path: shade_scene(options(path, frame=9, resolution=(20, 12))), None),
     "command line": (run_command, None),
     "cancelled while it samples": (lambda path: compare_scene(options(path), stop_at("samples")), Cancelled),
     "cancelled in Cycles": (lambda path: compare_scene(options(path), stop_at("Cycles B")), Cancelled),
@@ -101,7 +98,7 @@ def test_the_session_and_the_file_stay_as_they_are(tmp_path, capsys, name):
         with pytest.raises(error):
             operation(path)
     capsys.readouterr()
-    check_same(before, datablock_hash.session_state())
+    assert datablock_hash.session_state() == before
     assert (path.read_bytes(), path.stat().st_mtime_ns) == (content, time)
     assert {entry.name for entry in tmp_path.iterdir()} <= {path.name, "out", "demo.blend"}
 
@@ -111,31 +108,10 @@ def test_unsaved_changes_stay_in_the_session_and_out_of_the_result(tmp_path):
     bpy.data.objects["Key"].data.energy = 1234.0
     before = datablock_hash.session_state()
     report = shade_scene(options(path))
-    check_same(before, datablock_hash.session_state())
+    assert datablock_hash.session_state() == before
     scale = bpy.data.objects["Key"].data.energy / 100.0
     saved = shade_scene(options(path))["lights"][0]["radiance"]
     assert report["lights"][0]["radiance"] == saved and scale > 10.0
-
-
-def check_same(before, after):
-    changed = {
-        name
-        for name in before["blocks"].keys() | after["blocks"].keys()
-        if before["blocks"].get(name) != after["blocks"].get(name)
-    }
-    assert not changed, f"datablocks changed: {sorted(changed)}"
-    assert {**before, "blocks": None} == {**after, "blocks": None}
-
-
-# -- the fingerprints themselves --------------------------------------------------------------------------------------
-
-
-def test_looking_changes_nothing_and_opening_again_gives_the_same(tmp_path):
-    path = rich_file(tmp_path)
-    first = datablock_hash.session_state()
-    check_same(first, datablock_hash.session_state())
-    bpy.ops.wm.open_mainfile(filepath=str(path))
-    check_same(first, datablock_hash.session_state())
 
 
 def nodes(name):
@@ -145,16 +121,13 @@ def nodes(name):
 CHANGES = {
     "a vertex": lambda: setattr(bpy.data.objects["Ball"].data.vertices[3].co, "x", 5.0),
     "a custom property": lambda: bpy.data.objects["Ball"]["note"].update({"word": "other"}),
-    "a new custom property": lambda: bpy.context.scene.__setitem__("new", 1),
     "a modifier": lambda: setattr(bpy.data.objects["Ball"].modifiers[0], "width", 0.03),
-    "a modifier more": lambda: bpy.data.objects["Ball"].modifiers.new("More", "BEVEL"),
     "a vertex group": lambda: bpy.data.objects["Ball"].vertex_groups["Top"].add([2], 0.1, "REPLACE"),
     "a shape key": lambda: setattr(bpy.data.shape_keys[0].key_blocks[0].data[1].co, "z", 3.0),
     "a socket": lambda: nodes("Ball").nodes["Principled BSDF"].inputs["Roughness"].__setattr__("default_value", 0.41),
     "a link": lambda: nodes("Ball").links.remove(nodes("Ball").links[0]),
     "a node": lambda: nodes("Floor").nodes.new("ShaderNodeMath"),
     "a node's place": lambda: setattr(nodes("Floor").nodes[0], "location", (7.0, 8.0)),
-    "a node's name": lambda: setattr(nodes("Floor").nodes[0], "name", "Other"),
     "a material slot": lambda: bpy.data.objects["Catcher"].data.materials.append(None),
     "a keyframe": lambda: setattr(bpy.data.actions[0].layers[0].strips[0].channelbags[0].fcurves[0]
                                   .keyframe_points[0].co, "y", 9.0),
@@ -162,10 +135,8 @@ CHANGES = {
     "membership": lambda: bpy.data.collections["Props"].objects.unlink(bpy.data.objects["Ball"]),
     "an excluded collection": lambda: setattr(
         bpy.context.scene.view_layers["Second"].layer_collection.children["Props"], "exclude", True),
-    "a view layer": lambda: setattr(bpy.context.scene.view_layers["Second"], "use", False),
     "a pass": lambda: setattr(bpy.context.scene.view_layers["Second"], "use_pass_z", True),
     "a render setting": lambda: setattr(bpy.context.scene.render, "filepath", "/elsewhere"),
-    "an image setting": lambda: setattr(bpy.context.scene.render.image_settings, "compression", 3),
     "a Cycles setting": lambda: setattr(bpy.context.scene.cycles, "samples", 77),
     "a setting past its limits": lambda: _past_limits(bpy.context.scene.cycles),
     "the frame": lambda: setattr(bpy.context.scene, "frame_current", 2),
@@ -180,7 +151,6 @@ CHANGES = {
     "a picture": lambda: bpy.data.images["Painted"].pixels.__setitem__(9, 0.5),
     "a fake user": lambda: setattr(bpy.data.materials["Fake"], "use_fake_user", False),
     "a datablock more": lambda: bpy.data.materials.new("Another"),
-    "a datablock less": lambda: bpy.data.materials.remove(bpy.data.materials["Fake"]),
     "a name": lambda: setattr(bpy.data.objects["Ball"], "name", "Bowl"),
     "a scene more": lambda: bpy.data.scenes.new("Second scene"),
 }  # fmt: skip
@@ -192,8 +162,12 @@ def _past_limits(cycles):
     stored["filter_width"] = 1e-6
 
 
-def test_every_kind_of_change_shows(tmp_path):
+def test_every_kind_of_change_shows_and_opening_again_is_none(tmp_path):
     path = rich_file(tmp_path)
+    first = datablock_hash.session_state()
+    assert datablock_hash.session_state() == first
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    assert datablock_hash.session_state() == first
     unseen = []
     for name, change in CHANGES.items():
         bpy.ops.wm.open_mainfile(filepath=str(path))

@@ -47,10 +47,6 @@ def run(command):
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
 
 
-def run_python(*arguments):
-    return run([sys.executable, *map(str, arguments)])
-
-
 def job(room, output, cycles_samples=4, **changes):
     options = PictureOptions(room, output, techniques=("ltsh4",), cycles_samples=cycles_samples)
     return Job("compare", options, **{"scenes": (room,), **changes})
@@ -221,7 +217,7 @@ def test_json_is_alone_on_stdout_whatever_blender_prints():
         "print('before', flush=True)\nreserve_stdout()\n"
         "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
     )
-    done = run_python("-c", code)
+    done = run([sys.executable, "-c", code])
     assert done.stdout == "before\n{}\n" and done.stderr == "from C\nat the end\n"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import programs
 import pytest
 import scene_parts
-from kills import is_blenders_own
+from kills import children, is_blenders_own
 
 ROOT = Path(__file__).resolve().parents[3]
 LINES = {signal.SIGINT: "ltsh: interrupted", signal.SIGTERM: "ltsh: terminated"}
@@ -42,11 +42,6 @@ class Running:
                 return
         raise AssertionError(f"{stage} did not come, code {self.process.wait()}")
 
-    def processes(self) -> list[int]:
-        """Ids of the children of all its threads."""
-        tasks = Path(f"/proc/{self.process.pid}/task").iterdir()
-        return [int(word) for task in tasks for word in (task / "children").read_text().split()]
-
     def close(self):
         self._watchdog.cancel()
         self.process.kill()
@@ -77,34 +72,30 @@ def shade(room, out):
 
 
 @pytest.mark.parametrize(
-    ("stage", "arguments", "number"), [("Cycles A", compare, signal.SIGTERM), ("Reference", shade, signal.SIGINT)]
+    ("stage", "arguments", "number"),
+    [
+        ("Cycles A", compare, signal.SIGTERM),
+        ("Reference", shade, signal.SIGINT),
+        ("Cycles A", compare, signal.SIGKILL),
+        ("Reference", shade, signal.SIGKILL),
+    ],
 )
-def test_signals_end_a_command_and_leave_nothing(room, tmp_path, temporary_root, stage, arguments, number):
-    out = tmp_path / "out"
+def test_signals_end_a_command_and_all_its_processes_and_leave_nothing(
+    room, tmp_path, temporary_root, stage, arguments, number
+):
+    """The children of a killed one see that the other end of a pipe is closed; Blender removes their folder."""
+    out, killed = tmp_path / "out", number == signal.SIGKILL
     running = Running(stage, *arguments(room, out))
     try:
         time.sleep(0.5)  # into the stage
-        children = running.processes()
+        others = children(running.process.pid)
         running.process.send_signal(number)
         running.process.send_signal(number)  # an impatient second one does not disturb
         stdout, stderr = running.process.communicate(timeout=SECONDS)
     finally:
         running.close()
-    assert running.process.returncode == 128 + number and programs.said_nothing(stdout)
-    assert stderr.splitlines()[-1] == LINES[number]
-    assert "Traceback" not in stderr and children and all(ends(child, 0.0) for child in children)
+    assert others and all(ends(child, 20.0 if killed else 0.0) for child in others)
     assert left_over(out) == left_over(temporary_root) == []
-
-
-def test_a_killed_command_takes_all_its_processes_along(room, tmp_path, temporary_root):
-    """They see that the other end of a pipe is closed: Blender, which removes their temporary folder, and workers."""
-    running = Running("Reference", *shade(room, tmp_path / "out"))
-    try:
-        time.sleep(0.5)
-        children = running.processes()
-        running.process.kill()
-        running.process.wait(SECONDS)
-    finally:
-        running.close()
-    assert children and all(ends(child, 20.0) for child in children)
-    assert left_over(tmp_path / "out") == left_over(temporary_root) == []
+    assert running.process.returncode == (-number if killed else 128 + number)
+    if not killed:
+        assert programs.said_nothing(stdout) and "Traceback" not in stderr and stderr.splitlines()[-1] == LINES[number]

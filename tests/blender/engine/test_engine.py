@@ -1,4 +1,8 @@
-"""The render engine LTSH in background: what it registers, its final renders, the preview button."""
+"""The render engine LTSH in background: what it registers and its final renders as Blender drives them."""
+
+import tempfile
+import threading
+import time
 
 import bpy
 import numpy as np
@@ -14,35 +18,69 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.scene import Border
+from ltsh_addon.scene import Border, Cancelled
+
+SIZE = (28, 18)
+# Both take the same samples; the pictures are float32.
+SAME = {"rtol": 1e-6, "atol": 1e-7}
 
 
-def add_content(scene):
-    """A glossy plane and a matte sphere under an area light, and the engine."""
+def lit_scene():
+    """A glossy plane and a matte sphere under an area light, rendered by LTSH into float EXRs; plane and sphere."""
     shiny, _ = parts.principled("Shiny", Base_Color=(0.6, 0.3, 0.1, 1.0), Roughness=0.3)
     matte, _ = parts.bsdf_material("ShaderNodeBsdfDiffuse", "Matte", Color=(0.2, 0.5, 0.8, 1.0))
     plane, sphere = parts.add_plane(shiny, size=2.0), parts.add_sphere(matte, location=(0.4, 0.5, 0.6))
     parts.add_area_light()
     parts.add_camera()
+    scene = bpy.context.scene
     scene.render.engine = "LTSH"
-    scene.ltsh_view.render_samples = 1
+    scene.ltsh_view.render_samples, scene.ltsh_view.technique = 1, "ltsh2"
+    settings = scene.render.image_settings
+    settings.file_format, settings.color_depth = "OPEN_EXR", "32"
     return plane, sphere
 
 
+@pytest.fixture
+def scene(addon):
+    addon.render.resolution_x, addon.render.resolution_y = SIZE
+    lit_scene()
+    return addon
+
+
+def picture(channels, name):
+    """The layer `name` (H, W, 3) of an EXR."""
+    return np.stack([channels[f"{name}{letter}"] for letter in "RGB"], axis=-1)
+
+
 def render(scene, path):
-    """Channels of the picture that rendering `scene` writes."""
+    """The picture (H, W, 3) that rendering `scene` writes."""
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    return picture(read_channels(path), "")
+
+
+def render_passes(scene, path):
+    """Channels of the multi-layer file that rendering `scene` writes."""
     settings = scene.render.image_settings
     if bpy.app.version >= (5, 0, 0):
         settings.media_type = "MULTI_LAYER_IMAGE"
-    settings.file_format, settings.color_depth, settings.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
+    settings.file_format, settings.exr_codec = "OPEN_EXR_MULTILAYER", "ZIP"
     scene.render.filepath = str(path)
     bpy.ops.render.render(write_still=True)
     return read_channels(path)
 
 
-def picture(channels, layer, name, letters="RGB"):
-    """Pass `name` of a view layer, (H, W, C)."""
-    return np.stack([channels[f"{layer}.{name}.{letter}"] for letter in letters], axis=-1)
+def extracted(tmp_path, **options):
+    """Samples and lights of a copy of the open file."""
+    path = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    return client.extract(client.ExtractOptions(scene=path, **options))
+
+
+def shaded(extraction, technique="ltsh2", passes=shading.PASSES):
+    """What shading the samples gives, (H, W, 3)."""
+    result = shading.shade(extraction.samples, extraction.lights, technique, passes=passes)
+    return extraction.exposure * extraction.film.image(result.combined)
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):
@@ -53,86 +91,115 @@ def test_settings_of_cycles_own_renders_stay_hidden(addon):
         *("RENDER_PT_color_management", "RENDER_PT_format", "VIEWLAYER_PT_layer", "DATA_PT_uv_texture"),
     )
     for name in shown:
-        panel = getattr(bpy.types, name)
-        assert "LTSH" in getattr(panel, "COMPAT_ENGINES", {"LTSH"}), name
+        assert "LTSH" in getattr(getattr(bpy.types, name), "COMPAT_ENGINES", {"LTSH"}), name
     for name in ("CYCLES_RENDER_PT_sampling", "CYCLES_RENDER_PT_light_paths", "CYCLES_RENDER_PT_performance"):
         assert "LTSH" not in getattr(bpy.types, name).COMPAT_ENGINES, name
 
 
-def test_final_render_is_the_picture_that_shade_makes(addon, tmp_path):
-    add_content(addon)
-    addon.ltsh_view.technique, addon.ltsh_view.technique_passes = "ltsh2", True
-    channels = render(addon, tmp_path / "final.exr")
-    copy = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(copy), copy=True)
-    extraction = client.extract(client.ExtractOptions(scene=copy))
+def test_final_render_is_the_picture_that_shade_makes(scene, tmp_path):
+    scene.ltsh_view.technique_passes = True
+    channels, extraction = render_passes(scene, tmp_path / "final.exr"), extracted(tmp_path)
     for prefix, technique in (("LTSH", "ltsh2"), ("LTC", "ltc"), ("LTSH 4", "ltsh4")):
         for name in shading.PASSES:
-            shaded = shading.shade(extraction.samples, extraction.lights, technique, passes=(name,))
-            expected = extraction.film.image(shaded.combined)
-            found = picture(channels, "ViewLayer", f"{prefix} {name.capitalize()}")
-            # Both take the same samples; the pictures are float32.
-            np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+            expected = shaded(extraction, technique, (name,))
+            found = picture(channels, f"ViewLayer.{prefix} {name.capitalize()}.")
+            np.testing.assert_allclose(found, expected, **SAME)
             assert expected.max() > 0.01
-    both = picture(channels, "ViewLayer", "LTSH Specular") + picture(channels, "ViewLayer", "LTSH Diffuse")
-    np.testing.assert_allclose(picture(channels, "ViewLayer", "Combined"), both, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), shaded(extraction), **SAME)
 
 
-def test_every_view_layer_has_its_own_picture(addon, tmp_path):
-    plane, sphere = add_content(addon)
+def test_every_view_layer_has_its_own_picture(scene, tmp_path):
+    sphere = bpy.data.objects["Sphere"]
     other = bpy.data.collections.new("Other")
-    addon.collection.children.link(other)
-    addon.collection.objects.unlink(sphere)
+    scene.collection.children.link(other)
+    scene.collection.objects.unlink(sphere)
     other.objects.link(sphere)
-    layer = addon.view_layers.new("Without sphere")
+    layer = scene.view_layers.new("Without sphere")
     layer.layer_collection.children["Other"].exclude = True
-    addon.render.film_transparent = True
-    channels = render(addon, tmp_path / "layers.exr")
+    scene.render.film_transparent = True
+    channels = render_passes(scene, tmp_path / "layers.exr")
     alpha = {name: channels[f"{name}.Combined.A"] for name in ("ViewLayer", "Without sphere")}
     assert set(np.unique(alpha["Without sphere"])) == {0.0, 1.0}
     # The sphere stands in part before the background.
     assert alpha["ViewLayer"].sum() > 1.1 * alpha["Without sphere"].sum()
     for name, hit in alpha.items():
-        light = picture(channels, name, "LTSH Specular").sum(axis=-1)
+        light = picture(channels, f"{name}.LTSH Specular.").sum(axis=-1)
         assert light[hit == 0.0].max() == 0.0 < light.max(), name
 
 
-def test_the_world_is_seen_behind_surfaces_alone(addon, tmp_path):
-    add_content(addon)
-    world = addon.world = bpy.data.worlds.new("World")
+def test_the_world_is_seen_behind_surfaces_alone(scene, tmp_path):
+    world = scene.world = bpy.data.worlds.new("World")
     if bpy.app.version < (5, 0, 0):
         world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.bl_idname == "ShaderNodeBackground")
     background.inputs["Color"].default_value = (0.1, 0.2, 0.4, 1.0)
     background.inputs["Strength"].default_value = 2.0
-    channels = render(addon, tmp_path / "world.exr")
-    combined = picture(channels, "ViewLayer", "Combined")
+    channels = render_passes(scene, tmp_path / "world.exr")
+    combined = picture(channels, "ViewLayer.Combined.")
     np.testing.assert_allclose(combined[0, 0], (0.2, 0.4, 0.8), rtol=1e-6)
     assert (channels["ViewLayer.Combined.A"] == 1.0).all()
-    seen = picture(channels, "ViewLayer", "LTSH Specular").sum(axis=-1) > 0.0
+    seen = picture(channels, "ViewLayer.LTSH Specular.").sum(axis=-1) > 0.0
     assert seen.any() and not np.isclose(combined[seen][:, 2], 0.8, rtol=1e-3).any()
 
 
-def test_what_surfaces_emit_is_in_the_picture_and_has_a_pass(addon, tmp_path):
-    plane, _ = add_content(addon)
-    addon.cycles.film_exposure = 2.0
-    inputs = plane.data.materials[0].node_tree.nodes["Principled BSDF"].inputs
+def test_what_surfaces_emit_is_in_the_picture_and_has_a_pass(scene, tmp_path):
+    scene.cycles.film_exposure = 2.0
+    inputs = bpy.data.materials["Shiny"].node_tree.nodes["Principled BSDF"].inputs
     inputs["Emission Color"].default_value, inputs["Emission Strength"].default_value = (0.1, 0.2, 0.3, 1.0), 0.5
-    channels = render(addon, tmp_path / "glow.exr")
-    passes = {name: picture(channels, "ViewLayer", f"LTSH {name}") for name in ("Specular", "Diffuse", "Emission")}
+    channels = render_passes(scene, tmp_path / "glow.exr")
+    passes = {name: picture(channels, f"ViewLayer.LTSH {name}.") for name in ("Specular", "Diffuse", "Emission")}
     shining = passes["Emission"].any(axis=-1)
     assert 0.1 < shining.mean() < 0.9
     np.testing.assert_allclose(passes["Emission"][shining], np.tile((0.1, 0.2, 0.3), (shining.sum(), 1)), rtol=1e-5)
-    np.testing.assert_allclose(picture(channels, "ViewLayer", "Combined"), sum(passes.values()), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), sum(passes.values()), rtol=1e-5, atol=1e-6)
 
 
-def test_a_scene_without_lights_fails_with_its_reason(addon, tmp_path):
-    parts.add_plane()
-    parts.add_camera()
-    addon.render.engine = "LTSH"
-    with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
-        render(addon, tmp_path / "dark.exr")
-    assert not render_module._copy
+def test_every_frame_of_an_animation_is_its_own_picture(scene, tmp_path):
+    for frame, x in ((1, -1.0), (2, 1.0)):
+        bpy.data.objects["Light"].location.x = x
+        bpy.data.objects["Light"].keyframe_insert("location", frame=frame)
+    scene.frame_start, scene.frame_end = 1, 2
+    scene.render.filepath = str(tmp_path / "frame_")
+    bpy.ops.render.render(animation=True)
+    pictures = [picture(read_channels(tmp_path / f"frame_000{frame}.exr"), "") for frame in (1, 2)]
+    for frame, found in enumerate(pictures, 1):
+        np.testing.assert_allclose(found, shaded(extracted(tmp_path, frame=frame)), **SAME)
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.01
+
+
+def test_the_compositor_has_the_passes(scene, tmp_path):
+    extraction = extracted(tmp_path)
+    if bpy.app.version >= (5, 0, 0):
+        tree = scene.compositing_node_group = bpy.data.node_groups.new("Compositing", "CompositorNodeTree")
+        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+        output = tree.nodes.new("NodeGroupOutput")
+    else:
+        scene.use_nodes = True
+        tree = scene.node_tree
+        tree.nodes.clear()
+        output = tree.nodes.new("CompositorNodeComposite")
+    layers = tree.nodes.new("CompositorNodeRLayers")
+    layers.scene = scene
+    tree.links.new(layers.outputs["LTSH Specular"], output.inputs[0])
+    found = render(scene, tmp_path / "composited.exr")
+    np.testing.assert_allclose(found, shaded(extraction, passes=("specular",)), **SAME)
+    assert found.max() > 0.01
+
+
+@pytest.mark.parametrize("cropped", [True, False])
+def test_the_render_region_is_a_part_of_the_whole_picture(scene, tmp_path, cropped):
+    whole = render(scene, tmp_path / "whole.exr")
+    settings = scene.render
+    settings.use_border, settings.use_crop_to_border = True, cropped
+    # Columns 7 to 21 and, counted from below, rows 3 to 12.
+    settings.border_min_x, settings.border_max_x = 0.25, 0.75
+    settings.border_min_y, settings.border_max_y = 3 / 18, 12 / 18
+    part = render(scene, tmp_path / "part.exr")
+    inside = np.s_[6:15, 7:21]
+    np.testing.assert_allclose(part if cropped else part[inside], whole[inside], rtol=1e-5, atol=1e-6)
+    if not cropped:
+        part[inside] = 0.0
+        assert (part == 0.0).all()
 
 
 def test_only_the_render_region_is_handed_to_blender():
@@ -144,26 +211,82 @@ def test_only_the_render_region_is_handed_to_blender():
     np.testing.assert_array_equal(flat.reshape(6, 10)[0], image[5, :, 0])
 
 
-@pytest.fixture
-def without_cycles():
-    """Cycles' add-on is off."""
-    parts.empty_scene()
+# ---- stopping and faults
+
+
+def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    asked, failures = [], []
+
+    def stop(stage, fraction):
+        asked.append(stage)
+        return False
+
+    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_progress", lambda self: stop)
+    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_fail", lambda self, error: failures.append(error))
+    bpy.ops.render.render()
+    assert asked and not failures
+    assert not render_module._copy
+    # The work ends, and with it its temporary folders, after the render.
+    end = time.monotonic() + 60
+    while any(tmp_path.glob("ltsh-*")) and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not any(tmp_path.glob("ltsh-*"))
+
+
+def test_progress_grows_to_the_end_and_can_stop(scene, tmp_path):
+    path, stages = parts.save(tmp_path / "scene.blend"), []
+    job = render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", ("ltc", "ltsh4"))
+    render_module.final_picture(job, path, lambda stage, fraction: stages.append((fraction, stage)))
+    fractions = [fraction for fraction, _ in stages]
+    assert fractions == sorted(fractions) and fractions[0] >= 0.0 and 0.9 < fractions[-1] <= 1.0
+    assert {"LTC", "LTSH 2", "LTSH 4"} <= {stage for _, stage in stages}
+    with pytest.raises(Cancelled):
+        render_module.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
+
+
+def test_work_that_never_asks_is_left_at_once():
+    begun, go_on, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def work(report):
+        report("waiting", 0.5)
+        begun.set()
+        go_on.wait(60)
+        if report("later", 0.6) is False:
+            ended.set()
+
+    with pytest.raises(Cancelled, match="cancelled at waiting"):
+        render_module.stoppable(work, lambda stage, fraction: not begun.is_set())
+    assert not ended.is_set()
+    go_on.set()
+    # At its next report the work learns that nobody waits.
+    assert ended.wait(60)
+
+
+def test_faults_fail_the_render_with_their_reason(scene, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(render_module, "final_picture", lambda *_: 1 / 0)
+        with pytest.raises(RuntimeError, match="LTSH: ZeroDivisionError: division by zero"):
+            bpy.ops.render.render()
+    assert bpy.ops.render.render() == {"FINISHED"}
+    bpy.data.objects.remove(bpy.data.objects["Light"])
+    with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
+        bpy.ops.render.render()
+    assert not render_module._copy
+
+
+def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(tmp_path):
+    scene = parts.empty_scene()
     bpy.ops.preferences.addon_disable(module="cycles")
-    yield bpy.context.scene
-    bpy.ops.preferences.addon_enable(module="cycles")
-
-
-def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(without_cycles, tmp_path):
-    assert not hasattr(without_cycles, "cycles")
     ltsh_addon.register()
     try:
-        plane, _ = add_content(without_cycles)
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        lights, notes = view_lights(depsgraph, lambda instance: True, ShownTextures())
+        assert not hasattr(scene, "cycles")
+        plane, _ = lit_scene()
+        lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
         assert len(lights) == 1 and not notes
         assert looks.look_of(plane.active_material).corrected
-        assert view._shown(without_cycles, "single", None, 1.0).exposure == 1.0
-        channels = render(without_cycles, tmp_path / "final.exr")
-        assert picture(channels, "ViewLayer", "LTSH Specular").max() > 0.01
+        assert view._shown(scene, "single", None, 1.0).exposure == 1.0
+        assert render(scene, tmp_path / "final.exr").max() > 0.01
     finally:
         ltsh_addon.unregister()
+        bpy.ops.preferences.addon_enable(module="cycles")

@@ -14,6 +14,7 @@ from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.imaging.report import write_index
 
 SIZE = parts.SIZE
+PIXELS = np.random.default_rng(3).random((SIZE[1], SIZE[0], 3)).astype(np.float32)
 
 
 def projection_of(camera, size):
@@ -22,41 +23,14 @@ def projection_of(camera, size):
     return np.array(matrix @ camera.matrix_world.inverted())
 
 
-def context_of(scene, size=SIZE, perspective="CAMERA"):
-    """What a 3D view of `size` pixels would say."""
-    return SimpleNamespace(
-        space_data=SimpleNamespace(use_local_camera=False, camera=None),
-        region_data=SimpleNamespace(view_perspective=perspective),
-        region=SimpleNamespace(width=size[0], height=size[1]),
-    )
-
-
-def write_comparison(folder, pixels, **report):
-    """Results as `compare` leaves them, with one Cycles picture (H, W, 3)."""
-    height, width = pixels.shape[:2]
-    folder.mkdir(parents=True, exist_ok=True)
-    write_channels(folder / "cycles.combined.exr", {letter: pixels[..., i] for i, letter in enumerate("RGB")})
-    facts = {"camera": "Camera", "frame": 1, "resolution": [width, height], "pixel_aspect": 1.0, "border": None}
-    group = {"files": {"cycles.combined": "cycles.combined.exr"}, "multilayer": "compare.exr", "names": ["cycles"],
-             "labels": {"cycles": "Cycles"}, "passes": ["combined"], "scales": {"combined": 1.0}}  # fmt: skip
-    whole = {"command": "compare", "partial": "", "groups": {"": group}, "report": {**facts, "exposure": 1.0, **report}}
-    write_index(folder, whole)
-
-
-def test_a_picture_over_its_own_pixels_is_unchanged():
-    image = np.random.default_rng(1).random((5, 7, 3))
-    found = averaged(image, (0.0, 0.0, 7.0, 5.0), (7, 5))
-    np.testing.assert_allclose(found[::-1, :, :3], image, rtol=1e-12)
-    assert (found[..., 3] == 1.0).all()
-
-
 def test_smaller_pictures_are_means_over_areas_and_larger_ones_repeat():
     image = np.random.default_rng(2).random((6, 8, 3))
-    smaller = averaged(image, (0.0, 0.0, 4.0, 3.0), (4, 3))
     blocks = image.reshape(3, 2, 4, 2, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(smaller[::-1, :, :3], blocks, rtol=1e-12)
-    larger = averaged(image, (0.0, 0.0, 16.0, 12.0), (16, 12))
-    np.testing.assert_allclose(larger[::-1, :, :3], image.repeat(2, axis=0).repeat(2, axis=1), rtol=1e-12)
+    for expected in (blocks, image, image.repeat(2, axis=0).repeat(2, axis=1)):
+        height, width = expected.shape[:2]
+        found = averaged(image, (0.0, 0.0, width, height), (width, height))
+        np.testing.assert_allclose(found[::-1, :, :3], expected, rtol=1e-12)
+        assert (found[..., 3] == 1.0).all()
 
 
 def test_outside_the_frame_there_is_no_picture():
@@ -86,15 +60,35 @@ def test_the_frame_holds_what_the_camera_renders(kind):
         np.testing.assert_allclose(found, expected[:2], atol=1e-5)
 
 
-def test_the_picture_of_this_camera_is_found(addon, tmp_path):
+@pytest.fixture
+def found(addon, tmp_path):
+    """A function that writes a comparison of one Cycles picture and tells what a view finds."""
     camera = parts.add_camera()
     bpy.context.view_layer.update()
-    pixels = np.random.default_rng(3).random((SIZE[1], SIZE[0], 3)).astype(np.float32)
-    write_comparison(tmp_path / "images", pixels, exposure=2.0)
-    addon.ltsh.result_folder = str(tmp_path / "images")
-    found = reference_of(context_of(addon), addon, "combined", projection_of(camera, SIZE))
-    np.testing.assert_allclose(found.pixels, pixels / 2.0, rtol=1e-6)
-    np.testing.assert_allclose(found.frame, (0.0, 0.0, *SIZE), atol=1e-3)
+
+    def find(view="CAMERA", passes="combined", **facts):
+        write_channels(tmp_path / "cycles.exr", {letter: PIXELS[..., i] for i, letter in enumerate("RGB")})
+        report = {"camera": "Camera", "frame": 1, "resolution": SIZE, "pixel_aspect": 1.0, "border": None,
+                  "exposure": 1.0, **facts}  # fmt: skip
+        group = {"files": {"cycles.combined": "cycles.exr"}, "multilayer": "compare.exr", "names": ["cycles"],
+                 "labels": {"cycles": "Cycles"}, "passes": ["combined"], "scales": {"combined": 1.0}}  # fmt: skip
+        write_index(tmp_path, {"command": "compare", "partial": "", "groups": {"": group}, "report": report})
+        context = SimpleNamespace(
+            space_data=SimpleNamespace(use_local_camera=False, camera=None),
+            region_data=SimpleNamespace(view_perspective=view),
+            region=SimpleNamespace(width=SIZE[0], height=SIZE[1]),
+        )
+        addon.ltsh.output_folder = str(tmp_path / "none")
+        addon.ltsh.result_folder = facts.get("folder", str(tmp_path))
+        return reference_of(context, addon, passes, projection_of(camera, SIZE))
+
+    return find
+
+
+def test_the_picture_of_this_camera_is_found(found):
+    reference = found(exposure=2.0)
+    np.testing.assert_allclose(reference.pixels, PIXELS / 2.0, rtol=1e-6)
+    np.testing.assert_allclose(reference.frame, (0.0, 0.0, *SIZE), atol=1e-3)
 
 
 def lit_by(*lights):
@@ -118,26 +112,15 @@ def test_a_change_of_the_scene_makes_the_picture_outdated_until_it_is_undone(tmp
 
 
 @pytest.mark.parametrize(
-    ("view", "report", "passes", "reason"),
+    ("facts", "reason"),
     [
-        ("PERSP", {}, "combined", "look through the camera"),
-        ("CAMERA", {"camera": "Other"}, "combined", "of camera 'Other', this is 'Camera'"),
-        ("CAMERA", {"frame": 7}, "combined", "of frame 7, this is 1"),
-        ("CAMERA", {}, "diffuse", "has no diffuse pass"),
-        ("CAMERA", {"resolution": [SIZE[0], 2 * SIZE[1]]}, "combined", "does not fill the camera's frame"),
+        ({"view": "PERSP"}, "look through the camera"),
+        ({"camera": "Other"}, "of camera 'Other', this is 'Camera'"),
+        ({"frame": 7}, "of frame 7, this is 1"),
+        ({"passes": "diffuse"}, "has no diffuse pass"),
+        ({"resolution": [SIZE[0], 2 * SIZE[1]]}, "does not fill the camera's frame"),
+        ({"folder": ""}, "press Compare with Cycles"),
     ],
 )
-def test_what_is_in_the_way_is_said(addon, tmp_path, view, report, passes, reason):
-    camera = parts.add_camera()
-    bpy.context.view_layer.update()
-    write_comparison(tmp_path / "images", np.ones((SIZE[1], SIZE[0], 3)), **report)
-    addon.ltsh.result_folder = str(tmp_path / "images")
-    found = reference_of(context_of(addon, perspective=view), addon, passes, projection_of(camera, SIZE))
-    assert isinstance(found, str) and reason in found
-
-
-def test_without_a_comparison_the_view_says_how_to_get_one(addon, tmp_path):
-    camera = parts.add_camera()
-    addon.ltsh.output_folder = str(tmp_path)
-    found = reference_of(context_of(addon), addon, "combined", projection_of(camera, SIZE))
-    assert found.endswith("press Compare with Cycles")
+def test_what_is_in_the_way_is_said(found, facts, reason):
+    assert reason in str(found(**facts))

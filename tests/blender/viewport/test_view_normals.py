@@ -5,7 +5,7 @@ import bpy
 import numpy as np
 import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
-from view_pictures import COLUMNS, SIZE, away_from_edges, sampled_pictures, times_too_far, viewport_picture
+from view_pictures import COLUMNS, SIZE, away_from_edges, normal_map, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport import meshes
@@ -73,7 +73,6 @@ def test_normals_are_those_that_cycles_interpolates(tmp_path):
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     samples = client.extract(client.ExtractOptions(scene=path)).samples
     column = np.round(samples.position[:, 0]).astype(int)
-    wrong = []
     for x, ob in enumerate(objects):
         here = (column == x) & (np.abs(samples.position[:, 0] - x) < 0.47) & (np.abs(samples.position[:, 1]) < 0.47)
         expected, points = samples.normal[here], samples.position[here, :2] - (x, 0.0)
@@ -82,9 +81,7 @@ def test_normals_are_those_that_cycles_interpolates(tmp_path):
         certain = np.abs(points[:, 0]) > 1e-3
         difference = np.abs(found - expected)[certain].max(axis=1)
         assert len(difference) > 200 and np.isfinite(difference).all()
-        if (difference > 1e-4).mean() > 0.02:
-            wrong.append(f"{ob.name}: {(difference > 1e-4).mean():.0%} of its normals, by {difference.max():.3f}")
-    assert not wrong, wrong
+        assert (difference > 1e-4).mean() < 0.02, ob.name
 
 
 def dome(name, material, column, row, flat=False, scale=(1.0, 1.0, 1.0), data=None):
@@ -105,20 +102,6 @@ def dome(name, material, column, row, flat=False, scale=(1.0, 1.0, 1.0), data=No
     return parts.link(bpy.data.objects.new(name, data), (column - 1.5, row - 0.5, 0.0), scale=scale)
 
 
-def tilted(name):
-    """Metal with a normal map of one slope."""
-    material, node = parts.principled(name, Metallic=1.0, Roughness=0.3)
-    tree = material.node_tree
-    image = bpy.data.images.new(name, 4, 4, is_data=True, float_buffer=True)
-    image.pixels.foreach_set(np.tile(np.array([0.65, 0.4, 0.9, 1.0], np.float32), 16))
-    image.pack()
-    texture, normal = tree.nodes.new("ShaderNodeTexImage"), tree.nodes.new("ShaderNodeNormalMap")
-    texture.image = image
-    tree.links.new(texture.outputs["Color"], normal.inputs["Color"])
-    tree.links.new(normal.outputs["Normal"], node.inputs["Normal"])
-    return material
-
-
 @edits_with_graphics
 def test_stretched_objects_shine_as_in_cycles(tmp_path):
     parts.empty_scene(*SIZE)
@@ -130,8 +113,10 @@ def test_stretched_objects_shine_as_in_cycles(tmp_path):
     dome("flat, stretched", metal, 3, 0, flat=True, scale=long)
     first = dome("two users", metal, 0, 1, scale=long)
     dome("two users", metal, 1, 1, scale=long, data=first.data)
-    dome("normal map", tilted("Tilted"), 2, 1)
-    dome("normal map, stretched", tilted("Tilted, stretched"), 3, 1, scale=long)
+    bumpy = normal_map()
+    bumpy.node_tree.nodes["Principled BSDF"].inputs["Metallic"].default_value = 1.0
+    dome("normal map", bumpy, 2, 1)
+    dome("normal map, stretched", bumpy, 3, 1, scale=long)
     parts.add_area_light(location=(0.5, 0.6, 1.4), size=1.5, size_y=1.0)
     camera = parts.add_camera((0.0, -2.6, 3.4), (0.65, 0.0, 0.0))
     bpy.context.view_layer.update()

@@ -5,19 +5,12 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from job_window import Hand, add_on_in_room, image_pixels
+from job_window import Hand, image_pixels
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.process import blender_process
 from ltsh_addon.blender.ui import job, operators, results
 from ltsh_addon.blender.ui.job import Job, Plan
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """The add-on and a saved file that can be shaded."""
-    with add_on_in_room(tmp_path / "room.blend") as found:
-        yield found
 
 
 @pytest.fixture
@@ -164,14 +157,3 @@ def test_a_file_that_was_never_saved_uses_the_folder_of_the_preferences(scene, t
     assert job.output_folder(bpy.context.scene, "shade") == tmp_path / "own" / "untitled" / "shade"
     bpy.data.scenes.new("Second")
     assert job.output_folder(bpy.data.scenes["Second"], "bake").parts[-3:] == ("untitled", "Second", "bake")
-
-
-def test_objects_that_cannot_be_baked_are_left_out(scene):
-    floor = bpy.data.objects["Floor"]
-    other = floor.copy()
-    other.data, other.name = floor.data.copy(), "Bare"
-    scene.collection.objects.link(other)
-    other.data.uv_layers.remove(other.data.uv_layers[0])
-    for ob in (floor, other):
-        ob.select_set(True)
-    assert job.bake_options(bpy.context, Path("room.blend")).objects == ("Floor",)

@@ -76,6 +76,7 @@ def test_everything_that_can_be_clicked_says_what_it_does(scene):
     said = {panel: (panel.bl_label, "of a panel") for panel in all_panels()}
     for kind in operators_of_ours:
         name = kind.bl_idname.partition("_OT_")[2] or kind.bl_idname.partition(".")[2]
+        assert kind.bl_label[0].isupper(), kind
         said[kind] = kind.bl_label, getattr(bpy.ops.ltsh, name).get_rna_type().description
     for kind in (*operators_of_ours, *classes(bpy.types.PropertyGroup), *classes(bpy.types.AddonPreferences)):
         for item in kind.bl_rna.properties:

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import programs
 import pytest
-from job_window import SECONDS, Hand, add_on_in_room, ended, image_pixels
+from job_window import SECONDS, Hand, ended, image_pixels
 from kills import is_running
 
 from ltsh_addon.blender.ui import job as job_module
@@ -37,11 +37,10 @@ for thread in threading.enumerate():
 
 
 @pytest.fixture
-def never_ends(tmp_path):
-    """The add-on and a file in which Cycles has enough to do for as long as a test takes."""
-    with add_on_in_room(tmp_path / "room.blend") as scene:
-        scene.ltsh.cycles_samples = 1 << 20
-        yield scene
+def never_ends(scene):
+    """Cycles has enough to do for as long as a test takes."""
+    scene.ltsh.cycles_samples = 1 << 20
+    return scene
 
 
 @pytest.mark.parametrize("stop", ["Esc", "button"])
@@ -85,20 +84,15 @@ def test_a_job_whose_window_is_closed_goes_on_in_another(never_ends):
     assert other.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
 
 
-def test_cancelling_before_anything_is_finished_says_so(never_ends):
-    hand = Hand().start()
-    hand.send("ESC", "PRESS")
-    assert hand.outcome == {"CANCELLED"} and hand.reports[0][1].endswith("nothing was finished yet")
-    assert results.result_of(never_ends) is None
-
-
-def test_one_job_at_a_time(never_ends):
+def test_one_job_at_a_time_and_cancelling_one_without_results_says_so(never_ends):
     hand = Hand().start()
     for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
         assert not operator.poll()
         with pytest.raises(RuntimeError, match="A job is running"):
             operator()
     hand.send("ESC", "PRESS")
+    assert hand.outcome == {"CANCELLED"} and hand.reports[0][1].endswith("nothing was finished yet")
+    assert results.result_of(never_ends) is None
     assert bpy.ops.ltsh.shade.poll() and not bpy.ops.ltsh.cancel.poll()
 
 

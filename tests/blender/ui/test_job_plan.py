@@ -1,6 +1,7 @@
 """How far a job is as a whole, by the stages that it reports, with a clock that the tests turn."""
 
 import itertools
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -11,17 +12,9 @@ from ltsh_addon.blender.ui.job import MOST, PRIOR_SECONDS, Plan, Step
 STAGES = ("open", "samples", "A", "B", "images")
 
 
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
-
-
 def plan_of(*costs, stages=STAGES):
-    clock = Clock()
-    return Plan([Step(stage, cost) for stage, cost in zip(stages, costs, strict=False)], clock), clock
+    clock = SimpleNamespace(now=100.0)
+    return Plan([Step(stage, cost) for stage, cost in zip(stages, costs, strict=False)], lambda: clock.now), clock
 
 
 @given(

@@ -56,6 +56,9 @@ def test_disabling_takes_everything_back_also_the_second_time():
             ltsh_addon.unregister()
             assert difference(before, state()) == {}
         assert left == []
+    # What is not enabled can be disabled too.
+    ltsh_addon.unregister()
+    assert difference(before, state()) == {}
 
 
 def test_a_new_version_can_replace_the_one_that_is_loaded():
@@ -75,12 +78,6 @@ def test_a_new_version_can_replace_the_one_that_is_loaded():
         for name in [name for name in sys.modules if name.split(".")[0] == "ltsh_addon"]:
             del sys.modules[name]
         sys.modules.update(kept)
-    assert difference(before, state()) == {}
-
-
-def test_disabling_what_is_not_enabled_does_nothing():
-    before = state()
-    ltsh_addon.unregister()
     assert difference(before, state()) == {}
 
 

@@ -103,6 +103,10 @@ def faults_of(operator) -> str:
     return text
 
 
+def fail(*arguments, **options):
+    raise OSError("cannot\nread")
+
+
 def test_a_process_that_dies_is_told(scene):
     hand = Hand("shade").start()
     operators.running_job()._process.kill()
@@ -112,23 +116,14 @@ def test_a_process_that_dies_is_told(scene):
     assert hand.outcome == {"CANCELLED"} and hand.context.timers == []
 
 
-def test_a_blender_that_cannot_be_started_is_told(scene, monkeypatch):
-    def fail(*arguments, **options):
-        raise OSError("no more processes")
-
-    monkeypatch.setattr(blender_process, "start", fail)
-    assert "no more processes" in faults_of(bpy.ops.ltsh.compare)
-
-
-def test_what_the_command_line_refuses_is_told(scene):
+def test_what_cannot_be_shaded_or_started_is_told(scene, monkeypatch):
     bpy.data.objects["Light"].data.energy = 0.0
     assert "no area light" in faults_of(bpy.ops.ltsh.shade)
+    monkeypatch.setattr(blender_process, "start", fail)
+    assert "cannot read" in faults_of(bpy.ops.ltsh.compare)
 
 
 def test_an_unexpected_fault_ends_the_job_with_one_line(scene, monkeypatch):
-    def fail(*arguments):
-        raise RuntimeError("cannot\nread")
-
     monkeypatch.setattr(results, "show", fail)
     hand = Hand("shade").start().until(lambda: False)
     assert hand.outcome == {"CANCELLED"} and hand.reports == [("ERROR", "shade failed: cannot read")]
@@ -138,21 +133,21 @@ def test_an_unexpected_fault_ends_the_job_with_one_line(scene, monkeypatch):
 
 
 def test_the_scene_and_its_file_stay_as_they_were(scene, tmp_path):
-    before = (tmp_path / "room.blend").read_bytes(), bpy.data.filepath, sorted(path.name for path in tmp_path.iterdir())
+    def state():
+        names = [item.name for item in (*bpy.data.objects, *scene.view_layers)]
+        files = (tmp_path / "room.blend").read_bytes(), bpy.data.filepath, sorted(tmp_path.iterdir())
+        return names, files, scene.render.engine, scene.frame_current
+
     scene.frame_set(7)
-    names = [ob.name for ob in bpy.data.objects], [layer.name for layer in scene.view_layers], scene.render.engine
+    before = state()
     Hand("shade").start().send("ESC", "PRESS")
-    assert [ob.name for ob in bpy.data.objects] == names[0] and scene.frame_current == 7
-    assert ([layer.name for layer in scene.view_layers], scene.render.engine) == names[1:]
-    after = (tmp_path / "room.blend").read_bytes(), bpy.data.filepath, sorted(path.name for path in tmp_path.iterdir())
-    assert after == before
+    assert state() == before
 
 
 def test_a_file_that_was_never_saved_uses_the_folder_of_the_preferences(scene, tmp_path, monkeypatch):
     monkeypatch.setattr("ltsh_addon.blender.ui.settings.default_output_folder", lambda: tmp_path / "own")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
-    room_scene = Path(bpy.data.filepath)
-    assert job.output_folder(scene, "shade") == room_scene.parent / "ltsh" / "shade"
+    assert job.output_folder(scene, "shade") == Path(bpy.data.filepath).parent / "ltsh" / "shade"
     bpy.ops.wm.read_factory_settings(use_empty=True)
     assert job.output_folder(bpy.context.scene, "shade") == tmp_path / "own" / "untitled" / "shade"
     bpy.data.scenes.new("Second")

@@ -92,7 +92,7 @@ def test_a_missing_library_is_named_with_what_to_do(monkeypatch):
     preflight.missing_libraries.cache_clear()
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     message = preflight.missing_libraries()
-    assert "\n" not in message and "OpenEXR" in message and "install" in message
+    assert "\n" not in message and "OpenEXR" in message and "install" in message and "Python 3." in message
     # A panel asks at every redraw: the answer stays until the add-on is enabled again.
     monkeypatch.undo()
     assert preflight.missing_libraries() == message

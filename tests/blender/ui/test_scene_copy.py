@@ -3,24 +3,19 @@
 import bpy
 import numpy as np
 import pytest
-import scene_parts
 
-import ltsh_addon
 from ltsh_addon.blender.ui import comparison, operators
 
 
 @pytest.fixture
-def preferences(tmp_path):
+def preferences(addon, tmp_path):
     """Blender's own, with the add-on and a saved file; as they were afterwards."""
     found = bpy.context.preferences
     before = found.filepaths.file_preview_type, found.is_dirty
-    ltsh_addon.register()
-    scene_parts.empty_scene()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
     found.filepaths.file_preview_type, found.is_dirty = "CAMERA", False
     yield found
     found.filepaths.file_preview_type, found.is_dirty = before
-    ltsh_addon.unregister()
 
 
 @pytest.fixture

@@ -27,6 +27,16 @@ def drawn(lighting, samples, canvas, passes, **placement):
     return canvas.read()[..., :3].reshape(-1, 3)
 
 
+def lit(technique, seed, surface="plain", lights=1, count=WIDTH * HEIGHT):
+    """`count` random samples, `lights` lights over them and their pass."""
+    random = np.random.default_rng(seed)
+    samples = random_surfaces.samples(surface, count, random)
+    lights = [random_surfaces.light("plain", number, random) for number in range(lights)]
+    lighting = LightingPass(technique)
+    lighting.set_lights(lights)
+    return samples, lights, lighting
+
+
 def excess(found, expected, relative):
     """How many times too far off (P,) the worst channel is."""
     return (np.abs(found - expected) / (ABSOLUTE + relative * np.abs(expected))).max(axis=1)
@@ -104,10 +114,7 @@ def test_no_input_gives_anything_but_finite_light():
 
 def test_a_pass_draws_where_it_is_told_and_adds_to_what_is_there():
     def draw():
-        random = np.random.default_rng(11)
-        samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
-        lighting = LightingPass("ltsh2")
-        lighting.set_lights([random_surfaces.light("plain", 0, random)])
+        samples, _, lighting = lit("ltsh2", 11)
         canvas, large = Canvas(WIDTH, HEIGHT), Canvas(2 * WIDTH, 2 * HEIGHT)
         parts = [drawn(lighting, samples, canvas, name) for name in shading.PASSES]
         large.fill(7.0)
@@ -129,11 +136,7 @@ def test_a_thousand_lights_add_up():
     """More than one draw call takes."""
 
     def draw():
-        random = np.random.default_rng(17)
-        samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
-        lights = [random_surfaces.light("plain", number, random) for number in range(1100)]
-        lighting = LightingPass("ltsh2")
-        lighting.set_lights(lights)
+        samples, lights, lighting = lit("ltsh2", 17, lights=1100)
         assert len(lighting._shares) > 1
         return samples, lights, drawn(lighting, samples, Canvas(WIDTH, HEIGHT), "specular")
 
@@ -144,10 +147,7 @@ def test_a_thousand_lights_add_up():
 
 def test_pixels_without_a_surface_stay_dark():
     def draw():
-        random = np.random.default_rng(13)
-        samples = random_surfaces.samples("tilted", 40, random)
-        lighting = LightingPass("ltsh4")
-        lighting.set_lights([random_surfaces.light("plain", 0, random)])
+        samples, _, lighting = lit("ltsh4", 13, "tilted", count=40)
         canvas = Canvas(WIDTH, HEIGHT)
         pixel = np.arange(40) * 7
         pixel[-1] = WIDTH * HEIGHT - 1

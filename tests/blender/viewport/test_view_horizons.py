@@ -64,7 +64,7 @@ def test_the_card_chooses_the_horizon_that_numpy_chooses():
         by_lobe, by_light = horizon_excess(samples, lights)
         sure = is_certain(samples, lights) & (by_lobe + by_light != 1.0)
         wrong = np.abs(found - ended).max(axis=1) > 1e-6
-        assert not wrong[sure].any(), f"{kind}: {wrong[sure].sum()} of {sure.sum()} samples have the other horizon"
+        assert not wrong[sure].any(), kind
         smooth = np.abs(ended - samples.smooth_normal).max(axis=1) < 1e-6
         turned += min(smooth[sure].sum(), (~smooth)[sure].sum())
     # Both choices are there.
@@ -141,11 +141,8 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     wrong = np.abs(found - plain).max(axis=1) > 10.0 * (ABSOLUTE + RELATIVE * np.abs(plain).max(axis=1))
     # The horizon of the mesh makes a difference.
     assert wrong.sum() > 20
-    check_against_cycles(tmp_path / "sphere.blend", ended, pixel)
-
-
-def check_against_cycles(path, ended, pixel):
-    """The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces."""
+    # The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces.
+    path = tmp_path / "sphere.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     found = client.extract(client.ExtractOptions(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])

@@ -42,39 +42,33 @@ def excess(found, expected, relative):
     return (np.abs(found - expected) / (ABSOLUTE + relative * np.abs(expected))).max(axis=1)
 
 
-def check(surface, kinds, techniques=TECHNIQUES):
-    """The card agrees with numpy under lights of all `kinds`."""
-    with_graphics(lambda: compare_with_numpy(surface, kinds, {name: LightingPass(name) for name in techniques}))
-
-
-def compare_with_numpy(surface, kinds, passes):
-    canvas, brightest = Canvas(WIDTH, HEIGHT), dict.fromkeys(shading.PASSES, 0.0)
-    for kind in kinds:
-        # The same numbers for every kind of light and surface would leave most of the cases out.
-        random = np.random.default_rng([len(kind), *map(ord, kind + surface)])
-        samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
-        lights = [random_surfaces.light(kind, number, random) for number in range(3)]
-        for technique, lighting in passes.items():
-            lighting.set_lights(lights)
-            for name in shading.PASSES:
-                found = drawn(lighting, samples, canvas, name)
-                shaded = shading.shade(samples, lights, technique, passes=(name,), workers=1, dtype=np.float64)
-                times = excess(found, shaded.combined, RELATIVE_OF_CONES if lights[0].is_focused else RELATIVE)
-                brightest[name] = max(brightest[name], float(shaded.combined.max()))
-                assert times.max() <= 1.0, f"{kind}, {technique}, {name}: {times.max():.1f} x at {times.argmax()}"
-    # There is enough light that the absolute part of the tolerance is not what lets them pass.
-    assert min(brightest.values()) > 1e3 * ABSOLUTE
-
-
-@pytest.mark.parametrize("surface", random_surfaces.SURFACES)
-def test_radiance_is_that_of_the_integrator(surface):
-    check(surface, random_surfaces.LIGHTS)
-
-
-@pytest.mark.parametrize("surface", ["plain", "tilted"])
-def test_lights_with_a_spread_are_those_of_the_integrator(surface):
+@pytest.mark.parametrize(
+    ("surface", "kinds", "techniques"),
+    [(surface, random_surfaces.LIGHTS, TECHNIQUES) for surface in random_surfaces.SURFACES]
     # One technique each: llvmpipe takes seconds to compile one.
-    check(surface, random_surfaces.FOCUSED_LIGHTS, ("ltsh4" if surface == "plain" else "ltsh2",))
+    + [("plain", random_surfaces.FOCUSED_LIGHTS, ("ltsh4",)), ("tilted", random_surfaces.FOCUSED_LIGHTS, ("ltsh2",))],
+)
+def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
+    def compare():
+        passes = {name: LightingPass(name) for name in techniques}
+        canvas, brightest = Canvas(WIDTH, HEIGHT), dict.fromkeys(shading.PASSES, 0.0)
+        for kind in kinds:
+            # The same numbers for every kind of light and surface would leave most of the cases out.
+            random = np.random.default_rng([len(kind), *map(ord, kind + surface)])
+            samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
+            lights = [random_surfaces.light(kind, number, random) for number in range(3)]
+            for technique, lighting in passes.items():
+                lighting.set_lights(lights)
+                for name in shading.PASSES:
+                    found = drawn(lighting, samples, canvas, name)
+                    shaded = shading.shade(samples, lights, technique, passes=(name,), workers=1, dtype=np.float64)
+                    times = excess(found, shaded.combined, RELATIVE_OF_CONES if lights[0].is_focused else RELATIVE)
+                    brightest[name] = max(brightest[name], float(shaded.combined.max()))
+                    assert times.max() <= 1.0, f"{kind}, {technique}, {name}: {times.max():.1f} x at {times.argmax()}"
+        # There is enough light that the absolute part of the tolerance is not what lets them pass.
+        assert min(brightest.values()) > 1e3 * ABSOLUTE
+
+    with_graphics(compare)
 
 
 def test_no_input_gives_anything_but_finite_light():

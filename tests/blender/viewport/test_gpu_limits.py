@@ -38,12 +38,7 @@ class Recorder:
 def recorded(monkeypatch):
     """A function that makes a shader by `function` and returns the recorders of its create infos."""
     made = []
-
-    def create(*arguments):
-        made.append(Recorder())
-        return made[-1]
-
-    monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", create)
+    monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", lambda: made.append(Recorder()) or made[-1])
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
     monkeypatch.setattr(shaders, "batch_for_shader", lambda *arguments: None)

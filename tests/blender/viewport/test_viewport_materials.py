@@ -48,8 +48,14 @@ def made(name, kind, values):
     return make
 
 
+def bsdf(name, kind="BsdfPrincipled", **values):
+    """A function that makes a material of one BSDF; underscores in names of inputs stand for spaces."""
+    named = {key if key.islower() else key.replace("_", " "): value for key, value in values.items()}
+    return made(name, kind, {"distribution": "GGX", **named})
+
+
 def coated(name, **inputs):
-    return lambda: parts.principled(name, Base_Color=RED, **{"Roughness": 0.5, "Coat_Weight": 1.0, **inputs})[0]
+    return bsdf(name, Base_Color=RED, **{"Roughness": 0.5, "Coat_Weight": 1.0, **inputs})
 
 
 def coated_normal_map(follows):
@@ -138,16 +144,12 @@ def grouped():
     return made("grouped", "Group", {"node_tree": group, "Tint": (0.8, 0.4, 0.3, 1.0)})()
 
 
-def with_specular(name, **inputs):
-    return lambda: parts.principled(name, **inputs)[0]
-
-
 MATERIALS = (
-    with_specular("plastic", Base_Color=(0.5, 0.2, 0.1, 1.0), Roughness=0.3, IOR=1.7, Specular_IOR_Level=0.3),
-    with_specular("metal", Base_Color=(0.9, 0.6, 0.3, 1.0), Metallic=1.0, Specular_Tint=(0.6, 0.9, 1.0, 1.0)),
-    with_specular("half metal", Base_Color=(0.3, 0.6, 0.3, 1.0), Metallic=0.4, Roughness=0.6),
+    bsdf("plastic", Base_Color=(0.5, 0.2, 0.1, 1.0), Roughness=0.3, IOR=1.7, Specular_IOR_Level=0.3),
+    bsdf("metal", Base_Color=(0.9, 0.6, 0.3, 1.0), Metallic=1.0, Specular_Tint=(0.6, 0.9, 1.0, 1.0)),
+    bsdf("half metal", Base_Color=(0.3, 0.6, 0.3, 1.0), Metallic=0.4, Roughness=0.6),
     made("chalk", "BsdfDiffuse", {"Color": (0.2, 0.5, 0.8, 1.0)}),
-    made("mirror", "BsdfGlossy", {"distribution": "GGX", "Roughness": 0.2, "Color": (0.8, 0.7, 0.6, 1.0)}),
+    bsdf("mirror", "BsdfGlossy", Roughness=0.2, Color=(0.8, 0.7, 0.6, 1.0)),
     lambda: textured("color image", "Base Color")[0],
     lambda: textured("roughness image", "Roughness", is_data=True)[0],
     clipped_and_mapped,
@@ -159,9 +161,7 @@ MATERIALS = (
 
 
 def scattered(name, kind="BsdfPrincipled", **values):
-    """A material of one BSDF with Multiscatter GGX."""
-    named = {key if key.islower() else key.replace("_", " "): value for key, value in values.items()}
-    return made(name, kind, {"distribution": "MULTI_GGX", **named})
+    return bsdf(name, kind, distribution="MULTI_GGX", **values)
 
 
 SCATTERED = (

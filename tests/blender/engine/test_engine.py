@@ -18,7 +18,7 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.scene import Border, Cancelled
+from ltsh_addon.scene import Cancelled
 
 SIZE = (28, 18)
 # Both take the same samples; the pictures are float32.
@@ -200,18 +200,6 @@ def test_the_render_region_is_a_part_of_the_whole_picture(scene, tmp_path, cropp
     if not cropped:
         part[inside] = 0.0
         assert (part == 0.0).all()
-
-
-def test_only_the_render_region_is_handed_to_blender():
-    image = np.arange(60.0).reshape(6, 10, 1)
-    border = Border(left=2, top=1, width=5, height=3, full_width=10, full_height=6)
-    np.testing.assert_array_equal(render_module.inside_border(image, border), image[1:4, 2:7])
-    flat = render_module.blender_pixels(image)
-    # Blender's rows start at the bottom.
-    np.testing.assert_array_equal(flat.reshape(6, 10)[0], image[5, :, 0])
-
-
-# ---- stopping and faults
 
 
 def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkeypatch):

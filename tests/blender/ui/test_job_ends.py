@@ -11,6 +11,7 @@ import pytest
 from job_window import SECONDS, Hand, ended, image_pixels
 from kills import is_running
 
+import ltsh_addon
 from ltsh_addon.blender.ui import job as job_module
 from ltsh_addon.blender.ui import operators, results
 
@@ -120,24 +121,16 @@ def test_a_blender_that_ends_meanwhile_leaves_no_process_and_no_files(never_ends
             assert Path(folder.strip()).is_dir()
             owner.kill()
     # One that quits has waited for it.
-    seconds = SECONDS if end == "killed" else 0.0
-    assert ends(lambda: not Path(folder.strip()).exists(), seconds) and ends(lambda: not is_running(int(pid)), seconds)
-
-
-def ends(condition, seconds):
-    end = time.monotonic() + seconds
-    while not condition() and time.monotonic() < end:
+    last = time.monotonic() + (SECONDS if end == "killed" else 0.0)
+    while (Path(folder.strip()).exists() or is_running(int(pid))) and time.monotonic() < last:
         time.sleep(0.05)
-    return condition()
+    assert not Path(folder.strip()).exists() and not is_running(int(pid))
 
 
 def test_disabling_the_add_on_ends_the_job(never_ends):
     hand = Hand().start()
     job = operators.running_job()
-    operators.unregister()
-    try:
-        assert job._process.poll() is not None and not job.folder.exists()
-        hand.send()
-        assert hand.outcome == {"CANCELLED"}
-    finally:
-        operators.register()
+    ltsh_addon.unregister()
+    assert job._process.poll() is not None and not job.folder.exists()
+    hand.send()
+    assert hand.outcome == {"CANCELLED"}

@@ -91,9 +91,6 @@ def test_a_scene_that_is_renamed_or_removed_meanwhile(scene):
     assert hand.outcome == {"CANCELLED"} and hand.reports[0][0] == "WARNING"
 
 
-# ---- faults are one line
-
-
 def faults_of(operator) -> str:
     with pytest.raises(RuntimeError) as caught:
         operator()

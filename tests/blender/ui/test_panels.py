@@ -1,17 +1,12 @@
 """What the panels show, drawn into a recorded layout; how they look is for the drivers in tests/gui."""
 
-from pathlib import Path
-
 import bpy
-import numpy as np
 import pytest
 import scene_parts as parts
 from recorded_layout import Layout, buttons, drawn, texts
 
-from ltsh_addon.blender.ui import comparison, operators, panels, preflight, results
+from ltsh_addon.blender.ui import operators, panels, preflight
 from ltsh_addon.blender.ui.job import Job, Plan, Step
-from ltsh_addon.imaging.exr import write_channels
-from ltsh_addon.pipeline import display_layers
 
 MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[:10]
 JOBS = ("ltsh.shade", "ltsh.compare")
@@ -30,24 +25,18 @@ def classes(base):
     return [kind for kind in base.__subclasses__() if kind.__module__.startswith("ltsh_addon") and kind.is_registered]
 
 
-def add_results(scene, tmp_path, partial="", names=("ltsh4", "cycles")):
-    """Results of a comparison as `display_layers.write` leaves them, of random pictures."""
-    output = Path(bpy.path.abspath("//ltsh")) / "compare"
-    output.mkdir(parents=True, exist_ok=True)
-    random = np.random.default_rng(1)
-    channels = {"coverage.hit.V": np.ones((4, 6), np.float32)}
-    for layer in [*names, "cycles_A", "cycles_B", *(f"error_{name}" for name in names if name != "cycles")]:
-        for letter in "RGB":
-            channels[f"{layer}.specular.{letter}"] = random.random((4, 6), np.float32)
-    write_channels(output / "compare.exr", channels)
-    row = {"relative_l2": 0.1234, "bias": -0.0151, "flip": 0.0321, "unbiased_squared_error": 0.01}
-    rows = {name: {"against_cycles": row} for name in names if name != "cycles"}
-    report = {"passes": {"specular": {"noise": 0.02, "techniques": rows}}, "warnings": ["Light 'Key': approximated"]}
-    results.show(scene, display_layers.write("compare", output, report, partial))
-    return results.result_of(scene)
+@pytest.fixture
+def add_results(scene, tmp_path, show_results):
+    """A function that shows results of these pictures."""
 
+    def add(partial="", names=("ltsh4", "cycles")):
+        row = {"relative_l2": 0.1234, "bias": -0.0151, "flip": 0.0321, "unbiased_squared_error": 0.01}
+        rows = {name: {"against_cycles": row} for name in names if name != "cycles"}
+        passes = {"specular": {"noise": 0.02, "techniques": rows}}
+        report = {"passes": passes, "warnings": ["Light 'Key': approximated"]}
+        show_results(scene, tmp_path, 1, names, report, partial)
 
-# ---- the recorder itself
+    return add
 
 
 @pytest.mark.parametrize(
@@ -65,9 +54,6 @@ def add_results(scene, tmp_path, partial="", names=("ltsh4", "cycles")):
 def test_the_recorder_refuses_what_blender_refuses(scene, mistake):
     with pytest.raises((AssertionError, AttributeError, KeyError)):
         mistake(Layout())
-
-
-# ---- names and tooltips
 
 
 def test_everything_that_can_be_clicked_says_what_it_does(scene):
@@ -90,11 +76,8 @@ def test_everything_that_can_be_clicked_says_what_it_does(scene):
         assert label and len(description) > 8 and not description.endswith("."), (where, label, description)
 
 
-# ---- drawing
-
-
 @pytest.mark.parametrize("width", [220, 420, 900])
-def test_every_panel_draws_in_every_state(scene, tmp_path, width):
+def test_every_panel_draws_in_every_state(scene, tmp_path, add_results, width):
     """Nothing selected and no results, a job that runs, results that are partial, and those that are complete."""
     drawn_panels = all_panels()
     assert len(drawn_panels) >= 14
@@ -110,7 +93,7 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, width):
     draw_all()
     operators._running["job"] = None
     for partial in ("Not complete: without Cycles", ""):
-        add_results(scene, tmp_path, partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
+        add_results(partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
         draw_all()
     bpy.ops.object.select_all(action="SELECT")
     for mode in ("A", "WIPE", "SIDE", "ERROR"):
@@ -189,8 +172,8 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
     assert signs["Floor"] == "CHECKMARK" and signs["Fur"] == "CANCEL"
 
 
-def test_numbers_are_those_of_the_report(scene, tmp_path):
-    add_results(scene, tmp_path)
+def test_numbers_are_those_of_the_report(scene, add_results):
+    add_results()
     shown = drawn(panels.CLASSES[10])
     for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
@@ -198,13 +181,12 @@ def test_numbers_are_those_of_the_report(scene, tmp_path):
     assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
-    add_results(scene, tmp_path, "Not complete: without Cycles", ("ltc", "ltsh4"))
+    add_results("Not complete: without Cycles", ("ltc", "ltsh4"))
     assert "Not complete: without Cycles" in texts(drawn(panels.CLASSES[10]))
 
 
-def test_the_image_editor_offers_the_pictures_that_are_there(scene, tmp_path):
-    add_results(scene, tmp_path, names=("ltsh4", "cycles"))
-    comparison.refresh(scene)
+def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results):
+    add_results()
     panel = panels.LTSH_PT_IMAGE_results
     scene.ltsh.mode = "WIPE"
     shown = [item.what for item in drawn(panel)]

@@ -15,36 +15,9 @@ from ltsh_addon.blender.ui import comparison, results, view_operators
 from ltsh_addon.blender.ui import settings as settings_module
 from ltsh_addon.blender.ui.drawing import INK, PLATE
 from ltsh_addon.imaging.color import signed_error_colors
-from ltsh_addon.imaging.exr import write_channels
-from ltsh_addon.pipeline import display_layers
 
 HEIGHT, WIDTH = 6, 10
 PICTURES = ("ltc", "ltsh4", "cycles")
-
-
-def write_results(folder, seed):
-    """Random pictures as `ltsh compare` leaves them, prepared for Blender; {layer: (H, W, 3)}."""
-    random = np.random.default_rng(seed)
-    output = folder / "ltsh" / "compare"
-    output.mkdir(parents=True, exist_ok=True)
-    pictures = {f"{name}.{part}": random.random((HEIGHT, WIDTH, 3), np.float32) * 4.0 - 0.5
-                for name in (*PICTURES, "cycles_A", "cycles_B") for part in ("specular", "diffuse")}  # fmt: skip
-    channels = {"coverage.hit.V": np.ones((HEIGHT, WIDTH), np.float32)}
-    for layer, pixels in pictures.items():
-        channels |= {f"{layer}.{letter}": pixels[..., index] for index, letter in enumerate("RGB")}
-    write_channels(output / "compare.exr", channels)
-    display_layers.write("compare", output, {"passes": {}, "warnings": []})
-    for name in PICTURES:
-        pictures[f"{name}.combined"] = pictures[f"{name}.specular"] + pictures[f"{name}.diffuse"]
-    return pictures
-
-
-def show_results(scene, folder, seed=1):
-    """Show such pictures in `scene`; the pictures."""
-    pictures = write_results(folder, seed)
-    results.show(scene, folder / "ltsh" / "compare" / "images")
-    assert comparison.refresh(scene)
-    return pictures
 
 
 def seen():
@@ -52,7 +25,7 @@ def seen():
 
 
 @pytest.fixture
-def pictures(addon, tmp_path):
+def pictures(addon, tmp_path, show_results):
     """Results that are shown, in the folder of a saved file."""
     parts.save(tmp_path / "room.blend")
     return show_results(addon, tmp_path)
@@ -161,7 +134,7 @@ def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path
     np.testing.assert_array_equal(seen(), before)
 
 
-def test_new_results_replace_the_old_pictures(scene, tmp_path):
+def test_new_results_replace_the_old_pictures(scene, tmp_path, show_results):
     pictures = show_results(scene, tmp_path, seed=2)
     scene.ltsh.mode = "A"
     np.testing.assert_array_equal(seen(), pictures["ltsh4.combined"])
@@ -188,7 +161,7 @@ def test_results_that_vanish_do_no_harm(scene, tmp_path, damage):
             bpy.ops.ltsh.show_results(command="compare")
 
 
-def test_two_scenes_have_results_of_their_own(scene, tmp_path):
+def test_two_scenes_have_results_of_their_own(scene, tmp_path, show_results):
     first = seen().copy()
     other = bpy.data.scenes.new("Other")
     pictures = show_results(other, tmp_path / "other", seed=3)
@@ -219,9 +192,6 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
     squared = ((technique - halves[0]) * (technique - halves[1])).sum() / (halves[0] * halves[1]).sum()
     assert row["unbiased_squared_error"] == pytest.approx(squared, rel=1e-6)
     assert 0.0 < row["flip"] < 1.0
-
-
-# ---- presets and the manual
 
 
 def test_presets_of_ours_set_everything_they_name(scene):
@@ -258,14 +228,8 @@ def test_every_setting_of_a_job_is_part_of_presets(scene):
     assert settings - about_view - of_the_file == set(settings_module.KEPT)
 
 
-def test_a_manual_that_is_missing_is_told(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(view_operators, "MANUAL", tmp_path / "manual.md")
-    with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
-        bpy.ops.ltsh.manual()
-
-
-def test_the_manual_names_what_the_panels_show(scene):
-    """Every button and every setting, by the words on it."""
+def test_the_manual_names_what_the_panels_show(scene, tmp_path, monkeypatch):
+    """Every button and every setting, by the words on it; a manual that is missing is told."""
     text = view_operators.PICTURE_LINE.sub("", view_operators.MANUAL.read_text(encoding="utf-8"))
     assert "![" not in text and "\n\n\n" not in text
     buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Pixel Probe", "Open in Image Editor",
@@ -275,6 +239,9 @@ def test_the_manual_names_what_the_panels_show(scene):
     skipped = {"A", "B", "groups", "View", "Pass", "Object"}
     assert [word for word in (*buttons, *names) if word not in text and word not in skipped] == []
     assert len(text.splitlines()) < 120 and max(map(len, text.splitlines())) <= 120
+    monkeypatch.setattr(view_operators, "MANUAL", tmp_path / "manual.md")
+    with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
+        bpy.ops.ltsh.manual()
 
 
 def luminance(color):

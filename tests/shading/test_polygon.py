@@ -114,13 +114,6 @@ def test_both_ways_to_clip_give_the_same_polygon(corners):
         assert len(np.unique(fast[:, :, n].round(12), axis=1).T) == len(np.unique(slow[:, :, n].round(12), axis=1).T)
 
 
-def test_patterns_with_several_runs_are_told_apart():
-    kinds = polygon_module._pattern_kinds(4)
-    several = [pattern for pattern in range(16) if kinds[pattern] == polygon_module.SEVERAL_RUNS]
-    assert several == [0b0101, 0b1010]
-    assert kinds[0] == polygon_module.DARK and kinds[15] == polygon_module.WHOLE
-
-
 def test_splitting_long_edges_adds_the_points_nearest_to_the_origin():
     vertices = batch(*random_rectangles(50, seed=11, height=2.0))
     split = split_long_edges(vertices)
@@ -181,33 +174,19 @@ def test_a_light_that_almost_touches_the_surface_covers_the_hemisphere(dtype):
         assert np.abs(found - 2.0 * np.pi).max() < limit, exponent
 
 
-def test_reversing_a_polygon_reverses_its_solid_angle():
-    polygons = [clipped(p) for p in random_rectangles(30, seed=7) if (p[:, 2] > 0.0).all()]
-    for polygon in polygons:
-        forward = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert solid_angle(project_to_sphere(batch(polygon[::-1])))[0] == pytest.approx(-forward, abs=1e-15)
+def test_reversing_splitting_turning_and_repeating_corners():
+    """A reversed polygon has the opposite solid angle, halves add up, turning about z and double corners do nothing."""
 
+    def angle_of(polygon):
+        return solid_angle(project_to_sphere(batch(polygon)))[0]
 
-def test_splitting_a_polygon_adds_up():
     for polygon in random_rectangles(60, seed=8, height=6.0):
-        parts = [batch(polygon[[0, 1, 2]]), batch(polygon[[0, 2, 3]])]
-        whole = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert sum(solid_angle(project_to_sphere(part))[0] for part in parts) == pytest.approx(whole, abs=1e-14)
-
-
-def test_rotating_about_the_normal_changes_nothing():
-    for polygon in random_rectangles(30, seed=9, height=5.0):
-        expected = solid_angle(project_to_sphere(batch(polygon)))[0]
+        expected = pytest.approx(angle_of(polygon), abs=1e-14)
+        assert -angle_of(polygon[::-1]) == expected
+        assert angle_of(polygon[[0, 1, 2]]) + angle_of(polygon[[0, 2, 3]]) == expected
+        assert angle_of(polygon[[0, 0, 1, 2, 2, 2, 3]]) == expected
         for angle in (0.3, 1.7, 4.0):
-            found = solid_angle(project_to_sphere(batch(turned(polygon, angle))))[0]
-            assert found == pytest.approx(expected, abs=1e-14)
-
-
-def test_repeated_corners_change_nothing():
-    for polygon in random_rectangles(30, seed=10, height=5.0):
-        repeated = polygon[[0, 0, 1, 2, 2, 2, 3]]
-        expected = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert solid_angle(project_to_sphere(batch(repeated)))[0] == pytest.approx(expected, abs=1e-15)
+            assert angle_of(turned(polygon, angle)) == expected
 
 
 def test_a_corner_at_the_point_is_finite():

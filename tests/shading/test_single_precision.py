@@ -121,15 +121,6 @@ def test_edge_loop_gives_the_moments(degree, corners):
     assert np.abs(moments - expected)[:, ~needs_float64].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
 
 
-def test_edge_loop_gives_the_integrals_of_the_direction():
-    polygons = regular_polygons(6, 300, seed=9)
-    expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))
-    found, needs_float64 = moments32.vector_irradiance(polygons, moments32.Scratch())
-    height, _ = moments32.cosine_integral(polygons, moments32.Scratch())
-    assert np.abs(found - expected)[:, ~needs_float64].max() < 1e-6
-    assert np.abs(height - expected[2])[~needs_float64].max() < 1e-6
-
-
 def regular_polygons(corners, count, seed):
     """Polygons (3, V, P) in float32 around random directions above the horizon, of 0.03 to 0.5 rad."""
     generator = np.random.default_rng(seed)
@@ -142,33 +133,6 @@ def regular_polygons(corners, count, seed):
     angle = 2.0 * np.pi * np.arange(corners) / corners
     polygons = center[:, None] + size * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
     return np.ascontiguousarray(polygons.transpose(2, 1, 0), dtype=np.float32)
-
-
-@pytest.mark.parametrize("gap", [1e-6, 1e-4])
-def test_polygons_that_single_precision_cannot_do_are_reported(gap):
-    """A plane that passes by the point, and a polygon of 1e-4 rad."""
-    wall = np.array([[-1.0, gap, 0.0], [1.0, gap, 0.0], [1.0, gap, 2.0], [-1.0, gap, 2.0]])
-    tiny = np.array([[0.0, 0.0, 1.0], [1e-4, 0.0, 1.0], [1e-4, 1e-4, 1.0], [0.0, 1e-4, 1.0]])
-    fine = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-    polygons = np.stack([wall, tiny, fine]).transpose(2, 1, 0).astype(np.float32)
-    for _, needs_float64 in (
-        moments32.moments(polygons, 4, moments32.Scratch()),
-        moments32.cosine_integral(polygons, moments32.Scratch()),
-    ):
-        assert needs_float64.tolist() == [True, True, False]
-
-
-@pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])
-def test_shaders_and_the_edge_loop_weigh_their_moments_alike(name):
-    """One node of the table for 300 polygons."""
-    table, node = shading.load_table(name), 40 * 64 + 20
-    polygons = regular_polygons(4, 300, seed=8)
-    moments, needs_float64 = moments32.moments(polygons, table.degree, moments32.Scratch())
-    along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), table.degree)
-    found = moments32.prepare(table).weights[..., node] @ moments
-    expected = moments32.along_directions(table).weights[..., node] @ along_directions
-    assert np.abs(expected).max() > 0.1
-    assert np.abs(found - expected)[:, ~needs_float64].max() < 2e-6
 
 
 def test_degrees_beyond_the_fast_path_are_shaded_in_double():

@@ -1,7 +1,20 @@
 """The window answers while a comparison of 1920 x 1080 pixels is started, runs, and is looked at."""
 
 import bpy
-from hands import COMPARE, Pulse, click_button, drag, job, keys, open_panel, over, settings, until, wait_for_job
+from hands import (
+    COMPARE,
+    Pulse,
+    click_button,
+    drag,
+    job,
+    keys,
+    open_panel,
+    over,
+    results_opened,
+    settings,
+    until,
+    wait_for_job,
+)
 
 SECONDS = 1800
 # Small, for the graphics driver may be a program that takes longer to draw the window than all else.
@@ -51,9 +64,7 @@ def main(rig):
 
 
 def open_results(rig):
-    with rig.override():
-        bpy.ops.ltsh.open_results()
-    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+    yield from results_opened(rig)
     rig.area("IMAGE_EDITOR").spaces.active.show_region_ui = False
     yield 3
 

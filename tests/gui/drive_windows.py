@@ -1,7 +1,20 @@
 """Jobs with several windows and scenes: results go to the scene they were made of, whatever is closed meanwhile."""
 
 import bpy
-from hands import job, keys, module, open_panel, over, settings, start_comparison, until, wait_for_job
+from hands import (
+    close_window,
+    job,
+    job_started,
+    keys,
+    module,
+    open_panel,
+    operate,
+    over,
+    settings,
+    start_comparison,
+    until,
+    wait_for_job,
+)
 
 SIZE = "1600x900"
 SECONDS = 1500
@@ -23,8 +36,7 @@ def results_of(scene):
 
 def second_window(rig):
     """A new window, which may show a scene of its own."""
-    with rig.override():
-        bpy.ops.wm.window_new_main()
+    operate(rig, bpy.ops.wm.window_new_main)
     return bpy.context.window_manager.windows[-1]
 
 
@@ -38,14 +50,11 @@ def other_window_closed(rig):
     yield 3
     rig.shot("1_two_windows.png")
     # The second window lies over the first one.
-    with rig.override():
-        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a job starts in the first window")
+    operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
+    yield from job_started(rig, "a job starts in the first window")
     yield 4
     rig.shot("2_job_in_the_first.png")
-    with bpy.context.temp_override(window=second):
-        bpy.ops.wm.window_close()
+    close_window(second)
     yield 1
     rig.check(job() is not None, "closing another window leaves the job alone")
     yield from wait_for_job(rig, 600)
@@ -94,8 +103,7 @@ def own_window_closed(rig):
         rig.check(started is not None, "a job starts in the second window")
         yield 3
         rig.shot("5_job_in_the_second.png")
-        with bpy.context.temp_override(window=second):
-            bpy.ops.wm.window_close()
+        close_window(second)
         yield 2
         rig.shot("5_job_in_the_first.png")
         rig.check(job() is started, f"the window that is left goes on with it {end}")

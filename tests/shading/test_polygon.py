@@ -5,15 +5,10 @@ import polygon_quadrature
 import pytest
 import textbook
 
-from ltsh_addon.shading import polygon as polygon_module
 from ltsh_addon.shading.polygon import (
-    clip_single_run,
     clip_to_horizon,
-    horizon_patterns,
     project_to_sphere,
     solid_angle,
-    split_at_horizon,
-    split_long_edges,
 )
 
 ARROW = np.array([[-1.0, -1.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [-0.4, 0.0, 0.0]])
@@ -81,51 +76,6 @@ def test_the_two_sides_of_the_horizon_add_up_to_a_non_convex_polygon(shape):
     # Mirroring in z turns the vector area's x and y components around.
     total = above + below * np.array([-1.0, -1.0, 1.0])
     assert total == pytest.approx(vector_area(polygon), abs=1e-13)
-
-
-def test_split_at_horizon_partitions_the_points():
-    polygons = random_rectangles(300, seed=3, height=0.0)
-    above = (polygons[..., 2] > 0.0).any(axis=1)
-    seen = np.concatenate([index for index, _ in split_at_horizon(batch(*polygons))])
-    assert sorted(seen) == list(np.nonzero(above)[0])
-    whole = [part for _, part in split_at_horizon(batch(*(polygons + np.array([0.0, 0.0, 100.0]))))]
-    assert len(whole) == 1 and whole[0].shape == (3, 4, 300)
-    assert list(split_at_horizon(batch(*(polygons - np.array([0.0, 0.0, 100.0]))))) == []
-
-
-@pytest.mark.parametrize("corners", [3, 4, 5, 6, 7, 8])
-def test_both_ways_to_clip_give_the_same_polygon(corners):
-    """Regular polygons, of which one run of corners is above the horizon; corner by corner, up to where it starts."""
-    generator = np.random.default_rng(corners)
-    angle = 2.0 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
-    frames = np.linalg.qr(generator.normal(size=(400, 3, 3)))[0]
-    polygons = ring @ frames + generator.uniform(-0.9, 0.9, size=(400, 1, 3))
-    above = (polygons[..., 2] > 0.0).sum(axis=1)
-    polygons = polygons[(above > 0) & (above < corners)]
-    assert len(polygons) > 100
-    vertices = batch(*polygons)
-    patterns = horizon_patterns(vertices[2])
-    assert (polygon_module._pattern_kinds(corners)[patterns] == polygon_module.SINGLE_RUN).all()
-    fast, slow = clip_single_run(vertices, patterns), clip_to_horizon(vertices)
-    assert fast.shape[1] == corners + 1 and fast[2].min() == 0.0
-    for n in range(len(polygons)):
-        assert vector_area(fast[:, :, n].T) == pytest.approx(vector_area(slow[:, :, n].T), abs=1e-14)
-        assert len(np.unique(fast[:, :, n].round(12), axis=1).T) == len(np.unique(slow[:, :, n].round(12), axis=1).T)
-
-
-def test_splitting_long_edges_adds_the_points_nearest_to_the_origin():
-    vertices = batch(*random_rectangles(50, seed=11, height=2.0))
-    split = split_long_edges(vertices)
-    assert np.array_equal(split[:, ::2], vertices)
-    along = np.roll(vertices, -1, axis=1) - vertices
-    on_edge = np.linspace(0.0, 1.0, 101)[:, None, None, None]
-    distance = np.linalg.norm(vertices + on_edge * along, axis=1).min(axis=0)
-    found = np.linalg.norm(split[:, 1::2], axis=0)
-    # No sampled point is nearer, and the nearest sampled one is at most a step of an edge away.
-    assert (found <= distance + 1e-12).all()
-    assert (distance - found <= 0.01 * np.linalg.norm(along, axis=0)).all()
-    assert solid_angle(project_to_sphere(split)) == pytest.approx(solid_angle(project_to_sphere(vertices)), abs=1e-12)
 
 
 def test_solid_angle_of_triangles_is_lhuilier():

@@ -56,14 +56,6 @@ def test_basis_is_the_even_half_of_the_usual_one():
         assert np.abs(row - usual).max() < 2e-13, (degree, order)
 
 
-def test_float32_directions_give_float32_values():
-    directions = random_directions(50, seed=5)
-    single = spherical_harmonics.evaluate(4, directions.astype(np.float32))
-    assert single.dtype == np.float32
-    # Values below 1 and slopes below 10 for degree 4: a few times 10 * 6e-8
-    assert np.abs(single - spherical_harmonics.evaluate(4, directions)).max() < 3e-6
-
-
 @pytest.mark.parametrize("degree", range(DEGREE + 1))
 def test_hemisphere_integrals(degree):
     directions, weights = sphere_rule(DEGREE, upper=True)

@@ -29,17 +29,13 @@ def statistics():
 
 @pytest.mark.parametrize("name", SHIPPED_TABLES)
 def test_error_is_within_the_bound(statistics, name):
+    """Bilinear lookup costs less than a tenth of the least error of any coefficients under the interpolated warp."""
     found = statistics[name]
     print(name, found)
+    assert found.mean < 1.1 * found.solved_mean
     assert found.mean < MEAN[name] and found.median < MEDIAN[name]
     assert found.albedo_mean < 0.001 and found.albedo_maximum < 0.01
     assert found.negative_mass_mean < 0.001 and found.negative_mass_maximum < 0.01
-
-
-@pytest.mark.parametrize("name", SHIPPED_TABLES)
-def test_bilinear_lookup_costs_less_than_a_tenth(statistics, name):
-    """Against the coefficients of least error at the point itself, under the interpolated warp."""
-    assert statistics[name].mean < 1.1 * statistics[name].solved_mean
 
 
 def test_more_coefficients_are_better(statistics):
@@ -110,19 +106,6 @@ def test_mirrors_have_the_known_limit(name):
     values = evaluate_lobe(table, np.ones(1), np.zeros(1), (inverse / length[:, None])[None])[0]
     original = values / (lobe.xx * lobe.yy * lobe.zz * length**3)
     assert np.abs(original - z / np.pi).max() < 1e-3
-
-
-@pytest.mark.parametrize("name", SHIPPED_TABLES)
-def test_neighboring_lookups_give_neighboring_lobes(name):
-    """Across the edges of cells: bilinear interpolation is continuous."""
-    table = load_table(name)
-    count = table.warp.shape[0]
-    edge = np.arange(1, count - 1) / (count - 1)
-    directions = np.broadcast_to(np.array([[-0.6, 0.0, 0.8], [0.0, 0.6, 0.8]]), (count - 2, 2, 3))
-    cosine = np.full(count - 2, 0.7)
-    below = evaluate_lobe(table, cosine, edge - 1e-9, directions)
-    above = evaluate_lobe(table, cosine, edge + 1e-9, directions)
-    assert np.abs(above - below).max() < 1e-5 * np.abs(below).max()
 
 
 @pytest.fixture(autouse=True)

@@ -34,7 +34,7 @@ def build_scene(path, textured=False):
     import scene_parts
 
     scene_parts.empty_scene()
-    scene_parts.add_camera((0.0, -4.0, 3.0))
+    scene_parts.add_camera((0.0, -4.0, 3.0), (0.0, 0.0, 0.0))
     for number in range(4):
         place = (1.6 * (number % 2) - 0.8, 1.6 * (number // 2) - 0.8, 1.5)
         scene_parts.add_area_light(location=place, rotation=(0.3, 0.0, 0.2))
@@ -119,7 +119,8 @@ def _equal_error(scene, folder, kind, counts):
     small, size = ("--size", str(EQUAL_SIZE // 4)), ("--size", str(EQUAL_SIZE))
     common = ("--passes", "specular", "--margin", "0")
     bake(scene, folder / "truth", *small, *common, "--techniques", "ltsh4,reference")
-    error = _relative(*_layers(folder / "truth", "ltsh4.specular", "reference.specular"))
+    found, expected = _layers(folder / "truth", "ltsh4.specular", "reference.specular")
+    error = math.sqrt(((found - expected) ** 2).sum() / (expected**2).sum())
     # The second time, so that what the first one read is in memory.
     for _ in range(2):
         seconds, _ = bake(scene, folder / "ours", *size, *common)
@@ -152,11 +153,6 @@ def _layers(folder, *names):
 
     layers = imaging.read_layers(folder / "Floor.exr")
     return [layers[name].astype(np.float64) for name in names]
-
-
-def _relative(found, expected):
-    """Relative L2 error."""
-    return math.sqrt(((found - expected) ** 2).sum() / (expected**2).sum())
 
 
 def _scene(folder, kind):

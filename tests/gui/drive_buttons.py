@@ -22,7 +22,6 @@ def main(rig):
 
 
 def mended(rig):
-    camera = bpy.context.scene.camera
     bpy.context.scene.camera = None
     hands.operate(rig, bpy.ops.ed.undo_push, message="Without camera")
     yield 3
@@ -35,22 +34,11 @@ def mended(rig):
     yield from hands.over(rig)
     yield from hands.keys(rig, "ctrl+z")
     rig.check(bpy.context.scene.camera is None, "and one undo takes it back")
-    rig.check(len([ob for ob in bpy.data.objects if ob.type == "CAMERA"]) == 1, "with its object")
-    bpy.context.scene.camera = bpy.data.objects[camera.name] if camera_is_there(camera) else first_camera()
+    cameras = [ob for ob in bpy.data.objects if ob.type == "CAMERA"]
+    rig.check(len(cameras) == 1, "with its object")
+    bpy.context.scene.camera = cameras[0]
     hands.operate(rig, bpy.ops.ed.undo_push, message="With camera")
     yield 2
-
-
-def camera_is_there(camera):
-    """Undo makes new datablocks: what was read before may be gone."""
-    try:
-        return camera.name in bpy.data.objects
-    except ReferenceError:
-        return False
-
-
-def first_camera():
-    return next(ob for ob in bpy.data.objects if ob.type == "CAMERA")
 
 
 def shaded(rig):

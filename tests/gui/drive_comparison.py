@@ -28,10 +28,8 @@ def cancelled(rig):
     yield 1.0
     pulse.stop(rig, "until the first pictures are there")
     rig.shot("2_running.png")
-    rig.check(
-        hands.job() is not None and len(hands.job().results) == 1, "the techniques are shown while Cycles still renders"
-    )
     stopped = hands.job()
+    rig.check(stopped is not None and len(stopped.results) == 1, "the techniques are shown while Cycles still renders")
     pulse = hands.Pulse()
     yield from hands.click_button(rig, hands.CANCEL)
     yield from hands.until(lambda: stopped.cancelled)
@@ -74,10 +72,7 @@ def looked_at(rig):
     y = rig.size[1] - (region.y + middle)
     target = region.view2d.view_to_region(0.25, 0.5)[0]
     yield from hands.drag(rig, (region.x + x, y - 40), (region.x + target, y - 40))
-    yield from hands.until(lambda: abs(hands.settings().split - 0.25) < 0.02)
-    rig.check(
-        abs(hands.settings().split - 0.25) < 0.02, f"the line follows the mouse: split is {hands.settings().split:.3f}"
-    )
+    yield from hands.line_at(rig, 0.25, 0.02)
     rig.shot("5_dragged.png")
     image = bpy.data.images["LTSH Comparison"]
     cycles = bpy.data.images["LTSH cycles.combined"]

@@ -109,6 +109,13 @@ def drag(rig, start, end):
     yield CLICK_SECONDS
 
 
+def line_at(rig, share, most):
+    """Wait for the line of the wipe to follow the mouse there."""
+    yield from until(lambda: abs(settings().split - share) < most)
+    found = settings().split
+    rig.check(abs(found - share) < most, f"the line follows the mouse: split is {found:.3f}")
+
+
 def keys(rig, *names):
     """Press keys or shortcuts such as ctrl+z one after another; the mouse must be over the area that they are for."""
     for name in names:

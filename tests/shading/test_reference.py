@@ -77,13 +77,13 @@ def quadrature(light, round_light, **options):
     return values[:, 0], error[0]
 
 
-@pytest.mark.parametrize("round_light", [False, True], ids=["rectangle", "ellipse"])
-def test_rough_surfaces_match_quadrature_over_the_area(round_light):
+@pytest.mark.parametrize(("round_light", "tolerance"), [(False, 1e-4), (True, 1e-4), (False, 1e-7)])
+def test_rough_surfaces_match_quadrature_over_the_area(round_light, tolerance):
     for light in random_lights(1, 40):
         expected = over_area(*light, round_light)
-        found, estimate = quadrature(light, round_light)
+        found, estimate = quadrature(light, round_light, tolerance=tolerance)
         error = np.abs(found - expected).max()
-        assert error < 1e-4 * expected[0] + 1e-6, light
+        assert max(error, estimate) < tolerance * expected[0] + 1e-6, light
         # 1e-9: what 160 Gauss-Legendre nodes leave of the sharpest of these lobes
         assert error <= estimate + 1e-9, light
 
@@ -109,14 +109,6 @@ def test_smooth_surfaces_match_adaptive_quadrature(lowest, roughness):
         assert error < 1e-4 * abs(expected) + 1e-6 + bound
         # The difference of two orders is an estimate: for sharp lobes it may fall short, most where it is below 1e-6.
         assert error <= 2.0 * estimate + bound + 1e-6
-
-
-def test_a_tighter_tolerance_is_met():
-    for light in random_lights(4, 20):
-        expected = over_area(*light, False)
-        found, estimate = quadrature(light, False, tolerance=1e-7)
-        assert np.abs(found - expected).max() < 1e-7 * expected[0] + 1e-6
-        assert estimate < 1e-7 * expected[0] + 1e-6
 
 
 def test_a_light_over_the_whole_hemisphere_gives_the_directional_albedo():

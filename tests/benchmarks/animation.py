@@ -9,7 +9,6 @@ Ends with 1 where it grows with the frames.
 
 import argparse
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -20,7 +19,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-MIB = 1 << 20
+sys.path.insert(0, str(ROOT))
+
+import measure  # noqa: E402
+
 # Of either process, from the second quarter of the time to the last; a picture per frame would be 240 MiB and more.
 MOST_GROWTH = 16.0
 
@@ -28,14 +30,17 @@ MOST_GROWTH = 16.0
 def run(arguments, readings):
     """Seconds that `ltsh shade` takes, and those of processors.
 
-    `readings` receives seconds, bytes of the process, of its children, and processor seconds of all.
+    `readings` receives seconds, MiB of the process, of its children, and processor seconds of all.
     """
     command = [sys.executable, "-m", "ltsh_addon", "shade", *map(str, arguments), "--quiet"]
     start, used = time.perf_counter(), _of_children()
     program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
         while program.poll() is None:
-            readings.append((time.perf_counter() - start, *_reading(program.pid)))
+            below = measure.children(program.pid)
+            memory = measure.resident(program.pid), sum(map(measure.resident, below))
+            seconds = sum(map(measure.processor_seconds, (program.pid, *below)))
+            readings.append((time.perf_counter() - start, *memory, seconds))
             time.sleep(0.5 if readings[-1][0] > 20.0 else 0.05)
     finally:
         program.kill()
@@ -49,26 +54,6 @@ def _of_children():
     """Processor seconds of all processes that have ended below this one."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
-
-
-def _reading(parent):
-    """Resident bytes of the process and of its children, and processor seconds of all of them."""
-    try:
-        below = [int(number) for number in Path(f"/proc/{parent}/task/{parent}/children").read_text().split()]
-    except OSError:
-        below = []
-    memory, seconds = zip(*map(_process, (parent, *below)), strict=True)
-    return memory[0], sum(memory[1:]), sum(seconds)
-
-
-def _process(number):
-    """Resident bytes and processor seconds of one process."""
-    try:
-        pages = int(Path(f"/proc/{number}/statm").read_text().split()[1])
-        fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
-    except (OSError, IndexError):
-        return 0, 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE"), (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def report(frames, scene=None, resolution="64x36") -> bool:
@@ -108,7 +93,7 @@ def _over_time(rows, each) -> bool:
         inside = rows[(rows[:, 0] >= begin) & (rows[:, 0] <= end)]
         used = np.interp([begin, end], rows[:, 0], processors)
         used = (used[1] - used[0]) / (last - 1 - first)
-        kept.append(inside[:, 1:3].max(axis=0) / MIB)
+        kept.append(inside[:, 1:3].max(axis=0))
         print(f"  frames {first + 1:4} to {last:4}: {used:5.2f} s of processors each, "
               f"at most {kept[-1][0]:6.1f} MiB, Blender {kept[-1][1]:6.1f} MiB")  # fmt: skip
     return bool((kept[-1] - kept[1] < MOST_GROWTH).all())
@@ -126,5 +111,4 @@ def main():
 
 
 if __name__ == "__main__":
-    sys.path.insert(0, str(ROOT))
     main()

@@ -17,7 +17,10 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender" / "helpers")]
+
+import measure  # noqa: E402
+
 GROWTH_LIMIT = 0.1
 # Size -> seconds of our own work and MiB that a bake may take.
 LIMITS = {1024: (3.0, 4096.0), 4096: (60.0, 4096.0)}
@@ -26,47 +29,25 @@ EQUAL_SIZE = 512
 FACTOR = 30.0
 
 
-def build_scene(path, textured=False, rotation=(0.3, 0.0, 0.2)):
+def build_scene(path, textured=False):
     """A glossy plane of 6 m under four rectangles; `textured`: its color and roughness are procedural textures."""
-    import bpy
-    import numpy as np
+    import scene_parts
 
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(camera)
-    camera.location, scene.camera = (0.0, -4.0, 3.0), camera
+    scene_parts.empty_scene()
+    scene_parts.add_camera((0.0, -4.0, 3.0), (0.0, 0.0, 0.0))
     for number in range(4):
-        light = bpy.data.lights.new("Light", "AREA")
-        light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 1.2, 0.7, 100.0
-        ob = bpy.data.objects.new("Light", light)
-        scene.collection.objects.link(ob)
-        ob.location = (1.6 * (number % 2) - 0.8, 1.6 * (number // 2) - 0.8, 1.5)
-        ob.rotation_euler = rotation
-    mesh = bpy.data.meshes.new("Floor")
-    mesh.from_pydata([(-3, -3, 0), (3, -3, 0), (3, 3, 0), (-3, 3, 0)], [], [(0, 1, 2, 3)])
-    mesh.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 1, 0, 1, 1, 0, 1]))
-    mesh.materials.append(_material(textured))
-    scene.collection.objects.link(bpy.data.objects.new("Floor", mesh))
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
-
-
-def _material(textured):
-    import bpy
-
-    material = bpy.data.materials.new("Glossy")
-    if bpy.app.version < (5, 0, 0):
-        material.use_nodes = True
-    tree = material.node_tree
-    node = tree.nodes["Principled BSDF"]
+        place = (1.6 * (number % 2) - 0.8, 1.6 * (number // 2) - 0.8, 1.5)
+        scene_parts.add_area_light(location=place, rotation=(0.3, 0.0, 0.2))
+    material, node = scene_parts.principled("Glossy", Roughness=0.35)
     node.inputs["Base Color"].default_value = (0.4, 0.3, 0.2, 1.0)
-    node.inputs["Roughness"].default_value = 0.35
     if textured:
+        tree = material.node_tree
         noise, places = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeTexCoord")
         tree.links.new(places.outputs["Object"], noise.inputs["Vector"])
         tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
         tree.links.new(noise.outputs[0], node.inputs["Roughness"])
-    return material
+    scene_parts.add_plane(material, name="Floor")
+    scene_parts.save(path)
 
 
 def bake(scene, output, *options):
@@ -76,39 +57,14 @@ def bake(scene, output, *options):
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     peaks, processor = {}, 0.0
     while process.poll() is None:
-        processor = _processor_seconds(process.pid) or processor
-        for kind, pid in [("own", process.pid), *(("Blender", child) for child in _children(process.pid))]:
-            peaks[kind] = max(peaks.get(kind, 0.0), _peak(pid))
+        processor = measure.processor_seconds(process.pid) or processor
+        for kind, pid in [("own", process.pid), *(("Blender", child) for child in measure.children(process.pid))]:
+            peaks[kind] = max(peaks.get(kind, 0.0), measure.resident(pid, "VmHWM"))
         time.sleep(0.02)
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
     json.loads(process.stdout.read())
     return {**json.loads((output / "timing.json").read_text())["seconds"], "processor": processor}, peaks
-
-
-def _children(pid):
-    try:
-        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    except OSError:
-        return []
-
-
-def _processor_seconds(pid):
-    """User and system time of a process so far, its children left out; 0 where it has ended."""
-    try:
-        user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
-    except OSError:
-        return 0.0
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
-
-
-def _peak(pid):
-    """Largest resident size of a process so far in MiB; 0 where it has ended."""
-    try:
-        status = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:
-        return 0.0
-    return max((int(line.split()[1]) / 1024.0 for line in status if "VmHWM" in line), default=0.0)
 
 
 def memory(sizes, *options):
@@ -163,7 +119,8 @@ def _equal_error(scene, folder, kind, counts):
     small, size = ("--size", str(EQUAL_SIZE // 4)), ("--size", str(EQUAL_SIZE))
     common = ("--passes", "specular", "--margin", "0")
     bake(scene, folder / "truth", *small, *common, "--techniques", "ltsh4,reference")
-    error = _relative(*_layers(folder / "truth", "ltsh4.specular", "reference.specular"))
+    found, expected = _layers(folder / "truth", "ltsh4.specular", "reference.specular")
+    error = math.sqrt(((found - expected) ** 2).sum() / (expected**2).sum())
     # The second time, so that what the first one read is in memory.
     for _ in range(2):
         seconds, _ = bake(scene, folder / "ours", *size, *common)
@@ -196,11 +153,6 @@ def _layers(folder, *names):
 
     layers = imaging.read_layers(folder / "Floor.exr")
     return [layers[name].astype(np.float64) for name in names]
-
-
-def _relative(found, expected):
-    """Relative L2 error."""
-    return math.sqrt(((found - expected) ** 2).sum() / (expected**2).sum())
 
 
 def _scene(folder, kind):

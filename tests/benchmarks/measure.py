@@ -1,40 +1,61 @@
-"""Timing in rounds, and counting of what numpy writes."""
+"""Timing in rounds, time and memory of processes, and counting of what numpy writes."""
 
 import gc
+import os
 import time
+from pathlib import Path
 
 import numpy as np
 
 from ltsh_addon.shading import moments32
 
 
-def interleaved(cases, rounds=5):
-    """Median seconds of every case {name: function}, taken in turn so that a busy machine disturbs all alike."""
+def ratios(cases, base, rounds=5):
+    """Median seconds of every case {name: function}, and {name: median over the rounds of time / time of `base`}; cases
+    are taken in turn so that a busy machine disturbs all alike."""
     for function in cases.values():
         function()
-    seconds = {name: [] for name in cases}
+    times = {name: [] for name in cases}
     gc.disable()
     for _ in range(rounds):
         for name, function in cases.items():
             start = time.perf_counter()
             function()
-            seconds[name].append(time.perf_counter() - start)
-    gc.enable()
-    return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def ratios(cases, base, rounds=5):
-    """(seconds, {name: median over the rounds of time / time of `base`})."""
-    for function in cases.values():
-        function()
-    times = {name: [] for name in cases}
-    for _ in range(rounds):
-        for name, function in cases.items():
-            start = time.perf_counter()
-            function()
             times[name].append(time.perf_counter() - start)
+    gc.enable()
     medians = {name: float(np.median(values)) for name, values in times.items()}
     return medians, {name: float(np.median(np.divide(times[name], times[base]))) for name in times}
+
+
+def interleaved(cases, rounds=5):
+    """Median seconds of every case."""
+    return ratios(cases, next(iter(cases)), rounds)[0]
+
+
+def children(pid):
+    """Numbers of the processes that a process has started; Linux only, as all below."""
+    try:
+        return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+def processor_seconds(pid):
+    """User and system time of a process so far, its children left out; 0 where it has ended."""
+    try:
+        user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    except OSError:
+        return 0.0
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def resident(pid, kind="VmRSS"):
+    """MiB of a process that are resident, or its peak, "VmHWM"; 0 where it has ended."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return max((int(line.split()[1]) / 1024.0 for line in status if kind in line), default=0.0)
 
 
 class _Counted(np.ndarray):

@@ -7,6 +7,7 @@ import argparse
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from functools import partial
@@ -40,6 +41,14 @@ def row(name, nanoseconds, ratio=None, note=""):
     print(f"  {name:<42}{nanoseconds:>9.1f} ns{'' if ratio is None else f'{ratio:>8.2f} x'}  {note}")
 
 
+def compared(cases, base, rounds, per):
+    """Print the time of every case, by `per` polygons or samples, and its ratio to the case `base`; the ratios."""
+    medians, ratio = measure.ratios(cases, base, rounds)
+    for name, seconds in medians.items():
+        row(name, seconds / per * 1e9, ratio[name])
+    return ratio
+
+
 def polygons(options):
     """`integrate_polygon` alone: lookup, clip and integral of one lobe per rectangle."""
     count = 20_000 if options.quick else 100_000
@@ -52,9 +61,7 @@ def polygons(options):
         for degree in (2, 4):
             peer = ZonalHarmonics(degree)
             cases[f"zonal harmonics N={degree} (peer)"] = partial(zonal, peer, TABLES[f"ltsh{degree}"], *data)
-        medians, ratio = measure.ratios(cases, "ltc", 3 if options.quick else 5)
-        for name, seconds in medians.items():
-            row(name, seconds / count * 1e9, ratio[name])
+        ratio = compared(cases, "ltc", 3 if options.quick else 5, count)
         targets(ratio)
         print(f"  peer, target >= 5 x ltsh4: {ratio['zonal harmonics N=4 (peer)'] / ratio['ltsh4']:.1f}")
 
@@ -90,9 +97,7 @@ def shade(options):
             cases["diffuse"] = partial(shading.shade, samples, lights, "ltc", passes=["diffuse"], workers=1)
         for name, table in TABLES.items():
             cases[name] = partial(specular, samples, lights, table)
-        medians, ratio = measure.ratios(cases, "ltc", 3 if options.quick else 5)
-        for name, seconds in medians.items():
-            row(name, seconds / count / 4 * 1e9, ratio[name])
+        ratio = compared(cases, "ltc", 3 if options.quick else 5, 4 * count)
         if fresnel == "white":
             targets(ratio)
 
@@ -118,9 +123,7 @@ def light_kinds(options):
             f"{name}, {part}": partial(shading.shade, samples, its, TABLES["ltsh4"], passes=[part], workers=1)
             for name, its in kinds.items()
         }
-        medians, ratio = measure.ratios(cases, f"rectangle, {part}", 3)
-        for name, seconds in medians.items():
-            row(name, seconds / count / 4 * 1e9, ratio[name])
+        compared(cases, f"rectangle, {part}", 3, 4 * count)
 
 
 def specular(samples, lights, table, **options):
@@ -235,10 +238,34 @@ def cpu_seconds():
 
 def cycles(options):
     """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
-    from equal_error import report
+    from ltsh_addon.blender.process import client
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
-    report(64 if options.quick else 128)
+    count = 64 if options.quick else 128
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
+        scene = Path(folder) / "demo.blend"
+        client.build_demo(scene)
+        extraction = client.extract(client.ExtractOptions(scene, width=480, height=270, cycles_samples=count))
+    start = time.perf_counter()
+    shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])
+    shade_seconds = time.perf_counter() - start
+    image = extraction.film.image(shaded.combined)
+    a, b = (half.astype(np.float64) for half in extraction.reference["specular"])
+    energy = (a * b).sum()
+    # Halves with different seeds: their noise cancels in the product, and their difference is nothing else.
+    error = ((image - a) * (image - b)).sum() / energy
+    noise = 0.25 * ((a - b) ** 2).sum() / energy
+    needed = count * noise / max(error, 1e-12)
+    per_sample = extraction.seconds["cycles"] / count
+    ours = extraction.seconds["samples"] + shade_seconds
+    cycles = f"{count} samples in {extraction.seconds['cycles']:.1f} s, noise {noise**0.5:.2%}"
+    size = f"{len(extraction.samples)} samples, {len(extraction.lights)} lights"
+    print(f"  Cycles: {cycles}")
+    print(f"  ltsh4: error {error**0.5:.2%}, sample extraction {extraction.seconds['samples']:.2f} s")
+    print(f"         shading {shade_seconds:.2f} s ({size})")
+    factor = f"{needed * per_sample / ours:.1f} x our time (target 20 x)"
+    print(f"  Cycles needs {needed:.0f} samples, {needed * per_sample:.1f} s, for that error: {factor},")
+    print(f"         {needed * per_sample / shade_seconds:.0f} x the shading alone")
     heading("time at equal error of a bake, ltsh4 against Cycles' bake")
     bake_cost.equal_error(options.quick)
 

@@ -120,20 +120,14 @@ def area_of(light):
 def test_the_parts_of_a_light_have_its_power(shape, spread, direction):
     light = AreaLight("L", shape, **{**PLACED, "direction": [0, 0, direction]}, radiance=[1.0, 1.0, 1.0], spread=spread)
     image = np.random.default_rng(7).random((64, 64, 3))
-    whole = np.ones((64, 64, 3))
-    parts = split_light(light, cut_into_patches(whole, everywhere(whole), most=1))
-    cut = cut_into_patches(image, everywhere(image), most=100)
-    for (whole_light,), mean in ((parts, 1.0), (split_light(light, cut), None)):
-        lights = whole_light.patches
-        powers = [area_of(part) * part.radiance for part in lights]
-        expected = 4.0 * 0.6 * 0.4 * (np.pi / 4.0 if shape == "ELLIPSE" else 1.0)
+    area = 4.0 * 0.6 * 0.4 * (np.pi / 4.0 if shape == "ELLIPSE" else 1.0)
+    # The mean of the image inside the ellipse is not known better than by its pixels.
+    for picture, most, mean, tolerance in ((np.ones((64, 64, 3)), 1, 1.0, 1e-9), (image, 100, 0.5, 0.03)):
+        (whole,) = split_light(light, cut_into_patches(picture, everywhere(picture), most=most))
+        powers = [area_of(part) * part.radiance for part in whole.patches]
         # Counterclockwise around the direction: all areas are positive.
         assert min(power.min() for power in powers) > 0.0
-        if mean is not None:
-            assert np.allclose(sum(powers), expected * mean, rtol=1e-9)
-        else:
-            # The mean of the image inside the ellipse is not known better than by its pixels.
-            assert np.allclose(sum(powers), expected * 0.5, rtol=0.03)
-        assert {part.spread for part in lights} == {spread}
-        if spread < np.pi and mean is None:
-            assert {part.shape for part in lights} == {"RECTANGLE"}
+        assert np.allclose(sum(powers), area * mean, rtol=tolerance)
+        assert {part.spread for part in whole.patches} == {spread}
+        if spread < np.pi and most > 1:
+            assert {part.shape for part in whole.patches} == {"RECTANGLE"}

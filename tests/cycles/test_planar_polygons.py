@@ -38,11 +38,21 @@ def rotation(generator):
     return np.linalg.qr(generator.normal(size=(3, 3)))[0]
 
 
-def test_a_fine_grid_is_one_rectangle():
-    vertices, triangles = grid(40, 30)
-    (polygon,) = flat_polygons(vertices, triangles, labels(triangles))
-    assert len(polygon.corners) == 4 and area(polygon) == pytest.approx(1200.0)
-    assert np.allclose(polygon.normal, (0.0, 0.0, 1.0))
+@pytest.mark.parametrize(
+    ("size", "missing", "pieces", "corners", "expected"),
+    [
+        ((40, 30), (), 1, 4, 1200.0),
+        ((2, 2), {(1, 1)}, 1, 6, 3.0),
+        ((3, 3), {(1, 1)}, 16, 3, 8.0),  # a hole
+        ((2, 2), {(0, 1), (1, 0)}, 2, 4, 2.0),  # corners that touch
+    ],
+)
+def test_grids_are_simple_outlines_where_they_have_one(size, missing, pieces, corners, expected):
+    vertices, triangles = grid(*size, missing)
+    polygons = flat_polygons(vertices, triangles, labels(triangles))
+    assert [len(polygon.corners) for polygon in polygons] == pieces * [corners]
+    assert sum(area(polygon) for polygon in polygons) == pytest.approx(expected)
+    assert all(np.allclose(polygon.normal, (0.0, 0.0, 1.0)) for polygon in polygons)
 
 
 def test_single_precision_in_any_pose_does_not_break_the_plane():
@@ -52,21 +62,6 @@ def test_single_precision_in_any_pose_does_not_break_the_plane():
         moved = 0.1 * vertices @ rotation(generator).T + generator.normal(size=3)
         polygons = flat_polygons(moved.astype(np.float32).astype(float), triangles, labels(triangles))
         assert len(polygons) == 1 and len(polygons[0].corners) == 4
-
-
-def test_an_l_keeps_its_six_corners_and_a_hole_leaves_pieces():
-    vertices, triangles = grid(2, 2, missing={(1, 1)})
-    (polygon,) = flat_polygons(vertices, triangles, labels(triangles))
-    assert len(polygon.corners) == 6 and area(polygon) == pytest.approx(3.0)
-    vertices, triangles = grid(3, 3, missing={(1, 1)})
-    pieces = flat_polygons(vertices, triangles, labels(triangles))
-    assert len(pieces) == 16 and sum(area(piece) for piece in pieces) == pytest.approx(8.0)
-
-
-def test_corners_that_touch_are_no_simple_outline():
-    vertices, triangles = grid(2, 2, missing={(0, 1), (1, 0)})
-    pieces = flat_polygons(vertices, triangles, labels(triangles))
-    assert len(pieces) == 2 and sorted(area(piece) for piece in pieces) == pytest.approx([1.0, 1.0])
 
 
 def test_labels_are_not_mixed():

@@ -1,23 +1,7 @@
 """What is missing and its fix, shading, baking, undo in one step, the preview, the manual: each by a click."""
 
 import bpy
-from hands import (
-    MANUAL,
-    PREVIEW,
-    SHADE,
-    click,
-    click_button,
-    image_pixels,
-    job,
-    keys,
-    module,
-    open_panel,
-    over,
-    settings,
-    to_window,
-    until,
-    wait_for_job,
-)
+import hands
 
 SIZE = "1280x900"
 SECONDS = 1800
@@ -27,8 +11,8 @@ SHADED = "LTSH ltsh4.combined"
 
 
 def main(rig):
-    settings().resolution_percentage, settings().bake_size = 25, "256"
-    yield from open_panel(rig)
+    hands.settings().resolution_percentage, hands.settings().bake_size = 25, "256"
+    yield from hands.open_panel(rig)
     yield 2
     yield from mended(rig)
     yield from shaded(rig)
@@ -38,95 +22,76 @@ def main(rig):
 
 
 def mended(rig):
-    camera = bpy.context.scene.camera
     bpy.context.scene.camera = None
-    with rig.override():
-        bpy.ops.ed.undo_push(message="Without camera")
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Without camera")
     yield 3
     rig.shot("1_no_camera.png")
-    yield from click_button(rig, SHADE)
-    rig.check(job() is None, "without a camera nothing starts")
-    yield from click_button(rig, ADD_CAMERA)
+    yield from hands.click_button(rig, hands.SHADE)
+    rig.check(hands.job() is None, "without a camera nothing starts")
+    yield from hands.click_button(rig, ADD_CAMERA)
     yield 1
     rig.check(bpy.context.scene.camera is not None, "Add Camera adds one")
-    yield from over(rig)
-    yield from keys(rig, "ctrl+z")
+    yield from hands.over(rig)
+    yield from hands.keys(rig, "ctrl+z")
     rig.check(bpy.context.scene.camera is None, "and one undo takes it back")
-    rig.check(len([ob for ob in bpy.data.objects if ob.type == "CAMERA"]) == 1, "with its object")
-    bpy.context.scene.camera = bpy.data.objects[camera.name] if camera_is_there(camera) else first_camera()
-    with rig.override():
-        bpy.ops.ed.undo_push(message="With camera")
+    cameras = [ob for ob in bpy.data.objects if ob.type == "CAMERA"]
+    rig.check(len(cameras) == 1, "with its object")
+    bpy.context.scene.camera = cameras[0]
+    hands.operate(rig, bpy.ops.ed.undo_push, message="With camera")
     yield 2
 
 
-def camera_is_there(camera):
-    """Undo makes new datablocks: what was read before may be gone."""
-    try:
-        return camera.name in bpy.data.objects
-    except ReferenceError:
-        return False
-
-
-def first_camera():
-    return next(ob for ob in bpy.data.objects if ob.type == "CAMERA")
-
-
 def shaded(rig):
-    yield from click_button(rig, SHADE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a click on Shade Camera View starts a job")
-    yield from wait_for_job(rig, 900)
+    yield from hands.click_button(rig, hands.SHADE)
+    yield from hands.job_started(rig, "a click on Shade Camera View starts a job")
+    yield from hands.wait_for_job(rig, 900)
     # Panels below one that became shorter move for a moment.
     yield 3
-    pixels = image_pixels(SHADED)
+    pixels = hands.image_pixels(SHADED)
     rig.check(max(pixels, default=0.0) > 0.1, "the picture is an image of Blender")
     rig.shot("2_shaded.png")
-    yield from over(rig)
-    yield from keys(rig, "ctrl+z")
-    rig.check(SHADED not in bpy.data.images and not settings().result_folder, "one undo takes the results back")
-    yield from keys(rig, "ctrl+shift+z")
-    rig.check(settings().result_folder != "", "redo brings the results back")
-    rig.check(image_pixels(SHADED) == pixels, "with the same pixels")
-    rig.check(job() is None, "and starts nothing")
+    yield from hands.over(rig)
+    yield from hands.keys(rig, "ctrl+z")
+    rig.check(SHADED not in bpy.data.images and not hands.settings().result_folder, "one undo takes the results back")
+    yield from hands.keys(rig, "ctrl+shift+z")
+    rig.check(hands.settings().result_folder != "", "redo brings the results back")
+    rig.check(hands.image_pixels(SHADED) == pixels, "with the same pixels")
+    rig.check(hands.job() is None, "and starts nothing")
 
 
 def previewed(rig):
     engine = bpy.context.scene.render.engine
-    yield from click_button(rig, PREVIEW)
+    yield from hands.click_button(rig, hands.PREVIEW)
     yield 4
     rig.check(bpy.context.scene.render.engine == "LTSH", "the preview is on")
     rig.shot("3_preview.png")
     # The panel that ends it stands above by then, with settings of its own.
-    with rig.override():
-        bpy.ops.ltsh.preview()
+    hands.operate(rig, bpy.ops.ltsh.preview)
     yield 2
     rig.check(bpy.context.scene.render.engine == engine, "and ending it brings the artist's engine back")
 
 
 def baked(rig):
-    bpy.ops.object.select_all(action="DESELECT")
-    bpy.data.objects["floor"].select_set(True)
-    bpy.context.view_layer.objects.active = bpy.data.objects["floor"]
-    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *BAKE_HEADER))
+    hands.select(rig, bpy.data.objects["floor"])
+    yield from hands.click(rig, *hands.to_window(rig, "VIEW_3D", "UI", *BAKE_HEADER))
     yield 3
     rig.shot("4_bake.png")
-    yield from click_button(rig, BAKE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a click on Bake Selected starts a job")
-    yield from wait_for_job(rig, 900)
+    yield from hands.click_button(rig, BAKE)
+    yield from hands.job_started(rig, "a click on Bake Selected starts a job")
+    yield from hands.wait_for_job(rig, 900)
     # Panels below one that became shorter move for a moment.
     yield 3
-    rig.check(max(image_pixels("LTSH floor ltsh4.combined"), default=0.0) > 0.1, "the baked texture is an image")
-    result = module("ui.results").result_of(bpy.context.scene)
+    rig.check(max(hands.image_pixels("LTSH floor ltsh4.combined"), default=0.0) > 0.1, "the baked texture is an image")
+    result = hands.module("ui.results").result_of(bpy.context.scene)
     rig.check(result is not None and result.command == "bake", "the results are those of the bake")
     rig.shot("5_baked.png")
-    yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *BAKE_HEADER))
+    yield from hands.click(rig, *hands.to_window(rig, "VIEW_3D", "UI", *BAKE_HEADER))
     yield 1
 
 
 def manual(rig):
     windows = len(bpy.context.window_manager.windows)
-    yield from click_button(rig, MANUAL)
+    yield from hands.click_button(rig, hands.MANUAL)
     yield 2
     rig.check(len(bpy.context.window_manager.windows) == windows + 1, "the question mark opens a window")
     text = bpy.data.texts.get("LTSH Manual")

@@ -5,21 +5,9 @@ same view, whose passes hold what every technique makes of it.
 """
 
 import bpy
+import eyes
 import numpy as np
-from eyes import (
-    AGREEMENT,
-    bare_view,
-    camera_like_view,
-    check_against_numpy,
-    final_render,
-    free_view,
-    linear,
-    plain_colors,
-    relative_l2,
-    settled,
-    unclipped,
-)
-from hands import CLICK_SECONDS, drag
+from hands import CLICK_SECONDS, drag, operate, select, view_middle
 
 SECONDS = 1800
 # Dark enough that next to nothing is clipped.
@@ -34,9 +22,9 @@ def main(rig):
     yield 1
     yield from previewed(rig)
     yield from with_panel(rig)
-    bare_view(rig)
-    free_view(rig, scene.camera)
-    plain_colors(scene, EXPOSURE)
+    eyes.bare_view(rig)
+    eyes.free_view(rig, scene.camera)
+    eyes.plain_colors(scene, EXPOSURE)
     yield from light_dragged(rig)
     seen = yield from techniques(rig)
     yield from passes(rig, seen["ltsh4"])
@@ -46,16 +34,11 @@ def main(rig):
     yield from back_to_cycles(rig)
 
 
-def view():
-    return bpy.context.scene.ltsh_view
-
-
 def previewed(rig):
-    with rig.override():
-        bpy.ops.ltsh.preview()
+    operate(rig, bpy.ops.ltsh.preview)
     rig.check(bpy.context.scene.render.engine == "LTSH", "the preview has our engine")
     rig.check(rig.space.shading.type == "RENDERED", "the preview has Rendered shading")
-    pixels = yield from settled(rig, "engine_1_preview.png")
+    pixels = yield from eyes.settled(rig, "engine_1_preview.png")
     rig.check(0.02 < pixels.mean() < 0.9 and pixels.std() > 0.05, "the view shows a picture")
 
 
@@ -64,24 +47,20 @@ def with_panel(rig):
     rig.panel()
     yield 1
     rig.tab("LTSH")
-    view().mode, view().technique, view().second_technique = "split", "ltc", "ltsh4"
+    eyes.view().mode, eyes.view().technique, eyes.view().second_technique = "split", "ltc", "ltsh4"
     rig.space.region_3d.view_camera_zoom = 14.0
     yield 2
     rig.shot("engine_1_panel.png", area="VIEW_3D")
-    view().mode, view().technique = "single", "ltsh4"
+    eyes.view().mode, eyes.view().technique = "single", "ltsh4"
     rig.space.region_3d.view_camera_zoom = 0.0
 
 
 def light_dragged(rig):
-    before = yield from settled(rig, "engine_2_before.png")
+    before = yield from eyes.settled(rig, "engine_2_before.png")
     light = bpy.data.objects["Porthole"]
     place = light.location.copy()
-    with rig.override():
-        bpy.ops.object.select_all(action="DESELECT")
-    light.select_set(True)
-    bpy.context.view_layer.objects.active = light
-    region = rig.region()
-    x, y = region.x + region.width // 2, rig.size[1] - region.y - region.height // 2
+    select(rig, light)
+    x, y = view_middle(rig)
     rig.xdo("mousemove", x, y)
     yield CLICK_SECONDS
     rig.xdo("key", "g")
@@ -92,17 +71,16 @@ def light_dragged(rig):
     rig.shot("engine_2_dragging.png")
     rig.xdo("click", 1)
     yield CLICK_SECONDS
-    after = yield from settled(rig, "engine_2_after.png")
+    yield from eyes.differs(rig, "engine_2_after.png", before, "the picture follows the light", 0.005)
     rig.check((light.location - place).length > 0.2, "the mouse has moved the light")
-    rig.check(np.abs(after - before).mean() > 0.005, "the picture follows the light")
 
 
 def techniques(rig):
     """What the screen shows for each technique."""
     seen = {}
     for name in LABELS:
-        view().technique = name
-        seen[name] = yield from settled(rig, f"engine_3_{name}.png")
+        eyes.view().technique = name
+        seen[name] = yield from eyes.settled(rig, f"engine_3_{name}.png")
     for name in ("ltc", "ltsh2"):
         rig.check(np.abs(seen[name] - seen["ltsh4"]).max() > 0.02, f"{name} does not look like ltsh4")
     return seen
@@ -112,27 +90,27 @@ def passes(rig, both):
     """`both` is the sum of what the specular and the diffuse pass show."""
     total = np.zeros_like(both)
     for name in ("specular", "diffuse"):
-        view().shown = name
-        pixels = yield from settled(rig, f"engine_4_{name}.png")
-        total += linear(pixels, EXPOSURE)
-    view().shown = "combined"
-    error = relative_l2(total, linear(both, EXPOSURE), unclipped(both))
+        eyes.view().shown = name
+        pixels = yield from eyes.settled(rig, f"engine_4_{name}.png")
+        total += eyes.linear(pixels, EXPOSURE)
+    eyes.view().shown = "combined"
+    error = eyes.relative_l2(total, eyes.linear(both, EXPOSURE), eyes.unclipped(both))
     rig.fact("specular + diffuse against both", error)
-    rig.check(error < AGREEMENT, "specular and diffuse add up")
+    rig.check(error < eyes.AGREEMENT, "specular and diffuse add up")
 
 
 def split(rig, seen):
-    settings = view()
+    settings = eyes.view()
     settings.mode, settings.technique, settings.second_technique, settings.split_position = "split", "ltc", "ltsh4", 0.5
     rig.space.show_gizmo = True
-    yield from settled(rig, "engine_5_split.png")
+    yield from eyes.settled(rig, "engine_5_split.png")
     region = rig.region()
     y = rig.size[1] - region.y - region.height // 4
     start, end = ((region.x + round(share * region.width), y) for share in (0.5, 0.3))
     yield from drag(rig, start, end)
     rig.check(abs(settings.split_position - 0.3) < 0.02, f"the line follows the mouse: {settings.split_position:.3f}")
     rig.space.show_gizmo = False
-    pixels = yield from settled(rig, "engine_5_dragged.png")
+    pixels = yield from eyes.settled(rig, "engine_5_dragged.png")
     line = round(settings.split_position * region.width) - (region.width - pixels.shape[1]) // 2
     # The line and the captions at the upper end are no part of the pictures.
     rows = slice(60, None)
@@ -142,17 +120,17 @@ def split(rig, seen):
 
 
 def difference(rig, seen):
-    settings = view()
+    settings = eyes.view()
     settings.mode, settings.technique, settings.second_technique = "difference", "ltsh4", "ltc"
     settings.difference_scale = 0.25
-    pixels = yield from settled(rig, "engine_6_difference.png")
-    truth = (linear(seen["ltsh4"], EXPOSURE) - linear(seen["ltc"], EXPOSURE)).mean(axis=-1)
-    certain = unclipped(seen["ltsh4"]) & unclipped(seen["ltc"]) & (np.abs(truth) > 0.03)
+    pixels = yield from eyes.settled(rig, "engine_6_difference.png")
+    truth = (eyes.linear(seen["ltsh4"], EXPOSURE) - eyes.linear(seen["ltc"], EXPOSURE)).mean(axis=-1)
+    certain = eyes.unclipped(seen["ltsh4"]) & eyes.unclipped(seen["ltc"]) & (np.abs(truth) > 0.03)
     rig.fact("pixels that differ", int(certain.sum()))
     reddish = pixels[..., 0] > pixels[..., 2]
     rig.check(certain.any() and np.array_equal(reddish[certain], truth[certain] > 0.0), "red is brighter, blue darker")
     settings.second_technique = "ltsh4"
-    pixels = yield from settled(rig, "engine_6_nothing.png")
+    pixels = yield from eyes.settled(rig, "engine_6_nothing.png")
     rig.check(np.ptp(pixels[100:], axis=-1).max() < 0.02, "a technique does not differ from itself")
     settings.mode, settings.second_technique = "single", "ltc"
 
@@ -161,13 +139,13 @@ def rendered(rig, seen):
     """F12 through a camera that sees what the view shows."""
     scene = bpy.context.scene
     camera, resolution = scene.camera, (scene.render.resolution_x, scene.render.resolution_y)
-    scene.camera = camera_like_view(rig, "Like the view")
-    view().render_samples, view().technique_passes, view().technique = 1, True, "ltsh4"
-    found = yield from final_render(rig)
+    scene.camera = eyes.camera_like_view(rig, "Like the view")
+    eyes.view().render_samples, eyes.view().technique_passes, eyes.view().technique = 1, True, "ltsh4"
+    found = yield from eyes.final_render(rig)
     rig.shot("engine_7_f12.png")
     for name, label in LABELS.items():
         picture = found[f"{label} Specular"] + found[f"{label} Diffuse"]
-        usable = check_against_numpy(rig, name, seen[name], picture, EXPOSURE)
+        usable = eyes.check_against_numpy(rig, name, seen[name], picture, EXPOSURE)
         rig.check(usable.mean() > 0.97, f"{name}: next to nothing of the view is clipped")
     rig.xdo("key", "Escape")
     yield 2
@@ -175,8 +153,7 @@ def rendered(rig, seen):
 
 
 def back_to_cycles(rig):
-    with rig.override():
-        bpy.ops.ltsh.preview()
+    operate(rig, bpy.ops.ltsh.preview)
     rig.check(bpy.context.scene.render.engine == "CYCLES", "the artist's engine is back")
     rig.check(rig.space.shading.type == "SOLID", "the artist's shading is back")
     yield 1

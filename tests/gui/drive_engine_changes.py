@@ -7,22 +7,10 @@ To be opened with the example scene.
 from pathlib import Path
 
 import bpy
+import eyes
 import numpy as np
 from bpy_extras import view3d_utils
-from eyes import (
-    AGREEMENT,
-    bare_view,
-    camera_like_view,
-    check_against_numpy,
-    final_render,
-    free_view,
-    inside,
-    plain_colors,
-    relative_l2,
-    settled,
-    view_pixels,
-)
-from hands import keys, over, until
+from hands import close_window, keys, operate, over, select, until
 
 SECONDS = 1800
 EXPOSURE = -1.5
@@ -30,15 +18,12 @@ EXPOSURE = -1.5
 
 def main(rig):
     scene = bpy.context.scene
-    scene.render.engine = "LTSH"
     scene.ltsh_view.technique, scene.ltsh_view.render_samples = "ltsh4", 1
-    rig.camera_view()
-    yield 1
-    rig.space.shading.type = "RENDERED"
-    bare_view(rig)
-    plain_colors(scene, EXPOSURE)
+    yield from eyes.engine_started(rig)
+    eyes.bare_view(rig)
+    eyes.plain_colors(scene, EXPOSURE)
     yield from cameras(rig)
-    whole = yield from settled(rig, "changes_2_whole.png")
+    whole = yield from eyes.settled(rig, "changes_2_whole.png")
     yield from deleted_and_undone(rig, whole)
     yield from edited(rig, whole)
     yield from removed_image(rig)
@@ -59,17 +44,17 @@ def cameras(rig):
         for key, value in values.items():
             setattr(camera.data, key, value)
         rig.camera_view()
-        seen = yield from settled(rig, f"changes_1_{name}.png")
-        scene.camera = camera_like_view(rig, f"Like the view, {name}")
-        found = yield from final_render(rig)
+        seen = yield from eyes.settled(rig, f"changes_1_{name}.png")
+        scene.camera = eyes.camera_like_view(rig, f"Like the view, {name}")
+        found = yield from eyes.final_render(rig)
         rig.xdo("key", "Escape")
         yield 2
         scene.camera = camera
         scene.render.resolution_x, scene.render.resolution_y = size
         picture = found["LTSH Specular"] + found["LTSH Diffuse"]
-        check_against_numpy(rig, name, seen, picture, EXPOSURE, frame_of_camera(rig))
+        eyes.check_against_numpy(rig, name, seen, picture, EXPOSURE, frame_of_camera(rig))
     camera.data.shift_x, camera.data.shift_y, camera.data.type = shift, 0.0, kind
-    free_view(rig, camera)
+    eyes.free_view(rig, camera)
 
 
 def frame_of_camera(rig):
@@ -81,30 +66,25 @@ def frame_of_camera(rig):
     at = (at[:, :2] / at[:, 3:] * 0.5 + 0.5) * (region.width, region.height)
     (left, low), (right, high) = at.min(axis=0) + 2.0, at.max(axis=0) - 2.0
     x, y = np.arange(region.width) + 0.5, region.height - np.arange(region.height) - 0.5
-    return inside(((x > left) & (x < right))[None, :] & ((y > low) & (y < high))[:, None])
+    return eyes.inside(((x > left) & (x < right))[None, :] & ((y > low) & (y < high))[:, None])
 
 
 def deleted_and_undone(rig, whole):
     """By the keyboard: what is deleted is gone, what is undone is back."""
     target = biggest_object_in_view(rig)
-    with rig.override():
-        bpy.ops.object.select_all(action="DESELECT")
-        target.select_set(True)
-        bpy.context.view_layer.objects.active = target
-        bpy.ops.ed.undo_push(message="Selected")
+    select(rig, target)
+    operate(rig, bpy.ops.ed.undo_push, message="Selected")
     name = target.name
     yield from over(rig)
     yield from keys(rig, "Delete")
     yield from until(lambda: name not in bpy.data.objects)
-    without = yield from settled(rig, "changes_3_deleted.png")
     rig.check(name not in bpy.data.objects, f"Delete removes {name}")
-    rig.check(np.abs(without - whole).mean() > 1e-3, "and the view no longer shows it")
+    yield from eyes.differs(rig, "changes_3_deleted.png", whole, "and the view no longer shows it")
     yield from over(rig)
     yield from keys(rig, "ctrl+z")
     yield from until(lambda: name in bpy.data.objects)
-    again = yield from settled(rig, "changes_3_undone.png")
     rig.check(name in bpy.data.objects, "Ctrl Z brings it back")
-    rig.check(np.array_equal(again, whole), "and the picture is what it was")
+    yield from eyes.same_again(rig, "changes_3_undone.png", whole, "and the picture is what it was")
 
 
 def biggest_object_in_view(rig):
@@ -129,41 +109,41 @@ def edited(rig, whole):
         target.select_set(True)
         bpy.ops.object.mode_set(mode="EDIT")
         bpy.ops.mesh.select_all(action="SELECT")
-    yield from settled(rig, "changes_4_edit_mode.png")
-    with rig.override():
-        bpy.ops.transform.translate(value=(0.0, 0.0, 0.3))
-    moved = yield from settled(rig, "changes_4_edited.png")
-    rig.check(np.abs(moved - whole).mean() > 1e-3, "vertices moved in edit mode are seen at once")
+    yield from eyes.settled(rig, "changes_4_edit_mode.png")
+    operate(rig, bpy.ops.transform.translate, value=(0.0, 0.0, 0.3))
+    yield from eyes.differs(rig, "changes_4_edited.png", whole, "vertices moved in edit mode are seen at once")
     with rig.override():
         bpy.ops.transform.translate(value=(0.0, 0.0, -0.3))
         bpy.ops.object.mode_set(mode="OBJECT")
     modifier = target.modifiers.new("Displace", "DISPLACE")
     modifier.strength, modifier.mid_level = 0.3, 0.0
-    many = yield from settled(rig, "changes_4_modifier.png")
-    rig.check(np.abs(many - whole).mean() > 1e-3, "a modifier is seen at once")
+    yield from eyes.differs(rig, "changes_4_modifier.png", whole, "a modifier is seen at once")
     target.modifiers.remove(modifier)
-    before = yield from settled(rig, "changes_4_back.png")
-    error = relative_l2(before, whole, np.ones(whole.shape[:2], bool))
-    rig.check(error < AGREEMENT, f"all taken back the picture is what it was: {error:.5f}")
-    with rig.override():
-        bpy.ops.mesh.primitive_plane_add(size=0.5, location=target.matrix_world.translation)
+    before = yield from eyes.settled(rig, "changes_4_back.png")
+    error = eyes.relative_l2(before, whole, np.ones(whole.shape[:2], bool))
+    rig.check(error < eyes.AGREEMENT, f"all taken back the picture is what it was: {error:.5f}")
+    operate(rig, bpy.ops.mesh.primitive_plane_add, size=0.5, location=target.matrix_world.translation)
     plane = bpy.context.view_layer.objects.active
     plane.location.z += 1.0
-    material = bpy.data.materials.new("Glow")
-    if not material.node_tree:
-        material.use_nodes = True
-    nodes = material.node_tree.nodes
+    material, nodes, output = new_material("Glow", "ShaderNodeOutputMaterial")
     glow = nodes.new("ShaderNodeEmission")
     glow.inputs["Strength"].default_value = 30.0
-    output = next(node for node in nodes if node.bl_idname == "ShaderNodeOutputMaterial")
     material.node_tree.links.new(glow.outputs[0], output.inputs[0])
     plane.data.materials.append(material)
-    lit = yield from settled(rig, "changes_4_glow.png")
+    lit = yield from eyes.settled(rig, "changes_4_glow.png")
     rig.check(lit.mean() > before.mean() + 1e-3, "a glowing plane lights its surroundings")
     bpy.data.objects.remove(plane)
     bpy.data.materials.remove(material)
-    after = yield from settled(rig, "changes_4_no_glow.png")
-    rig.check(np.array_equal(after, before), "removed, it lights nothing")
+    yield from eyes.same_again(rig, "changes_4_no_glow.png", before, "removed, it lights nothing")
+
+
+def new_material(name, kind):
+    """A material with nodes: the material, its nodes, and the first node of that kind."""
+    material = bpy.data.materials.new(name)
+    if not material.node_tree:
+        material.use_nodes = True
+    nodes = material.node_tree.nodes
+    return material, nodes, next(node for node in nodes if node.bl_idname == kind)
 
 
 def removed_image(rig):
@@ -173,22 +153,19 @@ def removed_image(rig):
     image.pixels.foreach_set(np.repeat(checks.astype(np.float32).ravel(), 4))
     image.update()
     target = biggest_object_in_view(rig)
-    material, slot = bpy.data.materials.new("Checked"), target.material_slots[0]
+    material, nodes, shader = new_material("Checked", "ShaderNodeBsdfPrincipled")
+    slot = target.material_slots[0]
     former, slot.material = slot.material, material
-    if not material.node_tree:
-        material.use_nodes = True
-    nodes = material.node_tree.nodes
-    shader = next(node for node in nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
     texture = nodes.new("ShaderNodeTexImage")
     texture.image = image
     material.node_tree.links.new(texture.outputs["Color"], shader.inputs["Base Color"])
-    shown = yield from settled(rig, "changes_5_image.png")
+    shown = yield from eyes.settled(rig, "changes_5_image.png")
     image.pixels.foreach_set(np.repeat(1.0 - checks.astype(np.float32).ravel(), 4))
     image.update_tag()
-    painted = yield from settled(rig, "changes_5_painted.png")
+    painted = yield from eyes.settled(rig, "changes_5_painted.png")
     rig.check(np.abs(painted - shown).max() > 0.02, "what is painted on an image is seen at once")
     bpy.data.images.remove(image)
-    gone = yield from settled(rig, "changes_5_removed.png")
+    gone = yield from eyes.settled(rig, "changes_5_removed.png")
     rig.check(gone.std() > 0.02, "without the image there is still a picture")
     slot.material = former
     bpy.data.materials.remove(material)
@@ -196,8 +173,7 @@ def removed_image(rig):
 
 def two_windows(rig):
     """A light that moves is seen in both windows, and closing one leaves the other as it is."""
-    with rig.override():
-        bpy.ops.screen.area_dupli("INVOKE_DEFAULT")
+    operate(rig, bpy.ops.screen.area_dupli, "INVOKE_DEFAULT")
     yield 4
     windows = bpy.context.window_manager.windows
     rig.check(len(windows) == 2, "there are two windows")
@@ -212,42 +188,40 @@ def two_windows(rig):
     light.data.energy = 20.0 * before
     yield 6
     rig.shot("changes_6_brighter.png")
-    with bpy.context.temp_override(window=second):
-        bpy.ops.wm.window_close()
+    close_window(second)
     yield 2
-    brighter = yield from settled(rig, "changes_6_one_window.png")
+    brighter = yield from eyes.settled(rig, "changes_6_one_window.png")
     light.data.energy = before
-    darker = yield from settled(rig, "changes_6_back.png")
+    darker = yield from eyes.settled(rig, "changes_6_back.png")
     rig.check(brighter.mean() > darker.mean() + 1e-3, "after a window is closed the other follows the lights")
 
 
 def another_scene(rig):
     """The window shows another scene, which is removed while it is seen."""
     former = bpy.context.scene
-    before = view_pixels(rig, "changes_7_before.png")
+    before = eyes.view_pixels(rig, "changes_7_before.png")
     empty = bpy.data.scenes.new("Empty")
     empty.render.engine = "LTSH"
-    plain_colors(empty, EXPOSURE)
+    eyes.plain_colors(empty, EXPOSURE)
     bpy.context.window.scene = empty
-    pixels = yield from settled(rig, "changes_7_empty.png")
+    pixels = yield from eyes.settled(rig, "changes_7_empty.png")
     rig.check(pixels.std() < 0.1 and np.abs(pixels - before).mean() > 1e-3, "the empty scene shows no surfaces")
     bpy.data.scenes.remove(empty)
     rig.check(bpy.context.window.scene == former, "Blender goes back to the first one")
-    pixels = yield from settled(rig, "changes_7_back.png")
-    rig.check(np.array_equal(pixels, before), "whose picture is what it was")
+    yield from eyes.same_again(rig, "changes_7_back.png", before, "whose picture is what it was")
 
 
 def another_file(rig):
     """A file is opened, and a new one begun, while the engine draws."""
     other = str(Path(bpy.data.filepath).with_name("changes.blend"))
     bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
-    before = view_pixels(rig, "changes_8_before.png")
+    before = eyes.view_pixels(rig, "changes_8_before.png")
     for number in (1, 2):
         bpy.ops.wm.open_mainfile(filepath=other)
         yield 2
         rig.space.shading.type = "RENDERED"
-        pixels = yield from settled(rig, f"changes_8_opened_{number}.png")
-        rig.check(np.array_equal(pixels, before), f"opened, the file shows the same picture ({number})")
+        what = f"opened, the file shows the same picture ({number})"
+        yield from eyes.same_again(rig, f"changes_8_opened_{number}.png", before, what)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     yield 2
     rig.check(bpy.context.scene.render.engine != "LTSH", "a new file has its own engine")

@@ -6,27 +6,24 @@ To be opened with the example scene.
 import time
 
 import bpy
+import eyes
 import numpy as np
-from eyes import F12, bare_view, linear, plain_colors, settled, unclipped, view_pixels
-from hands import CLICK_SECONDS, Pulse, click, module, settings, wait_for_job
+from hands import Pulse, click, module, operate, select, settings, until, view_middle, wait_for_job
 
 SECONDS = 1800
 EXPOSURE = -1.5
-# After Escape is pressed; the driver itself looks only every 0.05 s, and xdotool takes its time to start.
+# After Escape is pressed; the driver itself looks only every 0.02 s, and xdotool takes its time to start.
 CANCEL_SECONDS = 0.8
 
 
 def main(rig):
     scene = bpy.context.scene
-    scene.render.engine = "LTSH"
-    rig.camera_view()
-    yield 1
-    rig.space.shading.type = "RENDERED"
-    yield from settled(rig, "views_1_with_overlays.png")
+    yield from eyes.engine_started(rig)
+    yield from eyes.settled(rig, "views_1_with_overlays.png")
     yield from selected_by_a_click(rig)
-    bare_view(rig)
-    plain_colors(scene, EXPOSURE)
-    whole = yield from settled(rig, "views_2_bare.png")
+    eyes.bare_view(rig)
+    eyes.plain_colors(scene, EXPOSURE)
+    whole = yield from eyes.settled(rig, "views_2_bare.png")
     yield from another_engine(rig)
     yield from changed_by_hand(rig, whole)
     yield from local_view(rig, whole)
@@ -37,18 +34,13 @@ def main(rig):
     yield from stopped_by_escape(rig)
 
 
-def view():
-    return bpy.context.scene.ltsh_view
-
-
 def is_picture(pixels):
     return pixels.std() > 0.02 and (pixels.max(axis=-1) > 0.01).mean() > 0.3
 
 
 def selected_by_a_click(rig):
-    region = rig.region()
     # The knot stands in the middle of the camera's frame.
-    x, y = region.x + region.width // 2, rig.size[1] - region.y - region.height // 2
+    x, y = view_middle(rig)
     yield from click(rig, x, y + 55)
     active = bpy.context.view_layer.objects.active
     rig.fact("clicked on", active.name if active else None)
@@ -61,13 +53,12 @@ def another_engine(rig):
     scene = bpy.context.scene
     scene.render.engine = "BLENDER_WORKBENCH"
     yield 1
-    with rig.override():
-        bpy.ops.ltsh.preview()
+    operate(rig, bpy.ops.ltsh.preview)
     yield 1
-    rig.check(view().artist_engine == "BLENDER_WORKBENCH", "the preview knows the engine to give back")
+    rig.check(eyes.view().artist_engine == "BLENDER_WORKBENCH", "the preview knows the engine to give back")
     scene.render.engine = "CYCLES"
     yield 1
-    rig.check(view().artist_engine == "", "an engine chosen by hand ends the preview")
+    rig.check(eyes.view().artist_engine == "", "an engine chosen by hand ends the preview")
     scene.render.engine = "LTSH"
     yield 1
 
@@ -78,59 +69,47 @@ def changed_by_hand(rig, whole):
     inputs = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled").inputs
     color = tuple(inputs["Base Color"].default_value)
     inputs["Base Color"].default_value = (0.9, 0.9, 0.1, 1.0)
-    pixels = yield from settled(rig, "views_3_material.png")
+    pixels = yield from eyes.settled(rig, "views_3_material.png")
     rig.check(np.abs(pixels - whole).max() > 0.1, "a changed material is seen at once")
     inputs["Base Color"].default_value = color
     wall = bpy.data.objects["back wall"]
     wall.hide_viewport = True
-    pixels = yield from settled(rig, "views_3_hidden.png")
-    rig.check(np.abs(pixels - whole).mean() > 0.003, "a hidden object is gone at once")
+    yield from eyes.differs(rig, "views_3_hidden.png", whole, "a hidden object is gone at once", 0.003)
     wall.hide_viewport = False
-    pixels = yield from settled(rig, "views_3_again.png")
-    rig.check(np.array_equal(pixels, whole), "undone, the picture is what it was")
+    yield from eyes.same_again(rig, "views_3_again.png", whole, "undone, the picture is what it was")
 
 
 def local_view(rig, whole):
-    with rig.override():
-        bpy.ops.object.select_all(action="DESELECT")
-        wall = bpy.data.objects["back wall"]
-        wall.select_set(True)
-        bpy.ops.view3d.localview(frame_selected=False)
-    pixels = yield from settled(rig, "views_4_local.png")
+    select(rig, bpy.data.objects["back wall"])
+    operate(rig, bpy.ops.view3d.localview, frame_selected=False)
+    pixels = yield from eyes.settled(rig, "views_4_local.png")
     lit, lit_before = ((image.max(axis=-1) > 0.02).mean() for image in (pixels, whole))
     rig.check(lit < 0.5 * lit_before, "local view hides the others")
-    with rig.override():
-        bpy.ops.view3d.localview(frame_selected=False)
-    pixels = yield from settled(rig, "views_4_left.png")
-    rig.check(np.array_equal(pixels, whole), "after local view the picture is what it was")
+    operate(rig, bpy.ops.view3d.localview, frame_selected=False)
+    yield from eyes.same_again(rig, "views_4_left.png", whole, "after local view the picture is what it was")
 
 
 def quad_view(rig):
-    with rig.override():
-        bpy.ops.screen.region_quadview()
+    operate(rig, bpy.ops.screen.region_quadview)
     yield 2
     rig.shot("views_5_quad.png")
     regions = [region for region in rig.area().regions if region.type == "WINDOW" and region.width > 10]
     rig.check(len(regions) == 4, "there are four views")
     # From the right the walls are seen from behind, where there is no light.
-    shown = [view_pixels(rig, "views_5_quad.png", region).std() > 0.01 for region in regions]
+    shown = [eyes.view_pixels(rig, "views_5_quad.png", region).std() > 0.01 for region in regions]
     rig.check(sum(shown) >= 3, f"they show something: {shown}")
-    with rig.override():
-        bpy.ops.screen.region_quadview()
+    operate(rig, bpy.ops.screen.region_quadview)
     yield 1
 
 
 def resized(rig, whole):
     rig.camera_view()
-    with rig.override():
-        bpy.ops.screen.screen_full_area(use_hide_panels=True)
-    pixels = yield from settled(rig, "views_6_full.png")
+    operate(rig, bpy.ops.screen.screen_full_area, use_hide_panels=True)
+    pixels = yield from eyes.settled(rig, "views_6_full.png")
     rig.check(pixels.shape[1] > whole.shape[1] and is_picture(pixels), "a larger view is filled")
     rig.check((pixels[-100:].max(axis=-1) > 0.0).mean() > 0.9, "down to its lower edge")
-    with rig.override():
-        bpy.ops.screen.screen_full_area(use_hide_panels=True)
-    pixels = yield from settled(rig, "views_6_back.png")
-    rig.check(np.array_equal(pixels, whole), "and so is the smaller one again")
+    operate(rig, bpy.ops.screen.screen_full_area, use_hide_panels=True)
+    yield from eyes.same_again(rig, "views_6_back.png", whole, "and so is the smaller one again")
 
 
 def with_an_error(rig):
@@ -145,66 +124,61 @@ def with_an_error(rig):
     try:
         light = bpy.data.objects["Neon"].data
         light.energy *= 1.01
-        pixels = yield from settled(rig, "views_7_error.png")
+        pixels = yield from eyes.settled(rig, "views_7_error.png")
     finally:
         mirror.sync = sync
-    corner = pixels[-60:, :600]
-    red = (corner[..., 0] > 0.6) & (corner[..., 1] < 0.5) & (corner[..., 2] < 0.45)
-    rig.check(red.sum() > 100, "the error stands in the view")
+    rig.check(red_pixels(pixels) > 100, "the error stands in the view")
     light.energy /= 1.01
-    pixels = yield from settled(rig, "views_7_gone.png")
+    pixels = yield from eyes.settled(rig, "views_7_gone.png")
+    rig.check(is_picture(pixels) and red_pixels(pixels) < 20, "after the error there is a picture without it")
+
+
+def red_pixels(pixels):
+    """How many pixels of the corner in which errors stand are red."""
     corner = pixels[-60:, :600]
-    red = (corner[..., 0] > 0.6) & (corner[..., 1] < 0.5) & (corner[..., 2] < 0.45)
-    rig.check(is_picture(pixels) and red.sum() < 20, "after the error there is a picture without it")
+    return ((corner[..., 0] > 0.6) & (corner[..., 1] < 0.5) & (corner[..., 2] < 0.45)).sum()
 
 
 def beside_cycles(rig):
     """Compare with Cycles, then the difference to its picture."""
-    view().mode, view().second_technique, view().technique = "difference", "cycles", "ltsh4"
+    eyes.view().mode, eyes.view().second_technique, eyes.view().technique = "difference", "cycles", "ltsh4"
     yield 1
-    pixels = yield from settled(rig, "views_8_no_cycles.png")
+    pixels = yield from eyes.settled(rig, "views_8_no_cycles.png")
     rig.check(is_picture(pixels), "without a Cycles picture the technique is seen")
     settings().techniques, settings().cycles_samples = {"ltsh4"}, 64
-    with rig.override():
-        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
+    operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
     yield from wait_for_job(rig, 900)
-    pixels = yield from settled(rig, "views_8_difference.png")
+    pixels = yield from eyes.settled(rig, "views_8_difference.png")
     middle = pixels[pixels.shape[0] // 3 : -pixels.shape[0] // 3, pixels.shape[1] // 3 : -pixels.shape[1] // 3]
     rig.fact("brightness of the difference in the middle", round(float(middle.mean()), 3))
     rig.check(middle.mean() > 0.7, "within the camera's frame the difference is about white")
     rig.check(np.ptp(pixels[80, 40]) < 0.02 and pixels[80, 40].max() < 0.8, "outside there is none")
-    view().mode = "split"
-    split = yield from settled(rig, "views_8_split.png")
-    view().mode = "single"
-    alone = yield from settled(rig, "views_8_alone.png")
+    eyes.view().mode = "split"
+    split = yield from eyes.settled(rig, "views_8_split.png")
+    eyes.view().mode = "single"
+    alone = yield from eyes.settled(rig, "views_8_alone.png")
     # The right half of the frame, without captions.
     rows, columns = slice(200, 400), slice(540, 740)
-    found, expected = linear(split[rows, columns], EXPOSURE), linear(alone[rows, columns], EXPOSURE)
-    where = unclipped(split[rows, columns]) & unclipped(alone[rows, columns])
+    found, expected = eyes.linear(split[rows, columns], EXPOSURE), eyes.linear(alone[rows, columns], EXPOSURE)
+    where = eyes.unclipped(split[rows, columns]) & eyes.unclipped(alone[rows, columns])
     ratio = float(found[where].mean() / expected[where].mean())
     rig.fact("Cycles by LTSH 4, mean of a part", round(ratio, 4))
     rig.check(abs(ratio - 1.0) < 0.05, "Cycles' picture lies where the technique's is, as bright")
     bpy.data.objects["Sunset"].location.x += 0.3
-    view().mode = "difference"
+    eyes.view().mode = "difference"
     before = pixels
-    pixels = yield from settled(rig, "views_8_outdated.png")
+    pixels = yield from eyes.settled(rig, "views_8_outdated.png")
     yellow = [int((image[-40:, :500, 0] - image[-40:, :500, 2] > 0.25).sum()) for image in (before, pixels)]
     rig.check(yellow[0] == 0 and yellow[1] > 50, f"the view says when the Cycles picture is older: {yellow}")
     bpy.data.objects["Sunset"].location.x -= 0.3
-    view().mode = "single"
+    eyes.view().mode = "single"
 
 
 def stopped_by_escape(rig):
-    scene, ended = bpy.context.scene, []
+    scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = 1920, 1080
-    view().render_samples = 16
-    bpy.context.preferences.view.render_display_type = "SCREEN"
-    bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
-    bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancel"))
-    region = rig.region()
-    rig.xdo("mousemove", region.x + region.width // 2, rig.size[1] - region.y - region.height // 2)
-    yield CLICK_SECONDS
-    rig.xdo("key", F12)
+    eyes.view().render_samples = 16
+    ended = yield from eyes.render_started(rig)
     yield 3
     pulse = Pulse()
     yield 5
@@ -213,8 +187,7 @@ def stopped_by_escape(rig):
     rig.check(not ended, "the render still runs")
     start = time.monotonic()
     rig.xdo("key", "Escape")
-    while not ended and time.monotonic() < start + 20:
-        yield 0.05
+    yield from until(lambda: ended, 20)
     seconds = time.monotonic() - start
     rig.fact("from Escape to the end of the render, s", round(seconds, 2))
     rig.check(ended == ["cancel"] and seconds < CANCEL_SECONDS, f"Escape stops the render at once: {ended}")

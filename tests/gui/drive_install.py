@@ -4,19 +4,8 @@ import subprocess
 from pathlib import Path
 
 import bpy
+import hands
 from blender_state import difference, state
-from hands import (
-    PREVIEW,
-    SHADE,
-    click,
-    click_button,
-    image_pixels,
-    job,
-    open_panel,
-    settings,
-    until,
-    wait_for_job,
-)
 
 INSTALL = False
 SIZE = "1280x900"
@@ -52,30 +41,29 @@ def zip_file():
 
 
 def dropped(rig):
-    region = rig.region()
-    x, y = region.x + region.width // 2, rig.size[1] - region.y - region.height // 2
+    x, y = hands.view_middle(rig)
     source = subprocess.Popen(["python3", HERE / "drag_file.py", zip_file(), str(x), str(y)])
-    yield from until(lambda: source.poll() is not None, 60)
+    yield from hands.until(lambda: source.poll() is not None, 60)
     rig.check(source.poll() == 0, f"the window takes the zip: {source.poll()}")
     yield 2
     rig.shot("1_dropped.png")
     rig.xdo("key", "Return")
-    yield from until(installed, 60)
+    yield from hands.until(installed, 60)
     rig.check(installed(), "the zip that was dropped is installed and enabled")
     rig.check((folder() / "blender_manifest.toml").is_file(), f"in {folder().parent.name}")
 
 
 def used(rig):
     """What works after a restart works at once."""
-    settings().resolution_percentage = 25
-    yield from open_panel(rig)
+    hands.settings().resolution_percentage = 25
+    yield from hands.open_panel(rig)
     yield 2
-    yield from click_button(rig, SHADE)
-    yield from until(lambda: job() is not None)
-    yield from wait_for_job(rig, 300)
-    rig.check(len(image_pixels("LTSH ltsh4.combined")) > 0, "shading the camera view shows an image")
+    yield from hands.click_button(rig, hands.SHADE)
+    yield from hands.until(lambda: hands.job() is not None)
+    yield from hands.wait_for_job(rig, 300)
+    rig.check(len(hands.image_pixels("LTSH ltsh4.combined")) > 0, "shading the camera view shows an image")
     yield 3
-    yield from click_button(rig, PREVIEW)
+    yield from hands.click_button(rig, hands.PREVIEW)
     yield 5
     rig.check(bpy.context.scene.render.engine == "LTSH", "the preview is on")
     rig.shot("2_used.png")
@@ -96,14 +84,14 @@ def section(name):
 
 
 def click_there(rig, place):
-    yield from click(rig, PREFERENCES[0] + place[0], PREFERENCES[1] + place[1])
+    yield from hands.click(rig, PREFERENCES[0] + place[0], PREFERENCES[1] + place[1])
     yield 1
 
 
 def disabled_and_enabled(rig, before):
     """By the checkbox, while the preview is seen."""
     yield from click_there(rig, CHECKBOX)
-    yield from until(lambda: not installed(), 30)
+    yield from hands.until(lambda: not installed(), 30)
     rig.check(not installed(), "the checkbox disables the add-on")
     yield 2
     rig.shot("3_disabled.png")
@@ -111,7 +99,7 @@ def disabled_and_enabled(rig, before):
     rig.check(seen == ("CYCLES", "SOLID"), f"the view shows what it did before the preview: {seen}")
     rig.check(not left(before), f"the disabled add-on leaves nothing: {left(before)}")
     yield from click_there(rig, CHECKBOX)
-    yield from until(installed, 30)
+    yield from hands.until(installed, 30)
     rig.check(installed(), "the checkbox enables it again")
 
 
@@ -125,7 +113,7 @@ def uninstalled(rig, before):
     yield from click_there(rig, EXTENSION_MENU)
     rig.shot("4_menu.png")
     yield from click_there(rig, UNINSTALL)
-    yield from until(lambda: not folder().exists() and not installed(), 60)
+    yield from hands.until(lambda: not folder().exists() and not installed(), 60)
     rig.check(not installed() and not folder().exists(), "Uninstall takes the add-on and its folder away")
     yield 2
     rig.shot("5_uninstalled.png")
@@ -139,15 +127,15 @@ def uninstalled(rig, before):
 def installed_from_disk(rig):
     yield from click_there(rig, MENU)
     yield from click_there(rig, INSTALL_FROM_DISK)
-    yield from until(lambda: file_browser() is not None, 30)
+    yield from hands.until(lambda: file_browser() is not None, 30)
     yield 2
     parameters = file_browser().params
     parameters.directory, parameters.filename = str(HERE).encode(), zip_file().name
     yield 2
     window = bpy.context.window_manager.windows[-1]
     rig.shot("6_from_disk.png")
-    yield from click(rig, window.x + window.width - 70, rig.size[1] - window.y - 21)
-    yield from until(installed, 60)
+    yield from hands.click(rig, window.x + window.width - 70, rig.size[1] - window.y - 21)
+    yield from hands.until(installed, 60)
     rig.check(installed(), "Install from Disk installs and enables it")
     yield 2
     rig.shot("7_installed.png")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import bpy
-from hands import drag, over, settings, until
+from hands import close_window, drag, operate, over, results_opened, settings
 
 SECONDS = 1200
 SIZE = "1600x900"
@@ -21,9 +21,7 @@ def main(rig):
     rig.panel()
     yield 1
     rig.tab("LTSH")
-    with rig.override():
-        bpy.ops.ltsh.open_results()
-    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+    yield from results_opened(rig)
     yield 2
     rig.check(rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", "the tab of the Image Editor is open")
     rig.shot("1_dark.png")
@@ -41,16 +39,14 @@ def main(rig):
     bpy.context.preferences.view.ui_scale = 1.0
     rig.area("PROPERTIES").spaces.active.context = "RENDER"
     yield 1
-    with rig.override("PROPERTIES"):
-        bpy.ops.screen.screen_full_area()
+    operate(rig, bpy.ops.screen.screen_full_area, kind="PROPERTIES")
     yield 2
     # Our panel is the last one.
     yield from over(rig, "PROPERTIES")
     rig.xdo("click", "--repeat", 60, 5)
     yield 3
     rig.shot("5_render_properties.png")
-    with rig.override("PROPERTIES"):
-        bpy.ops.screen.back_to_previous()
+    operate(rig, bpy.ops.screen.back_to_previous, kind="PROPERTIES")
     yield 1
     yield from preferences(rig)
 
@@ -88,6 +84,5 @@ def preferences(rig):
             addon_utils.module_bl_info(module)["show_expanded"] = True
     yield 2
     rig.shot("6_preferences.png")
-    with bpy.context.temp_override(window=window):
-        bpy.ops.wm.window_close()
+    close_window(window)
     yield 1

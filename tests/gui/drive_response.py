@@ -1,7 +1,7 @@
 """The window answers while a comparison of 1920 x 1080 pixels is started, runs, and is looked at."""
 
 import bpy
-from hands import COMPARE, Pulse, click_button, drag, job, keys, open_panel, over, settings, until, wait_for_job
+import hands
 
 SECONDS = 1800
 # Small, for the graphics driver may be a program that takes longer to draw the window than all else.
@@ -11,35 +11,35 @@ DRAWINGS = 5
 
 
 def main(rig):
-    yield from open_panel(rig)
+    yield from hands.open_panel(rig)
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 1920, 1080
-    settings().techniques, settings().cycles_samples = {"ltc", "ltsh4"}, 4
+    hands.settings().techniques, hands.settings().cycles_samples = {"ltc", "ltsh4"}, 4
     yield 4
-    pulse = Pulse()
+    pulse = hands.Pulse()
     yield 5
     pulse.stop(rig, "idle")
     drawing = yield from drawn(rig)
     pulses = []
     for what in ("click", "click with results of 1080p"):
-        pulse = Pulse()
-        yield from click_button(rig, COMPARE)
-        yield from until(lambda: job() is not None)
+        pulse = hands.Pulse()
+        yield from hands.click_button(rig, hands.COMPARE)
+        yield from hands.until(lambda: hands.job() is not None)
         yield 0.5
         pulses.append(pulse.stop(rig, what))
         if pulse is pulses[0]:
-            running = Pulse()
-            yield from wait_for_job(rig, 1200)
+            running = hands.Pulse()
+            yield from hands.wait_for_job(rig, 1200)
             pulses.append(running.stop(rig, "job"))
-            rig.check(job() is None and "LTSH cycles.combined" in bpy.data.images, "the comparison is there")
+            rig.check(hands.job() is None and "LTSH cycles.combined" in bpy.data.images, "the comparison is there")
             yield 2
-    yield from over(rig)
-    pulse = Pulse()
-    yield from keys(rig, "Escape")
-    yield from until(lambda: job() is None)
+    yield from hands.over(rig)
+    pulse = hands.Pulse()
+    yield from hands.keys(rig, "Escape")
+    yield from hands.until(lambda: hands.job() is None)
     pulses.append(pulse.stop(rig, "Esc"))
-    rig.check(job() is None, "Esc ends the job")
+    rig.check(hands.job() is None, "Esc ends the job")
     yield from open_results(rig)
-    pulse = Pulse()
+    pulse = hands.Pulse()
     yield from dragged(rig)
     yield 3
     # Every step brings a new picture of 1080p to the graphics card, which may be a program: only told, not checked.
@@ -51,9 +51,7 @@ def main(rig):
 
 
 def open_results(rig):
-    with rig.override():
-        bpy.ops.ltsh.open_results()
-    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+    yield from hands.results_opened(rig)
     rig.area("IMAGE_EDITOR").spaces.active.show_region_ui = False
     yield 3
 
@@ -61,18 +59,17 @@ def open_results(rig):
 def dragged(rig):
     """Drag the line of the wipe from the middle to the left."""
     region = rig.region("IMAGE_EDITOR")
-    (x, y), (end, _) = (region.view2d.view_to_region(split, 0.4) for split in (settings().split, 0.25))
+    (x, y), (end, _) = (region.view2d.view_to_region(split, 0.4) for split in (hands.settings().split, 0.25))
     height = rig.size[1] - region.y - y
-    yield from drag(rig, (region.x + x, height), (region.x + end, height))
-    yield from until(lambda: abs(settings().split - 0.25) < 0.05)
-    rig.check(abs(settings().split - 0.25) < 0.05, f"the line follows the mouse: split is {settings().split:.3f}")
+    yield from hands.drag(rig, (region.x + x, height), (region.x + end, height))
+    yield from hands.line_at(rig, 0.25, 0.05)
 
 
 def drawn(rig):
     """Seconds for which the window does not answer when it is drawn as a whole, the longest of some."""
     longest = 0.0
     for _ in range(DRAWINGS):
-        pulse = Pulse()
+        pulse = hands.Pulse()
         yield 0.2
         rig.redraw()
         yield 1.5

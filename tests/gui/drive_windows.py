@@ -1,15 +1,15 @@
 """Jobs with several windows and scenes: results go to the scene they were made of, whatever is closed meanwhile."""
 
 import bpy
-from hands import job, keys, module, open_panel, over, settings, start_comparison, until, wait_for_job
+import hands
 
 SIZE = "1600x900"
 SECONDS = 1500
 
 
 def main(rig):
-    yield from open_panel(rig)
-    settings().techniques, settings().cycles_samples = {"ltc"}, 16
+    yield from hands.open_panel(rig)
+    hands.settings().techniques, hands.settings().cycles_samples = {"ltc"}, 16
     yield 3
     yield from other_window_closed(rig)
     yield from undone_while_it_runs(rig)
@@ -18,13 +18,12 @@ def main(rig):
 
 
 def results_of(scene):
-    return module("ui.results").result_of(scene)
+    return hands.module("ui.results").result_of(scene)
 
 
 def second_window(rig):
     """A new window, which may show a scene of its own."""
-    with rig.override():
-        bpy.ops.wm.window_new_main()
+    hands.operate(rig, bpy.ops.wm.window_new_main)
     return bpy.context.window_manager.windows[-1]
 
 
@@ -38,17 +37,14 @@ def other_window_closed(rig):
     yield 3
     rig.shot("1_two_windows.png")
     # The second window lies over the first one.
-    with rig.override():
-        bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, "a job starts in the first window")
+    hands.operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
+    yield from hands.job_started(rig, "a job starts in the first window")
     yield 4
     rig.shot("2_job_in_the_first.png")
-    with bpy.context.temp_override(window=second):
-        bpy.ops.wm.window_close()
+    hands.close_window(second)
     yield 1
-    rig.check(job() is not None, "closing another window leaves the job alone")
-    yield from wait_for_job(rig, 600)
+    rig.check(hands.job() is not None, "closing another window leaves the job alone")
+    yield from hands.wait_for_job(rig, 600)
     yield 1
     rig.check(results_of(first) is not None, "the results are those of the scene of the job")
     rig.check(not other.ltsh.result_folder or other.ltsh.result_folder != first.ltsh.result_folder,
@@ -66,13 +62,13 @@ def undone_while_it_runs(rig):
         bpy.ops.ed.undo_push(message="Before")
         light.data.energy = 3.0 * energy
         bpy.ops.ed.undo_push(message="Brighter")
-    yield from start_comparison(rig)
-    yield from over(rig)
-    yield from keys(rig, "ctrl+z")
-    yield from until(lambda: bpy.data.objects[name].data.energy == energy)
+    yield from hands.start_comparison(rig)
+    yield from hands.over(rig)
+    yield from hands.keys(rig, "ctrl+z")
+    yield from hands.until(lambda: bpy.data.objects[name].data.energy == energy)
     rig.check(bpy.data.objects[name].data.energy == energy, "Ctrl Z undoes the change of the light")
-    rig.check(job() is not None, "and the job goes on")
-    yield from wait_for_job(rig, 600)
+    rig.check(hands.job() is not None, "and the job goes on")
+    yield from hands.wait_for_job(rig, 600)
     yield 1
     rig.check(results_of(bpy.context.scene) is not None, "its results are shown")
     rig.check("LTSH cycles.combined" in bpy.data.images, "as images")
@@ -89,25 +85,23 @@ def own_window_closed(rig):
         region = next(region for region in area.regions if region.type == "WINDOW")
         with bpy.context.temp_override(window=second, screen=second.screen, area=area, region=region):
             bpy.ops.ltsh.compare("INVOKE_DEFAULT")
-        yield from until(lambda: job() is not None)
-        started = job()
-        rig.check(started is not None, "a job starts in the second window")
+        yield from hands.job_started(rig, "a job starts in the second window")
+        started = hands.job()
         yield 3
         rig.shot("5_job_in_the_second.png")
-        with bpy.context.temp_override(window=second):
-            bpy.ops.wm.window_close()
+        hands.close_window(second)
         yield 2
         rig.shot("5_job_in_the_first.png")
-        rig.check(job() is started, f"the window that is left goes on with it {end}")
+        rig.check(hands.job() is started, f"the window that is left goes on with it {end}")
         if end == "to Escape":
-            yield from over(rig)
-            yield from keys(rig, "Escape")
-            yield from until(lambda: job() is None)
+            yield from hands.over(rig)
+            yield from hands.keys(rig, "Escape")
+            yield from hands.until(lambda: hands.job() is None)
             rig.check(started.cancelled, "Escape ends it there")
         else:
-            yield from wait_for_job(rig, 600)
+            yield from hands.wait_for_job(rig, 600)
             rig.check(not started.cancelled and started.shown == 2, f"{started.shown} of its results are shown")
-        yield from until(lambda folder=started.folder: not folder.exists())
+        yield from hands.until(lambda folder=started.folder: not folder.exists())
         rig.check(not started.folder.exists(), "its files are gone")
         yield 1
         rig.shot("6_closed.png")
@@ -121,13 +115,13 @@ def scene_removed(rig):
     bpy.context.window.scene = doomed
     yield 3
     doomed.ltsh.techniques, doomed.ltsh.cycles_samples = {"ltc"}, 16
-    yield from start_comparison(rig)
-    started = job()
+    yield from hands.start_comparison(rig)
+    started = hands.job()
     yield 3
     bpy.data.scenes.remove(doomed)
     yield 1
     rig.check(bpy.context.scene == former, "the window shows the other scene")
-    yield from wait_for_job(rig, 600)
+    yield from hands.wait_for_job(rig, 600)
     rig.check(not started.error, f"the job ends without an error: {started.error}")
     yield 1
     rig.shot("7_scene_removed.png")

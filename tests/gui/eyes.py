@@ -19,6 +19,19 @@ AGREEMENT = 0.01
 RENDER_SECONDS = 600
 
 
+def view():
+    """What the engine LTSH shows."""
+    return bpy.context.scene.ltsh_view
+
+
+def engine_started(rig):
+    """See the scene through its camera as the engine LTSH draws it."""
+    bpy.context.scene.render.engine = "LTSH"
+    rig.camera_view()
+    yield 1
+    rig.space.shading.type = "RENDERED"
+
+
 def bare_view(rig):
     """Nothing but the picture in the 3D view."""
     space = rig.space
@@ -75,6 +88,19 @@ def settled(rig, name, tries=40):
     return before
 
 
+def same_again(rig, name, whole, what):
+    """Check that the view comes to show the picture `whole`."""
+    pixels = yield from settled(rig, name)
+    rig.check(np.array_equal(pixels, whole), what)
+
+
+def differs(rig, name, whole, what, least=1e-3):
+    """Check that the view comes to show another picture; the picture."""
+    pixels = yield from settled(rig, name)
+    rig.check(np.abs(pixels - whole).mean() > least, what)
+    return pixels
+
+
 def plain_colors(scene, exposure):
     """Make the view transform one that `linear` can undo: sRGB's curve and an exposure."""
     view = scene.view_settings
@@ -126,24 +152,25 @@ def camera_like_view(rig, name):
     return camera
 
 
+def render_started(rig):
+    """Press F12; a list that "complete" or "cancel" is put into when the render ends. To be used with `yield from`."""
+    ended = []
+    bpy.context.preferences.view.render_display_type = "SCREEN"
+    bpy.app.handlers.render_complete.append(lambda *_: ended.append("complete"))
+    bpy.app.handlers.render_cancel.append(lambda *_: ended.append("cancel"))
+    yield from over(rig)
+    rig.xdo("key", F12)
+    return ended
+
+
 def final_render(rig):
     """Press F12 and wait; the passes of the picture as `passes_of` has them. To be used with `yield from`."""
-    scene, ended = bpy.context.scene, []
-    handlers = [
-        (bpy.app.handlers.render_complete, lambda *_: ended.append("complete")),
-        (bpy.app.handlers.render_cancel, lambda *_: ended.append("cancel")),
-    ]
-    bpy.context.preferences.view.render_display_type = "SCREEN"
-    for event, handler in handlers:
-        event.append(handler)
-    yield from over(rig)
+    scene = bpy.context.scene
+    ended = yield from render_started(rig)
     start = time.monotonic()
-    rig.xdo("key", F12)
     yield from until(lambda: ended, RENDER_SECONDS)
     rig.fact("F12, s", round(time.monotonic() - start, 1))
     rig.check(ended == ["complete"], f"F12 ends well: {ended}")
-    for event, handler in handlers:
-        event.remove(handler)
     yield 2
     settings, path = scene.render.image_settings, rig.out / "final.exr"
     if bpy.app.version >= (5, 0, 0):

@@ -54,11 +54,46 @@ def open_panel(rig):
     rig.tab("LTSH")
 
 
+def operate(rig, operator, *arguments, kind="VIEW_3D", which="WINDOW", **options):
+    """Call an operator of Blender in a region of the window."""
+    with rig.override(kind, which):
+        operator(*arguments, **options)
+
+
+def select(rig, ob):
+    """Select this object alone, as the active one."""
+    operate(rig, bpy.ops.object.select_all, action="DESELECT")
+    ob.select_set(True)
+    bpy.context.view_layer.objects.active = ob
+
+
+def job_started(rig, what):
+    """Wait for the job that was asked for."""
+    yield from until(lambda: job() is not None)
+    rig.check(job() is not None, what)
+
+
+def close_window(window):
+    with bpy.context.temp_override(window=window):
+        bpy.ops.wm.window_close()
+
+
+def results_opened(rig):
+    """Show the results in the Image Editor, and wait for our tab beside them."""
+    operate(rig, bpy.ops.ltsh.open_results)
+    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+
+
+def view_middle(rig):
+    """X11 coordinates of the middle of the 3D view."""
+    region = rig.region()
+    return region.x + region.width // 2, rig.size[1] - region.y - region.height // 2
+
+
 def start_comparison(rig, what="a click on Compare with Cycles starts a job"):
     """Click Compare with Cycles, and wait for its job."""
     yield from click_button(rig, COMPARE)
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, what)
+    yield from job_started(rig, what)
 
 
 def drag(rig, start, end):
@@ -67,12 +102,18 @@ def drag(rig, start, end):
     yield CLICK_SECONDS
     rig.xdo("mousedown", 1)
     yield CLICK_SECONDS
-    middle = (start[0] + end[0]) // 2, (start[1] + end[1]) // 2
-    for point in (middle, end):
+    for point in (((start[0] + end[0]) // 2, (start[1] + end[1]) // 2), end):
         rig.xdo("mousemove", *point)
         yield CLICK_SECONDS
     rig.xdo("mouseup", 1)
     yield CLICK_SECONDS
+
+
+def line_at(rig, share, most):
+    """Wait for the line of the wipe to follow the mouse there."""
+    yield from until(lambda: abs(settings().split - share) < most)
+    found = settings().split
+    rig.check(abs(found - share) < most, f"the line follows the mouse: split is {found:.3f}")
 
 
 def keys(rig, *names):

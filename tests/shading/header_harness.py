@@ -42,26 +42,7 @@ const float *storage;
 
 _CALLS = """
 #ifdef __cplusplus
-#define API extern "C"
 extern "C" {
-#else
-#define API extern
-#endif
-int coefficient_count(void);
-void lookup(int n, const float *cosine, const float *roughness, int curve, float *out);
-void dielectric(int n, const float *cosine, const float *roughness, const float *ior, float *out);
-void lobe(int n, const float *cosine, const float *roughness, const float *directions, float *out);
-void integrate(int n, const float *cosine, const float *roughness, int corners, const float *vertices, float *out);
-void integral(int n, const float *cosine, const float *roughness, int curve, int corners, const float *vertices,
-    float *out);
-void clip(int n, int corners, const float *vertices, int *count, float *out);
-void form_factor(int n, int corners, const float *vertices, float *out);
-void albedo(int n, const float *cosine, const float *roughness, int curve, float *out);
-void average_albedo(int n, const float *roughness, int curve, float *out);
-void fresnel(int n, const float *cosine, int curve, float *out);
-void local(int n, const float *normals, const float *views, const float *vectors, float *out);
-#ifdef __cplusplus
-}
 #endif
 
 static ltsh_vec3 vector(const float *v) { return ltsh_make_vec3(v[0], v[1], v[2]); }
@@ -163,9 +144,13 @@ void local(int n, const float *normals, const float *views, const float *vectors
         out[3 * i] = v.x; out[3 * i + 1] = v.y; out[3 * i + 2] = v.z;
     }
 }
+
+#ifdef __cplusplus
+}
+#endif
 """
 
-_DATA_CALL = "\nconst float *data(void);\nconst float *data(void) { return NAME_data; }\n"
+_DATA_CALL = "\nconst float *data(void) { return NAME_data; }\n"
 
 
 def synthetic_table(family: str, degree: int) -> LookupTable:

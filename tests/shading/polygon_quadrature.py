@@ -10,6 +10,17 @@ PIECES = 6
 MAX_LEVELS = 40
 
 
+def above_horizon(polygon):
+    """Corners (W, 3) of the part of one polygon (V, 3) above z = 0, by cutting its edges one by one."""
+    corners = []
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        if a[2] > 0.0:
+            corners.append(a)
+        if (a[2] > 0.0) != (b[2] > 0.0):
+            corners.append((a + a[2] / (a[2] - b[2]) * (b - a)) * np.array([1.0, 1.0, 0.0]))
+    return np.array(corners).reshape(-1, 3)
+
+
 def edge_pieces(polygon, pieces=PIECES):
     """Polygon (V, 3) as unit vectors with every edge cut into equal arcs: no arc is close to a half circle."""
     unit = polygon / np.linalg.norm(polygon, axis=1, keepdims=True)

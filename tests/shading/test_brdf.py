@@ -67,10 +67,6 @@ def test_half_angle_cosine_is_that_of_the_half_vector():
     assert opposite == pytest.approx(0.0, abs=1e-8)
 
 
-def test_schlick_curve():
-    assert brdf.schlick_curve(np.array([0.0, 0.5, 1.0])) == pytest.approx([1.0, 0.5**5, 0.0])
-
-
 @pytest.mark.parametrize("ior", [1.05, 1.33, 1.5, 2.4, 4.0])
 def test_dielectric_reflectance_obeys_the_fresnel_equations(ior):
     cosine = np.linspace(0.0, 1.0, 401)

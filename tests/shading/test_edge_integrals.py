@@ -7,7 +7,7 @@ import polygon_quadrature
 import pytest
 
 from ltsh_addon.shading import edge_integrals, spherical_harmonics
-from ltsh_addon.shading.polygon import clip_to_horizon, one_plus_cosine, project_to_sphere
+from ltsh_addon.shading.polygon import clip_to_horizon, one_plus_cosine
 
 RELATIVE_ERROR = {np.float32: 1e-6, np.float64: 2e-14}
 
@@ -140,36 +140,7 @@ def test_tiny_polygons_keep_their_relative_accuracy(degree):
         assert np.abs(closed_form(polygon, degree) - expected).max() < 1e-5 * scale
 
 
-def test_moments_do_not_depend_on_the_batch():
-    polygons = np.stack([p for p in random_polygons("generic", 60, seed=3) if len(p) == 4])
-    unit = np.ascontiguousarray(polygons.transpose(2, 1, 0))
-    together = edge_integrals.moments(unit, 4)
-    for n in range(unit.shape[2]):
-        assert edge_integrals.moments(unit[:, :, n : n + 1], 4)[:, 0] == pytest.approx(together[:, n], rel=0, abs=1e-15)
-
-
-def test_clamped_cosine_integral_is_a_degree_1_integral():
-    """z is Y_10 / K_10, so that the closed forms of both modules meet."""
-    for kind in ("generic", "clipped", "large"):
-        for polygon in random_polygons(kind, 10, seed=5):
-            expected = closed_form(polygon, 1)[1] / spherical_harmonics.normalization(1, 0)
-            found = edge_integrals.clamped_cosine_integral(polygon.T[:, :, None])[0]
-            assert found == pytest.approx(expected, abs=1e-14)
-
-
 @pytest.mark.parametrize("degree", [-1, 9])
 def test_degrees_out_of_range_are_refused(degree):
     with pytest.raises(ValueError, match=f"degree is {degree}, expected 0 to 8"):
         edge_integrals.ridge_matrix(degree)
-
-
-def test_float32_moments_are_close_to_float64():
-    """Generic polygons: the sum over edges has rounding errors of a few units of 6e-8 times the moments' size."""
-    polygons = np.stack([p for p in random_polygons("generic", 200, seed=6) if len(p) == 4])
-    double = project_to_sphere(np.ascontiguousarray(polygons.transpose(2, 1, 0)))
-    single = project_to_sphere(double.astype(np.float32))
-    for degree in (2, 4):
-        exact = edge_integrals.moments(single.astype(np.float64), degree)
-        found = edge_integrals.moments(single, degree)
-        assert found.dtype == np.float32
-        assert np.abs(found - exact).max() < 2e-5

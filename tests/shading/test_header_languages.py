@@ -39,16 +39,13 @@ def test_c_can_keep_the_data_elsewhere(folder, tables):
     assert "ltsh4_data" not in text and "mine[" in text
 
 
-def test_headers_of_another_version_are_refused(folder, tables):
-    source = f'#define LTSH_SHARED 0\n#include "{folder}/ltc.h"\n'
-    complaint = header_harness.accepts(header_harness.C_COMPILER, source, folder / "other.c", "-std=c99")
-    assert "different versions" in complaint
-
-
-def test_glsl_without_a_source_of_data_is_refused(folder, tables):
-    source = f'#define GL_core_profile 1\n#include "{folder}/ltc.h"\n'
-    complaint = header_harness.accepts(header_harness.C_COMPILER, source, folder / "none.c", "-std=c99")
-    assert "define LTC_DATA(index)" in complaint
+@pytest.mark.parametrize(
+    ("definition", "complaint"),
+    [("LTSH_SHARED 0", "different versions"), ("GL_core_profile 1", "define LTC_DATA(index)")],
+)
+def test_other_versions_and_glsl_without_data_are_refused(folder, tables, definition, complaint):
+    source = f'#define {definition}\n#include "{folder}/ltc.h"\n'
+    assert complaint in header_harness.accepts(header_harness.C_COMPILER, source, folder / "refused.c", "-std=c99")
 
 
 def _glsl(path, name):

@@ -1,10 +1,11 @@
 """Lights with a spread, against sums over patches of their surface."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-import patch_quadrature
 import pytest
+import quadrature
 import surface_scenes
 from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
 from test_single_precision import PROMISED, all_kinds_of_samples
@@ -42,11 +43,31 @@ def cases(degrees, shape, count, seed=0, roughness=(0.2, 1.0)):
     return found
 
 
-def lobe_over_patches(table, sample, light):
-    """Radiance of the table's lobe, by the sum over patches."""
-    direction, measure = patch_quadrature.incident(sample, light, 300)
-    local, view = patch_quadrature.in_frame(sample, direction)
-    return shading.evaluate_lobe(table, view[2:], sample.roughness, local[None])[0] @ measure
+def lobe_of(table, directions, sample):
+    """The table's lobe as a BRDF times cosine (1, S, 3) of one sample."""
+    normal, view = sample.normal[0], sample.view[0]
+    tangent = unit(view - (view @ normal) * normal)
+    local = directions @ np.stack([tangent, np.cross(normal, tangent), normal]).T
+    return shading.evaluate_lobe(table, [view @ normal], sample.roughness, local)[..., None] * np.ones(3)
+
+
+def in_cone(sample, light):
+    """The part of a rectangle around all that lights the point; other lights as they are."""
+    if light.is_round:
+        return light
+    center, halves, offset = light.center, [], sample.position[0] - light.center
+    for half in (light.half_u, light.half_v):
+        size = np.linalg.norm(half)
+        reach = (offset @ light.direction) * np.tan(0.5 * light.spread) / size
+        low, high = np.clip(offset @ half / size**2 + np.array([-reach, reach]), -1.0, 1.0)
+        center = center + 0.5 * (low + high) * half
+        halves.append(0.5 * (high - low) * half)
+    return replace(light, center=center, half_u=halves[0], half_v=halves[1])
+
+
+def over_patches(brdf, pairs):
+    """Radiances by sums over patches."""
+    return [quadrature.radiance(sample, [in_cone(sample, light)], brdf, 300)[0, 0] for sample, light in pairs]
 
 
 def assert_close(found, expected, tolerance, what):
@@ -56,38 +77,24 @@ def assert_close(found, expected, tolerance, what):
 
 
 @pytest.mark.parametrize(
-    ("degrees", "shape"), [(20.0, "RECTANGLE"), (60.0, "ELLIPSE"), (120.0, "RECTANGLE"), (170.0, "ELLIPSE")]
-)
-def test_lights_with_a_spread_match_patches(degrees, shape):
+    ("degrees", "shape", "name"),
+    [(1.0, "RECTANGLE", "ltsh2"), (4.0, "RECTANGLE", "ltsh2"), (20.0, "RECTANGLE", "ltsh4"), (60.0, "ELLIPSE", "ltsh4"),
+     (120.0, "RECTANGLE", "ltsh4"), (170.0, "ELLIPSE", "ltsh4")],
+)  # fmt: skip
+def test_lights_with_a_spread_match_patches(degrees, shape, name):
     """The closed forms in both precisions and the quadrature; the oracle leaves 1e-4."""
-    pairs = cases(degrees, shape, 2, seed=int(degrees))
-    table = shading.load_table("ltsh4")
-    expected = {
-        "lobe": [lobe_over_patches(table, *pair) for pair in pairs],
-        "diffuse": [patch_quadrature.diffuse(*pair)[0] for pair in pairs],
-        "true lobe": [patch_quadrature.specular(*pair)[0] for pair in pairs],
-    }
-    for dtype in (np.float32, np.float64):
-        shaded = [shading.shade(sample, [light], table, workers=1, dtype=dtype) for sample, light in pairs]
-        assert_close([part.specular[0, 0, 0] for part in shaded], expected["lobe"], CLOSED, ("lobe", dtype))
-        assert_close([part.diffuse[0, 0, 0] for part in shaded], expected["diffuse"], CLOSED, ("diffuse", dtype))
-    shaded = [shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]) for sample, light in pairs]
-    assert_close([part.specular[0, 0, 0] for part in shaded], expected["true lobe"], QUADRATURE, "true lobe")
+    pairs, table = cases(degrees, shape, 3, seed=int(degrees)), shading.load_table(name)
 
+    def shaded(part, technique, dtype):
+        rows = [shading.shade(sample, [light], technique, passes=[part], dtype=dtype) for sample, light in pairs]
+        return [row.combined[0, 0] for row in rows]
 
-@pytest.mark.parametrize("degrees", [1.0, 4.0])
-def test_narrow_cones_match_patches(degrees):
-    """Of a rectangle: the oracle resolves their cones."""
-    pairs = cases(degrees, "RECTANGLE", 3, seed=7)
-    table = shading.load_table("ltsh2")
-    shaded = [shading.shade(sample, [light], table) for sample, light in pairs]
-    expected = [lobe_over_patches(table, *pair) for pair in pairs]
-    assert_close([part.specular[0, 0, 0] for part in shaded], expected, CLOSED, "lobe")
-    expected = [patch_quadrature.diffuse(*pair)[0] for pair in pairs]
-    assert_close([part.diffuse[0, 0, 0] for part in shaded], expected, CLOSED, "diffuse")
-    shaded = [shading.shade(sample, [light], shading.REFERENCE) for sample, light in pairs]
-    expected = [patch_quadrature.specular(*pair)[0] for pair in pairs]
-    assert_close([part.specular[0, 0, 0] for part in shaded], expected, QUADRATURE, "true lobe")
+    for part, brdf in (("specular", partial(lobe_of, table)), ("diffuse", quadrature.lambert)):
+        expected = over_patches(brdf, pairs)
+        for dtype in (np.float32, np.float64):
+            assert_close(shaded(part, table, dtype), expected, CLOSED, (part, dtype))
+    found = shaded("specular", shading.REFERENCE, np.float64)
+    assert_close(found, over_patches(quadrature.ggx, pairs), QUADRATURE, "true lobe")
 
 
 @pytest.mark.parametrize("shape", ["RECTANGLE", "DISK"])

@@ -55,24 +55,13 @@ def test_polar_quadrature_is_the_other_one_on_cut_polygons():
     found = polar_quadrature.integrate(polygons, lambda directions: powers(directions)[3])
     compared = 0
     for polygon, value in zip(polygons, found, strict=True):
-        kept = above_horizon(polygon)
+        kept = polygon_quadrature.above_horizon(polygon)
         # The other one is exact where no edge passes by the point closely.
         if len(kept) and np.linalg.norm(kept, axis=1).min() > 0.3 and abs(np.linalg.det(polygon[:3])) > 1.0:
             expected = polygon_quadrature.integral(kept, lambda directions: powers(directions)[3], order=24)
             assert value == pytest.approx(expected, abs=1e-7)
             compared += 1
     assert compared > 10
-
-
-def above_horizon(polygon):
-    """The corners of the part of a polygon (V, 3) above z = 0."""
-    kept = []
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        if a[2] > 0.0:
-            kept.append(a)
-        if (a[2] > 0.0) != (b[2] > 0.0):
-            kept.append((a + a[2] / (a[2] - b[2]) * (b - a)) * np.array([1.0, 1.0, 0.0]))
-    return np.array(kept)
 
 
 def test_adaptive_quadrature_meets_its_bound_on_a_narrow_peak():

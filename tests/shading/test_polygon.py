@@ -5,15 +5,10 @@ import polygon_quadrature
 import pytest
 import textbook
 
-from ltsh_addon.shading import polygon as polygon_module
 from ltsh_addon.shading.polygon import (
-    clip_single_run,
     clip_to_horizon,
-    horizon_patterns,
     project_to_sphere,
     solid_angle,
-    split_at_horizon,
-    split_long_edges,
 )
 
 ARROW = np.array([[-1.0, -1.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [-0.4, 0.0, 0.0]])
@@ -83,58 +78,6 @@ def test_the_two_sides_of_the_horizon_add_up_to_a_non_convex_polygon(shape):
     assert total == pytest.approx(vector_area(polygon), abs=1e-13)
 
 
-def test_split_at_horizon_partitions_the_points():
-    polygons = random_rectangles(300, seed=3, height=0.0)
-    above = (polygons[..., 2] > 0.0).any(axis=1)
-    seen = np.concatenate([index for index, _ in split_at_horizon(batch(*polygons))])
-    assert sorted(seen) == list(np.nonzero(above)[0])
-    whole = [part for _, part in split_at_horizon(batch(*(polygons + np.array([0.0, 0.0, 100.0]))))]
-    assert len(whole) == 1 and whole[0].shape == (3, 4, 300)
-    assert list(split_at_horizon(batch(*(polygons - np.array([0.0, 0.0, 100.0]))))) == []
-
-
-@pytest.mark.parametrize("corners", [3, 4, 5, 6, 7, 8])
-def test_both_ways_to_clip_give_the_same_polygon(corners):
-    """Regular polygons, of which one run of corners is above the horizon; corner by corner, up to where it starts."""
-    generator = np.random.default_rng(corners)
-    angle = 2.0 * np.pi * np.arange(corners) / corners
-    ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(corners)], axis=1)
-    frames = np.linalg.qr(generator.normal(size=(400, 3, 3)))[0]
-    polygons = ring @ frames + generator.uniform(-0.9, 0.9, size=(400, 1, 3))
-    above = (polygons[..., 2] > 0.0).sum(axis=1)
-    polygons = polygons[(above > 0) & (above < corners)]
-    assert len(polygons) > 100
-    vertices = batch(*polygons)
-    patterns = horizon_patterns(vertices[2])
-    assert (polygon_module._pattern_kinds(corners)[patterns] == polygon_module.SINGLE_RUN).all()
-    fast, slow = clip_single_run(vertices, patterns), clip_to_horizon(vertices)
-    assert fast.shape[1] == corners + 1 and fast[2].min() == 0.0
-    for n in range(len(polygons)):
-        assert vector_area(fast[:, :, n].T) == pytest.approx(vector_area(slow[:, :, n].T), abs=1e-14)
-        assert len(np.unique(fast[:, :, n].round(12), axis=1).T) == len(np.unique(slow[:, :, n].round(12), axis=1).T)
-
-
-def test_patterns_with_several_runs_are_told_apart():
-    kinds = polygon_module._pattern_kinds(4)
-    several = [pattern for pattern in range(16) if kinds[pattern] == polygon_module.SEVERAL_RUNS]
-    assert several == [0b0101, 0b1010]
-    assert kinds[0] == polygon_module.DARK and kinds[15] == polygon_module.WHOLE
-
-
-def test_splitting_long_edges_adds_the_points_nearest_to_the_origin():
-    vertices = batch(*random_rectangles(50, seed=11, height=2.0))
-    split = split_long_edges(vertices)
-    assert np.array_equal(split[:, ::2], vertices)
-    along = np.roll(vertices, -1, axis=1) - vertices
-    on_edge = np.linspace(0.0, 1.0, 101)[:, None, None, None]
-    distance = np.linalg.norm(vertices + on_edge * along, axis=1).min(axis=0)
-    found = np.linalg.norm(split[:, 1::2], axis=0)
-    # No sampled point is nearer, and the nearest sampled one is at most a step of an edge away.
-    assert (found <= distance + 1e-12).all()
-    assert (distance - found <= 0.01 * np.linalg.norm(along, axis=0)).all()
-    assert solid_angle(project_to_sphere(split)) == pytest.approx(solid_angle(project_to_sphere(vertices)), abs=1e-12)
-
-
 def test_solid_angle_of_triangles_is_lhuilier():
     generator = np.random.default_rng(4)
     corners = generator.normal(size=(500, 3, 3))
@@ -181,33 +124,19 @@ def test_a_light_that_almost_touches_the_surface_covers_the_hemisphere(dtype):
         assert np.abs(found - 2.0 * np.pi).max() < limit, exponent
 
 
-def test_reversing_a_polygon_reverses_its_solid_angle():
-    polygons = [clipped(p) for p in random_rectangles(30, seed=7) if (p[:, 2] > 0.0).all()]
-    for polygon in polygons:
-        forward = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert solid_angle(project_to_sphere(batch(polygon[::-1])))[0] == pytest.approx(-forward, abs=1e-15)
+def test_reversing_splitting_turning_and_repeating_corners():
+    """A reversed polygon has the opposite solid angle, halves add up, turning about z and double corners do nothing."""
 
+    def angle_of(polygon):
+        return solid_angle(project_to_sphere(batch(polygon)))[0]
 
-def test_splitting_a_polygon_adds_up():
     for polygon in random_rectangles(60, seed=8, height=6.0):
-        parts = [batch(polygon[[0, 1, 2]]), batch(polygon[[0, 2, 3]])]
-        whole = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert sum(solid_angle(project_to_sphere(part))[0] for part in parts) == pytest.approx(whole, abs=1e-14)
-
-
-def test_rotating_about_the_normal_changes_nothing():
-    for polygon in random_rectangles(30, seed=9, height=5.0):
-        expected = solid_angle(project_to_sphere(batch(polygon)))[0]
+        expected = pytest.approx(angle_of(polygon), abs=1e-14)
+        assert -angle_of(polygon[::-1]) == expected
+        assert angle_of(polygon[[0, 1, 2]]) + angle_of(polygon[[0, 2, 3]]) == expected
+        assert angle_of(polygon[[0, 0, 1, 2, 2, 2, 3]]) == expected
         for angle in (0.3, 1.7, 4.0):
-            found = solid_angle(project_to_sphere(batch(turned(polygon, angle))))[0]
-            assert found == pytest.approx(expected, abs=1e-14)
-
-
-def test_repeated_corners_change_nothing():
-    for polygon in random_rectangles(30, seed=10, height=5.0):
-        repeated = polygon[[0, 0, 1, 2, 2, 2, 3]]
-        expected = solid_angle(project_to_sphere(batch(polygon)))[0]
-        assert solid_angle(project_to_sphere(batch(repeated)))[0] == pytest.approx(expected, abs=1e-15)
+            assert angle_of(turned(polygon, angle)) == expected
 
 
 def test_a_corner_at_the_point_is_finite():

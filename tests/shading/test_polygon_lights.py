@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-import patch_quadrature
 import pytest
+import quadrature
 from surface_scenes import area_light, random_samples, single_sample, unit
 from test_single_precision import all_kinds_of_samples
 from test_single_precision import assert_close as assert_promise
@@ -68,56 +68,23 @@ def test_a_polygon_of_four_corners_is_the_rectangle(technique):
 
 
 @techniques
-def test_either_way_around_gives_the_same(technique):
-    samples = random_samples(60, seed=2)
-    light = polygon_light(STAR)
-    expected = shaded(samples, [light], technique)
-    found = shaded(samples, [replace(light, corners=light.corners[::-1])], technique)
-    assert expected.max() > 0.1
-    assert_same(found, [expected], technique)
-
-
-@techniques
 def test_a_concave_polygon_is_the_sum_of_its_parts(technique):
     samples = random_samples(80, seed=3)
-    for flat in (ELL, REPEATED):
+    for flat in (ELL, ELL[::-1], REPEATED):
         light = polygon_light(flat)
         parts = [shaded(samples, [rectangle(light, *part)], technique) for part in ELL_PARTS]
         assert_same(shaded(samples, [light], technique), parts, technique)
 
 
-@techniques
-def test_splitting_a_polygon_adds_up(technique):
-    """A star cut into kites from its middle."""
-    samples = random_samples(40, seed=4)
-    star = polygon_light(STAR)
-    kites = [polygon_light(np.stack([[0.0, 0.0], STAR[n - 1], STAR[n], STAR[(n + 1) % 14]])) for n in range(0, 14, 2)]
-    parts = [shaded(samples, [kite], technique) for kite in kites]
-    assert_same(shaded(samples, [star], technique), parts, technique)
-
-
-@pytest.mark.parametrize("technique", ["ltsh4", shading.REFERENCE])
-def test_a_64_gon_is_the_disk(technique):
-    """Of the same area: outlines differ by 0.2 % of the radius, up and down, those of 32 corners by 0.6 %."""
-    samples = random_samples(80, seed=5, lowest_roughness=0.2)
-    disk = area_light(shape="DISK", half_u=(0.8, 0, 0), half_v=(0, -0.8, 0), radiance=(1, 1, 1))
-    polygon = replace(disk, shape="POLYGON", corners=disk.polygon(64))
-    expected = shaded(samples, [disk], technique)
-    assert np.abs(shaded(samples, [polygon], technique) - expected).max() < 1e-3 * expected.max()
-
-
 def test_a_concave_polygon_matches_patches_of_its_surface():
-    """The L against sums over patches of its two rectangles: the diffuse light, and the true lobe of the reference."""
+    """The diffuse light, and the true lobe of the reference."""
     light = polygon_light(ELL)
-    parts = [rectangle(light, *part) for part in ELL_PARTS]
     for view, roughness in (((0.5, 0.1, 1.0), 0.3), ((1.0, 0.3, 0.4), 0.6)):
         white = {"specular_f0": (0.9, 0.5, 0.1), "specular_f90": (1, 1, 1), "roughness": roughness}
         sample = single_sample(view=view, **white)
         found = shading.shade(sample, [light], shading.REFERENCE)
-        expected = sum(patch_quadrature.specular(sample, part) for part in parts)
-        assert found.specular[0, 0] == pytest.approx(expected, rel=2e-4)
-        expected = sum(patch_quadrature.diffuse(sample, part) for part in parts)
-        assert found.diffuse[0, 0] == pytest.approx(expected, rel=2e-5)
+        for part, brdf, limit in ((found.specular, quadrature.ggx, 2e-4), (found.diffuse, quadrature.lambert, 2e-5)):
+            assert part[0] == pytest.approx(quadrature.radiance(sample, [light], brdf, 200), rel=limit)
 
 
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)

@@ -77,13 +77,13 @@ def quadrature(light, round_light, **options):
     return values[:, 0], error[0]
 
 
-@pytest.mark.parametrize("round_light", [False, True], ids=["rectangle", "ellipse"])
-def test_rough_surfaces_match_quadrature_over_the_area(round_light):
+@pytest.mark.parametrize(("round_light", "tolerance"), [(False, 1e-4), (True, 1e-4), (False, 1e-7)])
+def test_rough_surfaces_match_quadrature_over_the_area(round_light, tolerance):
     for light in random_lights(1, 40):
         expected = over_area(*light, round_light)
-        found, estimate = quadrature(light, round_light)
+        found, estimate = quadrature(light, round_light, tolerance=tolerance)
         error = np.abs(found - expected).max()
-        assert error < 1e-4 * expected[0] + 1e-6, light
+        assert max(error, estimate) < tolerance * expected[0] + 1e-6, light
         # 1e-9: what 160 Gauss-Legendre nodes leave of the sharpest of these lobes
         assert error <= estimate + 1e-9, light
 
@@ -109,14 +109,6 @@ def test_smooth_surfaces_match_adaptive_quadrature(lowest, roughness):
         assert error < 1e-4 * abs(expected) + 1e-6 + bound
         # The difference of two orders is an estimate: for sharp lobes it may fall short, most where it is below 1e-6.
         assert error <= 2.0 * estimate + bound + 1e-6
-
-
-def test_a_tighter_tolerance_is_met():
-    for light in random_lights(4, 20):
-        expected = over_area(*light, False)
-        found, estimate = quadrature(light, False, tolerance=1e-7)
-        assert np.abs(found - expected).max() < 1e-7 * expected[0] + 1e-6
-        assert estimate < 1e-7 * expected[0] + 1e-6
 
 
 def test_a_light_over_the_whole_hemisphere_gives_the_directional_albedo():
@@ -161,7 +153,7 @@ def test_lights_cut_by_the_horizon_match_adaptive_quadrature():
                 shape=shape, center=(-1.2, 0.1, 0.2), half_u=(0.0, 0.8, 0.1), half_v=(0.1, 0, 0.5), radiance=(1, 1, 1)
             )
             polygon = light.polygon(2048)
-            kept = np.concatenate([clip_edge(a, b) for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True)])
+            kept = polygon_quadrature.above_horizon(polygon)
             lobe = brdf_of(cosine, roughness)
             if shape == "ELLIPSE":
                 expected = abs(polygon_quadrature.integral(kept, lobe, kept.mean(axis=0), order=24, pieces=1))
@@ -184,7 +176,7 @@ def test_ellipses_cut_by_the_shading_horizon_alone_are_exact(center):
     white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "geometric_normal": normal}
     polygon = light.polygon(2048)
     assert (polygon @ normal).min() > 0.0 > polygon[:, 2].min()
-    kept = np.concatenate([clip_edge(a, b) for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True)])
+    kept = polygon_quadrature.above_horizon(polygon)
     for roughness in (0.3, 0.7):
         sample = single_sample(view=view, roughness=roughness, **white)
         found = shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]).specular[0, 0, 0]
@@ -196,14 +188,6 @@ def test_ellipses_cut_by_the_shading_horizon_alone_are_exact(center):
 
 def brdf_of(cosine, roughness):
     return lambda directions: brdf.ggx_brdf_cosine(cosine, roughness**2, directions)
-
-
-def clip_edge(a, b):
-    """Corners that the edge from a to b adds to the part above the horizon."""
-    found = [a] if a[2] > 0.0 else []
-    if (a[2] > 0.0) != (b[2] > 0.0):
-        found.append((a + a[2] / (a[2] - b[2]) * (b - a)) * np.array([1.0, 1.0, 0.0]))
-    return np.array(found).reshape(-1, 3)
 
 
 def test_error_estimates_are_reported_only_by_the_reference():

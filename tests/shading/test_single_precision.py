@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
+from surface_scenes import area_light, four_lights, random_samples, unit
 from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
@@ -101,13 +101,6 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     assert np.abs(apart - together).max() < 2e-6
 
 
-def test_looking_straight_down_needs_no_tangent():
-    view = unit(np.array([1e-9, 0.0, 1.0]))
-    fields = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1), "roughness": 0.3}
-    for sample in (single_sample(view=view, **fields), single_sample(view=(0, 0, 1), **fields)):
-        assert_close(sample, white_lights([area_light(center=(0.4, 0.2, 2.0))]), "ltsh4")
-
-
 @pytest.mark.parametrize("corners", [3, 4, 5, 12, 32, 64])
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_edge_loop_gives_the_moments(degree, corners):
@@ -119,15 +112,6 @@ def test_edge_loop_gives_the_moments(degree, corners):
     assert moments.dtype == np.float32
     assert needs_float64.mean() < 0.2
     assert np.abs(moments - expected)[:, ~needs_float64].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
-
-
-def test_edge_loop_gives_the_integrals_of_the_direction():
-    polygons = regular_polygons(6, 300, seed=9)
-    expected = edge_integrals.vector_irradiance(project_to_sphere(polygons.astype(np.float64)))
-    found, needs_float64 = moments32.vector_irradiance(polygons, moments32.Scratch())
-    height, _ = moments32.cosine_integral(polygons, moments32.Scratch())
-    assert np.abs(found - expected)[:, ~needs_float64].max() < 1e-6
-    assert np.abs(height - expected[2])[~needs_float64].max() < 1e-6
 
 
 def regular_polygons(corners, count, seed):
@@ -142,33 +126,6 @@ def regular_polygons(corners, count, seed):
     angle = 2.0 * np.pi * np.arange(corners) / corners
     polygons = center[:, None] + size * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
     return np.ascontiguousarray(polygons.transpose(2, 1, 0), dtype=np.float32)
-
-
-@pytest.mark.parametrize("gap", [1e-6, 1e-4])
-def test_polygons_that_single_precision_cannot_do_are_reported(gap):
-    """A plane that passes by the point, and a polygon of 1e-4 rad."""
-    wall = np.array([[-1.0, gap, 0.0], [1.0, gap, 0.0], [1.0, gap, 2.0], [-1.0, gap, 2.0]])
-    tiny = np.array([[0.0, 0.0, 1.0], [1e-4, 0.0, 1.0], [1e-4, 1e-4, 1.0], [0.0, 1e-4, 1.0]])
-    fine = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-    polygons = np.stack([wall, tiny, fine]).transpose(2, 1, 0).astype(np.float32)
-    for _, needs_float64 in (
-        moments32.moments(polygons, 4, moments32.Scratch()),
-        moments32.cosine_integral(polygons, moments32.Scratch()),
-    ):
-        assert needs_float64.tolist() == [True, True, False]
-
-
-@pytest.mark.parametrize("name", ["ltsh2", "ltsh4"])
-def test_shaders_and_the_edge_loop_weigh_their_moments_alike(name):
-    """One node of the table for 300 polygons."""
-    table, node = shading.load_table(name), 40 * 64 + 20
-    polygons = regular_polygons(4, 300, seed=8)
-    moments, needs_float64 = moments32.moments(polygons, table.degree, moments32.Scratch())
-    along_directions = edge_integrals.moments(project_to_sphere(polygons.astype(np.float64)), table.degree)
-    found = moments32.prepare(table).weights[..., node] @ moments
-    expected = moments32.along_directions(table).weights[..., node] @ along_directions
-    assert np.abs(expected).max() > 0.1
-    assert np.abs(found - expected)[:, ~needs_float64].max() < 2e-6
 
 
 def test_degrees_beyond_the_fast_path_are_shaded_in_double():

@@ -1,6 +1,5 @@
 """Worker processes of `shade`: the same bits, no orphans, and the work goes on where they fail."""
 
-import io
 import subprocess
 import sys
 import threading
@@ -15,7 +14,7 @@ from surface_scenes import four_lights, random_samples
 
 from ltsh_addon import shading
 from ltsh_addon.scene import Cancelled
-from ltsh_addon.shading import integrator, parallel, worker
+from ltsh_addon.shading import integrator, parallel
 
 ROOT = Path(__file__).resolve().parents[2]
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -98,22 +97,17 @@ def test_progress_is_reported_from_this_thread_and_reaches_one(started):
     assert threads == {threading.main_thread()}
 
 
-def test_cancelling_ends_the_children(started, children_only, caplog):
+def fail(_):
+    raise RuntimeError("window closed")
+
+
+@pytest.mark.parametrize(("progress", "error"), [(lambda _: False, Cancelled), (fail, RuntimeError)])
+def test_cancelling_and_errors_end_the_children(progress, error, started, children_only, caplog):
     start = time.monotonic()
-    with pytest.raises(Cancelled):
-        shading.shade(random_samples(400), four_lights(), shading.REFERENCE, workers=3, progress=lambda _: False)
+    with pytest.raises(error):
+        shading.shade(random_samples(400), four_lights(), shading.REFERENCE, workers=3, progress=progress)
     assert len(started) == 2 and all_ended(started)
-    assert time.monotonic() - start < 30.0
-    assert not caplog.records
-
-
-def test_an_error_ends_the_children(started):
-    def fail(_):
-        raise RuntimeError("window closed")
-
-    with pytest.raises(RuntimeError, match="window closed"):
-        shading.shade(random_samples(400), four_lights(), "ltc", workers=3, progress=fail)
-    assert len(started) == 2 and all_ended(started)
+    assert time.monotonic() - start < 30.0 and not caplog.records
 
 
 def test_a_child_that_dies_costs_nothing_but_time(started, children_only, caplog):
@@ -184,16 +178,6 @@ def test_children_of_a_killed_parent_end():
     while is_running(child) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not is_running(child)
-
-
-def test_messages_survive_the_way_and_an_end_is_noticed():
-    stream = io.BytesIO()
-    for message in ({"a": 1}, None, list(range(1000))):
-        worker.send(stream, message)
-    stream.seek(0)
-    assert [worker.receive(stream) for _ in range(3)] == [{"a": 1}, None, list(range(1000))]
-    with pytest.raises(EOFError):
-        worker.receive(stream)
 
 
 RENAMED = """

@@ -35,9 +35,9 @@ def test_the_first_signal_raises_and_the_next_ones_do_not_disturb(number, monkey
 def test_what_ends_in_time_goes_on():
     """The process lives on where the caller takes the exception; the thread that watches ends."""
     code = (
-        "import signal, time\nfrom ltsh_addon import interruption\ninterruption.PATIENCE_SECONDS = 2.0\n"
+        "import signal, time\nfrom ltsh_addon import interruption\ninterruption.PATIENCE_SECONDS = 0.5\n"
         "try:\n    with interruption.raised('ltsh'):\n        signal.raise_signal(signal.SIGTERM)\n"
-        "except KeyboardInterrupt:\n    time.sleep(2.5)\n    print('alive')\n"
+        "except KeyboardInterrupt:\n    time.sleep(1.0)\n    print('alive')\n"
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)

@@ -230,8 +230,8 @@ def test_polygon_integrals_agree_with_the_add_on(compiled, corners):
 def test_polygon_integrals_agree_with_quadrature(compiled):
     """Lobes of medium width."""
     table, header = compiled
-    cosine, roughness = points(30, seed=20, lowest_roughness=0.6)
-    vertices = random_polygons(30, 4, seed=21)
+    cosine, roughness = points(20, seed=20, lowest_roughness=0.6)
+    vertices = random_polygons(20, 4, seed=21)
     found = header.call("integral", cosine, roughness, 0, 4, vertices)
     for number, polygon in enumerate(vertices.astype(float)):
         expected, bound = lobe_quadrature(table, cosine[number], roughness[number], above_horizon(polygon), 1e-6)

@@ -26,8 +26,11 @@ TABLES = {name: None for name in shading.SHIPPED_TABLES} | {
     f"random_{degree}": ("ltsh", degree) for degree in (1, 5, MAX_DEGREE)
 }
 TABLES["random_ltc"] = ("ltc", 1)
-# A compiler takes a second for each; two of the degrees between are for `make soak`.
-NAMES = [pytest.param(name, marks=pytest.mark.soak) if name in ("ltsh2", "random_5") else name for name in TABLES]
+# A compiler takes a second for each; two of the degrees between and an LTC of random matrices are for `make soak`.
+NAMES = [
+    pytest.param(name, marks=pytest.mark.soak) if name in ("ltsh2", "random_5", "random_ltc") else name
+    for name in TABLES
+]
 
 _SHIM = """
 #include <cmath>

@@ -216,7 +216,7 @@ class Comparison:
     """The results of one scene, ready to be measured and written."""
 
     options: PictureOptions
-    extraction: Any  # blender.child.Extraction, which the core does not import
+    extraction: Any  # blender.process.client.Extraction, which the core does not import
     results: dict[str, Result]
 
     @property

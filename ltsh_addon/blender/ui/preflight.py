@@ -33,7 +33,7 @@ def missing_libraries() -> str | None:
         version = ".".join(platform.python_version_tuple()[:2])
         return (
             f"OpenEXR cannot be imported ({error_line(error)}): install the LTSH zip for "
-            f"{platform.system()} {platform.machine()} and Python {version}; only Live Preview works without"
+            f"{platform.system()} {platform.machine()} and Python {version}; only Preview with LTSH works without"
         )
     return None
 

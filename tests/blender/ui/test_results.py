@@ -77,7 +77,7 @@ def test_side_by_side_and_swapped(scene, pictures):
 
 
 def test_the_difference_has_the_colors_of_the_sheet(scene, pictures):
-    """Blender shows linear values; through the sRGB curve they are those of imaging.false_color."""
+    """Blender shows linear values; through the sRGB curve they are those of imaging.color."""
     scene.ltsh.mode, scene.ltsh.error_scale = "ERROR", 2.0
     image = bpy.data.images["LTSH Comparison"]
     assert not image.use_view_as_render

@@ -18,7 +18,7 @@ from .lookup_table import LookupTable
 from .spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
 
 # Raise it when a function of core.h changes: headers of different versions refuse to be included together.
-CORE_VERSION = 3
+CORE_VERSION = 4
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
@@ -52,6 +52,7 @@ def core_text() -> str:
         "MIN_ALPHA": float_literal(lookup_table.MIN_ALPHA),
         "TWO_OVER_PI": float_literal(2.0 / np.pi),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
+        "FOUR_PI": float_literal(4.0 * np.pi),
         "ARC_NODES": "\n".join(_arc_node_lines()),
     }
     return filled(_text("core.h"), values)

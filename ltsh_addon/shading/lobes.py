@@ -53,8 +53,10 @@ def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, s
     float32 if the vertices are, else float64. The signed integral, positive for corners counterclockwise as seen from
     outside the unit sphere, is multiplied by the sign of the polygon's solid angle and clamped at zero; `signed`
     returns it as it is. Polygons need not be convex. In a self-intersecting one every part counts as often as the
-    boundary winds around it, with that sign: of a figure of eight the difference of its halves remains. A polygon whose
-    plane goes through the point has the mean of the limits from both sides, or one of them.
+    boundary winds around it, with that sign, in the solid angle as in the integral: a square traced twice has twice
+    the integral; of a figure of eight the difference of its halves remains, or 0 where the half that the lobe prefers
+    is the smaller one. A polygon whose plane goes through the point has the mean of the limits from both sides, or one
+    of them.
     Absolute error below 2e-5 in float32, where points that need it are computed in float64. Raises ValueError where the
     shapes do not fit.
     """
@@ -151,6 +153,10 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
     def integrate(corners, index):
         chosen = weights if index is None else np.take(weights, index, axis=2)
         values, angle, needs_float64 = ridges.integrals(corners, chosen, scratch)
+        if vertices.shape[1] > 4 and tilt is None:
+            # Only here do polygons wind several times around a point, beyond the range of one arc tangent.
+            angle = solid_angle(project_to_sphere(corners[:3]))
+            needs_float64 |= np.abs(angle) > np.float32(moments32.LARGEST_SAFE_ANGLE)
         if not signed:
             values *= np.sign(angle)
             np.maximum(values, np.float32(0.0), out=values)
@@ -166,8 +172,25 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
         polygons, clip_rows = _warped(vertices[part], warp, tilt, scratch)
         values, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 1, integrate)
         result[part] = values[0]
+        if not signed and corners > 3:
+            redo[part] |= _may_turn_back(vertices[part])
     redo |= roughness < moments32.SHARP_ROUGHNESS
     return result, np.nonzero(redo)[0]
+
+
+def _may_turn_back(vertices):
+    """Mask (P,) of polygons (P, V, 3) that do not fan out from their first corner one way around. Only of those may
+    parts that are cut off or warped change the sign of the solid angle."""
+    first, *others = (tuple(vertices[:, corner, axis] for axis in range(3)) for corner in range(vertices.shape[1]))
+    sides = [[a - b for a, b in zip(corner, first, strict=True)] for corner in others]
+    turned, back = np.zeros(len(vertices), bool), np.zeros(len(vertices), bool)
+    for side, following in zip(sides[:-1], sides[1:], strict=True):
+        volume = first[0] * (side[1] * following[2] - side[2] * following[1])
+        volume += first[1] * (side[2] * following[0] - side[0] * following[2])
+        volume += first[2] * (side[0] * following[1] - side[1] * following[0])
+        turned |= volume > 0.0
+        back |= volume < 0.0
+    return turned & back
 
 
 def _warped(vertices, warp, tilt, scratch):

@@ -168,28 +168,13 @@ def one_plus_cosine(total: np.ndarray) -> np.ndarray:
 def solid_angle(unit: np.ndarray) -> np.ndarray:
     """Signed solid angle (P,) in sr of spherical polygons (3, V, P) in the hemisphere z >= 0.
 
-    Positive where the corners run counterclockwise about +z as seen from outside the sphere. Product over the edges of
-    the spherical triangles with apex e_z (Van Oosterom and Strackee 1983), with one arc tangent at the end.
+    Positive where the corners run counterclockwise about +z as seen from outside the sphere. What the boundary winds
+    around several times counts as often. Sum over the edges of the spherical triangles with apex e_z (Van Oosterom and
+    Strackee 1983), each of which has pi at most.
     """
     total = edge_sums(unit)
-    real = total[2] + one_plus_cosine(total)
     imaginary = unit[0] * total[1] - unit[1] * total[0]
-    # An edge between two corners at the point itself has no angle: factor 1, not 0.
-    real = np.where((real == 0.0) & (imaginary == 0.0), 1.0, real)
-    product_real, product_imaginary = real[0], imaginary[0]
-    for edge in range(1, unit.shape[1]):
-        product_real, product_imaginary = (
-            product_real * real[edge] - product_imaginary * imaginary[edge],
-            product_real * imaginary[edge] + product_imaginary * real[edge],
-        )
-        # Only the argument matters: keep the magnitude near one so that many edges neither overflow nor underflow.
-        scale = np.abs(product_real) + np.abs(product_imaginary)
-        scale = 1.0 / np.where(scale > 0.0, scale, 1.0)
-        product_real, product_imaginary = product_real * scale, product_imaginary * scale
-    angle = 2.0 * np.arctan2(product_imaginary, product_real)
-    # Close to 2 pi rounding may cross the branch cut; the area projected on the horizon still has the right sign.
-    wrapped = (np.abs(angle) > 6.0) & (imaginary.sum(axis=0) * angle < 0.0)
-    return np.where(wrapped, -angle, angle)
+    return 2.0 * np.arctan2(imaginary, total[2] + one_plus_cosine(total)).sum(axis=0)
 
 
 def convex_pieces(corners: np.ndarray) -> list[np.ndarray]:

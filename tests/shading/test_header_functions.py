@@ -227,6 +227,25 @@ def test_polygon_integrals_agree_with_the_add_on(compiled, corners):
     assert (signed > 0.01).any() and (signed < -0.01).any() and (found >= 0.0).all()
 
 
+def test_a_triangle_traced_twice_has_twice_the_integral(compiled):
+    """The tolerance is as above, of both."""
+    table, header = compiled
+    cosine, roughness = points(300, seed=22, lowest_roughness=0.3)
+    angle = np.array([0.0, 1.0, 2.0]) * 2.0 * np.pi / 3.0 + 0.1
+    once = np.zeros((300, 3, 3))
+    once[..., 0], once[..., 1] = np.cos(angle), np.sin(angle)
+    once[..., 2] = np.random.default_rng(23).uniform(0.02, 0.5, (300, 1))
+    once = once.astype(np.float32)
+    exact = [array.astype(float) for array in (cosine, roughness, once)]
+    expected = 2.0 * shading.integrate_polygon(table, *exact)
+    tolerance = 40.0 * EPS / half_circle_gaps(table, *exact) * np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    twice = np.tile(once, (1, 2, 1))
+    for vertices in (twice, twice[:, ::-1]):
+        found = header.call("integrate", cosine, roughness, 6, vertices)
+        assert (np.abs(found - expected) <= tolerance).all()
+    assert expected.max() > 1.0
+
+
 def test_polygon_integrals_agree_with_quadrature(compiled):
     """Lobes of medium width."""
     table, header = compiled

@@ -139,6 +139,30 @@ def test_reversing_splitting_turning_and_repeating_corners():
             assert angle_of(turned(polygon, angle)) == expected
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("height", [2.0, 0.5, 0.05])
+def test_every_turn_around_a_polygon_counts(height, dtype):
+    """Up to four times 2 pi; a pentagram is a pentagon once more: its tips lie between the two."""
+    square = np.array([[-1.0, -1.0, height], [1.0, -1.0, height], [1.0, 1.0, height], [-1.0, 1.0, height]])
+    once = 4.0 * np.arctan(1.0 / (height * np.sqrt(height**2 + 2.0)))
+    # Sixteen arc tangents, each with an error of some units in the last place.
+    limit = 100.0 * float(np.finfo(dtype).eps)
+    for turns in (1, 2, 3, 4):
+        several = batch(np.tile(square, (turns, 1))).astype(dtype)
+        for polygon, sign in ((several, 1.0), (several[:, ::-1], -1.0)):
+            found = solid_angle(project_to_sphere(polygon))[0]
+            assert found == pytest.approx(sign * turns * once, abs=limit)
+    angle = 2.0 * np.pi * np.arange(5) / 5
+    tips = np.stack([np.cos(angle), np.sin(angle), np.full(5, height)], axis=1)
+    inner = tips * np.array([-1.0, -1.0, 0.0]) * (np.cos(0.4 * np.pi) / np.cos(0.2 * np.pi)) + [0.0, 0.0, height]
+    outline = np.stack([tips, np.roll(inner, -3, axis=0)], axis=1).reshape(-1, 3)
+    star, outside, inside = (
+        solid_angle(project_to_sphere(batch(polygon).astype(dtype)))[0]
+        for polygon in (tips[[0, 2, 4, 1, 3]], outline, inner)
+    )
+    assert star == pytest.approx(outside + inside, abs=limit)
+
+
 def test_a_corner_at_the_point_is_finite():
     polygon = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]])
     unit = project_to_sphere(batch(polygon))

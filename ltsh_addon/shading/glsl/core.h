@@ -167,12 +167,12 @@ LTSH_FUNCTION ltsh_vec3 ltsh_edge_sum(ltsh_polygon unit, int i)
 }
 
 /* Signed solid angle of a spherical polygon in z >= 0: positive where the corners run counterclockwise about +z as seen
-   from outside the sphere. */
+   from outside the sphere. What the boundary winds around several times counts as often. */
 LTSH_FUNCTION float ltsh_solid_angle(ltsh_polygon unit)
 {
     float real = 1.0f;
     float imaginary = 0.0f;
-    float projected = 0.0f;
+    int turns = 0;
     for (int i = 0; i < unit.count; ++i) {
         ltsh_vec3 total = ltsh_edge_sum(unit, i);
         float edge_real = total.z + ltsh_one_plus_cosine(total);
@@ -183,19 +183,20 @@ LTSH_FUNCTION float ltsh_solid_angle(ltsh_polygon unit)
         float magnitude = (next_real < 0.0f ? -next_real : next_real)
             + (next_imaginary < 0.0f ? -next_imaginary : next_imaginary);
         float scale = magnitude > 0.0f ? 1.0f / magnitude : 1.0f;
+        /* The argument grows by a quarter turn at most: it passes the branch cut only from a negative real part. */
+        if (real < 0.0f && imaginary >= 0.0f && edge_imaginary > 0.0f && next_imaginary < 0.0f) {
+            turns += 1;
+        }
+        if (real < 0.0f && imaginary < 0.0f && edge_imaginary < 0.0f && next_imaginary >= 0.0f) {
+            turns -= 1;
+        }
         real = scale * next_real;
         imaginary = scale * next_imaginary;
-        projected += edge_imaginary;
     }
     if (real == 0.0f && imaginary == 0.0f) {
         return 0.0f;
     }
-    float solid_angle = 2.0f * LTSH_ATAN2(imaginary, real);
-    /* Close to 2 pi rounding may cross the branch cut; the area projected on the horizon still has the right sign. */
-    if ((solid_angle > 6.0f || solid_angle < -6.0f) && projected * solid_angle < 0.0f) {
-        return -solid_angle;
-    }
-    return solid_angle;
+    return 2.0f * LTSH_ATAN2(imaginary, real) + @FOUR_PI@ * LTSH_FLOAT(turns);
 }
 
 /* 1, -1 or 0: the sign of the solid angle of a polygon in z >= 0, in any length unit. */

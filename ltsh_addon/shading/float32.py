@@ -15,7 +15,7 @@ import numpy as np
 
 from . import float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
-from .lobes import FLOAT64_CHUNK
+from .lobes import FLOAT64_CHUNK, NARROWEST
 from .polygon import dot
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
@@ -106,8 +106,8 @@ class _Lighting:
             if light.is_focused:
                 near = light_cone.may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
-            if light.spread < NARROW_SPREAD:
-                needs_float64.append(index[allowed])
+            if light.spread < NARROW_SPREAD or _is_narrow(light, corners):
+                needs_float64.append(index if allowed is None else index[allowed])
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width):
                 offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
@@ -173,6 +173,12 @@ class _Lighting:
             self.shade_in_float64(self.samples.take(members[part]), own, target)
             # A sample may be there for several lights.
             np.add.at(self.radiance, (group[part], members[part]), target[0].astype(np.float32))
+
+
+def _is_narrow(light, corners) -> bool:
+    """True for lights whose long edges cancel beyond what single precision can tell."""
+    sides = corners - corners[0]
+    return np.linalg.norm(light.area_vector) < NARROWEST * (sides * sides).sum(axis=1).max()
 
 
 def _batches(light, corners, position, width):

@@ -13,10 +13,21 @@ import numpy as np
 from . import edge_integrals, moments32, spherical_harmonics
 from .light_polygons import integrate_visible
 from .lookup_table import Lobe, LookupTable
-from .polygon import edge_sums, one_plus_cosine, project_to_sphere, solid_angle, split_at_horizon, split_long_edges
+from .polygon import (
+    dot,
+    edge_sums,
+    one_plus_cosine,
+    project_to_sphere,
+    solid_angle,
+    split_at_horizon,
+    split_long_edges,
+)
 
 # Edges with a smaller 1 + cos(theta), 11 degrees short of a half circle, get a corner in between.
 LONG_EDGE = 0.02
+# Polygons whose area is a smaller share of their squared length are computed in float64. In single precision the error
+# is some 1e-7 of their length: of the integral 4e-4 (median over directions and lobes) at this limit.
+NARROWEST = 1e-3
 # Samples whose arrays in float64 stay in the cache.
 FLOAT64_CHUNK = 4096
 # Corners per chunk in float32: a compromise between calls of numpy and arrays that stay in the cache.
@@ -57,8 +68,8 @@ def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, s
     the integral; of a figure of eight the difference of its halves remains, or 0 where the half that the lobe prefers
     is the smaller one. A polygon whose plane goes through the point has the mean of the limits from both sides, or one
     of them.
-    Absolute error below 2e-5 in float32, where points that need it are computed in float64. Raises ValueError where the
-    shapes do not fit.
+    Absolute error below 2e-5 in float32, where points that need it are computed in float64: among them narrow polygons,
+    see `NARROWEST`. Raises ValueError where the shapes do not fit.
     """
     cosine, roughness, vertices = _as_float(cos_theta_o, roughness, vertices)
     if vertices.ndim != 3 or vertices.shape[2] != 3 or vertices.shape[1] < 3 or len(vertices) != len(cosine):
@@ -172,25 +183,27 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
         polygons, clip_rows = _warped(vertices[part], warp, tilt, scratch)
         values, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 1, integrate)
         result[part] = values[0]
-        if not signed and corners > 3:
-            redo[part] |= _may_turn_back(vertices[part])
+        redo[part] |= _needs_float64(vertices[part], signed)
     redo |= roughness < moments32.SHARP_ROUGHNESS
     return result, np.nonzero(redo)[0]
 
 
-def _may_turn_back(vertices):
-    """Mask (P,) of polygons (P, V, 3) that do not fan out from their first corner one way around. Only of those may
-    parts that are cut off or warped change the sign of the solid angle."""
+@np.errstate(over="ignore", invalid="ignore")
+def _needs_float64(vertices, signed):
+    """Mask (P,) of polygons (P, V, 3) that are narrow or, unless `signed`, do not fan out from their first corner one
+    way around: only of those may parts that are cut off or warped change the sign of the solid angle."""
     first, *others = (tuple(vertices[:, corner, axis] for axis in range(3)) for corner in range(vertices.shape[1]))
     sides = [[a - b for a, b in zip(corner, first, strict=True)] for corner in others]
-    turned, back = np.zeros(len(vertices), bool), np.zeros(len(vertices), bool)
-    for side, following in zip(sides[:-1], sides[1:], strict=True):
-        volume = first[0] * (side[1] * following[2] - side[2] * following[1])
-        volume += first[1] * (side[2] * following[0] - side[0] * following[2])
-        volume += first[2] * (side[0] * following[1] - side[1] * following[0])
-        turned |= volume > 0.0
-        back |= volume < 0.0
-    return turned & back
+    longest = np.maximum.reduce([dot(side, side) for side in sides])
+    area, turned, back = np.zeros((3, len(vertices)), np.float32), False, False
+    for a, b in zip(sides[:-1], sides[1:], strict=True):
+        triangle = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+        for total, component in zip(area, triangle, strict=True):
+            total += component
+        volume = dot(first, triangle)
+        turned, back = turned | (volume > 0.0), back | (volume < 0.0)
+    narrow = np.maximum.reduce(np.abs(area)) < np.float32(2.0 * NARROWEST) * longest
+    return narrow if signed else narrow | (turned & back)
 
 
 def _warped(vertices, warp, tilt, scratch):

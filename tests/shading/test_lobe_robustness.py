@@ -254,6 +254,24 @@ def test_single_precision_is_close_to_double(name, crossing):
 
 
 @table_names
+@pytest.mark.parametrize("corners", [3, 4, 5])
+def test_single_precision_knows_narrow_polygons(name, corners):
+    """Of 1 m by 0.1 mm and less, seen from 1 m and more: relative to the integral some units of 6e-8 remain."""
+    generator = np.random.default_rng(15)
+    center = generator.normal(size=(300, 1, 3)) + [0.0, 0.0, 2.0]
+    along = unit(generator.normal(size=(300, 1, 3)))
+    across = unit(np.cross(along, generator.normal(size=(300, 1, 3)))) * spread(generator, 300, -7, -4)
+    angle = 2.0 * np.pi * np.arange(corners)[:, None] / corners
+    polygons = (center + np.cos(angle) * along + np.sin(angle) * across).astype(np.float32)
+    cosine, roughness = ((0.3 + 0.7 * generator.random(300)).astype(np.float32) for _ in range(2))
+    double = shading.integrate_polygon(*(TABLES[name], *(a.astype(float) for a in (cosine, roughness, polygons))))
+    assert double.min() >= 0.0 and np.median(double) > 1e-9
+    single = shading.integrate_polygon(TABLES[name], cosine, roughness, polygons)
+    bright = double > 1e-3 * np.median(double)
+    assert np.abs(single / np.where(bright, double, 1.0) - 1.0)[bright].max() < 2e-7
+
+
+@table_names
 def test_single_precision_counts_figures_of_eight_as_double_does(name):
     """The sign of what remains of the halves hangs on their solid angles, whatever the lobe makes of them; those whose
     halves are about equal are left out."""

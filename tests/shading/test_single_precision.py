@@ -79,6 +79,26 @@ def test_lights_at_hostile_places_keep_the_promise(name):
 
 
 @table_names
+def test_narrow_lights_are_exact_to_rounding(name):
+    """1 m by 10 um: in single precision their long edges would cancel but for some percent."""
+    samples = all_kinds_of_samples(400, seed=5)
+    narrow = {"center": (0.2, 0.1, 1.5), "half_u": (0.5, 0, 0), "half_v": (0, -5e-6, 0)}
+    triangle = np.array([[-0.5, 0.0, 1.5], [-0.5, 1e-5, 1.5], [0.5, 0.0, 1.5]])
+    lights = [
+        area_light(**narrow),
+        area_light(**narrow, shape="ELLIPSE"),
+        area_light(**narrow, spread=1.0),
+        replace(area_light(**narrow), shape="POLYGON", corners=triangle),
+    ]
+    for light in white_lights(lights):
+        single = shading.shade(samples, [light], name, workers=1)
+        double = shading.shade(samples, [light], name, workers=1, dtype=np.float64)
+        for part in shading.PASSES:
+            found, expected = getattr(single, part), getattr(double, part)
+            assert np.abs(found - expected).max() < 2e-7 * expected.max() and expected.max() > 0.0
+
+
+@table_names
 def test_a_scene_far_from_the_origin_keeps_the_promise(name):
     """Positions are subtracted in double precision."""
     samples, lights = all_kinds_of_samples(500, seed=3), white_lights(four_lights())

@@ -14,9 +14,10 @@ const JOB_TYPE = {
         },
         {
             key: "output", label: "Output Folder", type: "string", subtype: "dir_path", required: true,
-            eval: "str(Path(bpy.data.filepath).with_name('ltsh') / settings.command)",
-            evalInfo: { showButton: true, description: "The folder ltsh beside the file" },
-            description: "Folder that all workers see under the same path; one job, one folder",
+            eval: "str(Path(bpy.data.filepath).parent / 'ltsh' / settings.command) if bpy.data.filepath else ''",
+            evalInfo: { showLinkButton: true, description: "ltsh/bake or the like beside the file" },
+            description: "Folder that all workers see under the same path; one job, one folder. "
+                + "// is the folder of the .blend that the workers open",
         },
         {
             key: "shards", label: "Shards", type: "int32", default: 4, required: true, propargs: { min: 1, max: 1000 },
@@ -25,7 +26,7 @@ const JOB_TYPE = {
         {
             key: "frames", label: "Frames", type: "string", default: "",
             eval: "str(C.scene.frame_current)",
-            evalInfo: { showButton: true, description: "The current frame" },
+            evalInfo: { showLinkButton: true, description: "The current frame" },
             description: "Such as 12 or 1-240:2,300; empty: the frame that the file was saved at",
         },
         {
@@ -58,7 +59,7 @@ const JOB_TYPE = {
         },
         {
             key: "arguments", label: "Further Arguments", type: "string", default: "",
-            description: "Other options of the command, separated by spaces, such as --aa 16 --resolution 960x540",
+            description: "Other options of the command, separated by spaces, such as --aa 16 --camera Left",
         },
         {
             key: "blendfile", label: "Scene", type: "string", required: true, visible: "web",
@@ -70,8 +71,9 @@ const JOB_TYPE = {
 
 // Called by Flamenco Manager.
 function compileJob(job) {
-    const settings = job.settings;
+    const settings = withDefaults(job.settings);
     checkSettings(settings);
+    settings.output = job.settings.output = outputFolder(settings);
     const mergeTask = ltshTask("merge", settings, ["merge", settings.output]);
     const shared = sharedArguments(settings);
     for (let number = 1; number <= settings.shards; number++) {
@@ -84,11 +86,38 @@ function compileJob(job) {
     job.addTask(mergeTask);
 }
 
+// Flamenco passes on what was submitted: by a script, maybe not all.
+function withDefaults(given) {
+    const settings = {};
+    for (const setting of JOB_TYPE.settings) {
+        const value = given[setting.key];
+        settings[setting.key] = value === undefined || value === null ? setting.default : value;
+    }
+    return settings;
+}
+
+// Blender's // stands for the folder of the .blend.
+function outputFolder(settings) {
+    if (!settings.output.startsWith("//")) {
+        return settings.output;
+    }
+    const folder = settings.blendfile.replace(/[^\/\\]*$/, "");
+    if (folder === "") {
+        throw new Error("output is " + settings.output + ", but blendfile, " + settings.blendfile
+            + ", has no folder: give a path that all workers see");
+    }
+    return folder + settings.output.slice(2);
+}
+
 function checkSettings(settings) {
     for (const key of ["blendfile", "output"]) {
         if (!settings[key]) {
             throw new Error(key + " is empty, expected a path that all workers see");
         }
+    }
+    const commands = JOB_TYPE.settings[0].choices;
+    if (!commands.includes(settings.command)) {
+        throw new Error("command is " + settings.command + ", expected one of " + commands.join(", "));
     }
     if (!(settings.shards >= 1)) {
         throw new Error("shards is " + settings.shards + ", expected 1 or more");
@@ -99,7 +128,7 @@ function checkSettings(settings) {
 function ltshTask(name, settings, args) {
     const task = author.Task(name, "blender");
     task.addCommand(author.Command("exec", {
-        exe: settings.blender || "{blender}",
+        exe: settings.blender,
         args: ["--command", "ltsh"].concat(args),
     }));
     return task;
@@ -128,9 +157,9 @@ function sharedArguments(settings) {
     if (settings.command === "compare" || (baking && settings.error)) {
         args.push("--cycles-samples", String(settings.cycles_samples));
     }
-    return args.concat((settings.arguments || "").split(/\s+/).filter((word) => word !== ""));
+    return args.concat(settings.arguments.split(/\s+/).filter((word) => word !== ""));
 }
 
 function names(text) {
-    return (text || "").split(";").map((name) => name.trim()).filter((name) => name !== "");
+    return text.split(";").map((name) => name.trim()).filter((name) => name !== "");
 }

@@ -11,6 +11,7 @@ const SETTING_TYPES = { string: "string", int32: "number", float: "number", bool
 const SETTING_SUBTYPES = ["file_path", "dir_path", "file_name", "hashed_file_path"];
 const SETTING_KEYS = ["key", "label", "description", "type", "subtype", "choices", "propargs", "default", "eval",
     "evalInfo", "visible", "required", "editable"];
+const EVAL_INFO_KEYS = ["showLinkButton", "description"];
 
 const author = {
     Task: function (name, type) {
@@ -45,6 +46,9 @@ function checkJobType() {
         if (wrong.length || !(setting.type in SETTING_TYPES)) {
             refuse("setting " + setting.key + ": " + wrong + " " + setting.type);
         }
+        if (!Object.keys(setting.evalInfo || {}).every((key) => EVAL_INFO_KEYS.includes(key))) {
+            refuse("setting " + setting.key + ": evalInfo has " + Object.keys(setting.evalInfo));
+        }
         if ("subtype" in setting && !SETTING_SUBTYPES.includes(setting.subtype)) {
             refuse("setting " + setting.key + " has the subtype " + setting.subtype);
         }
@@ -57,19 +61,10 @@ function checkJobType() {
     }
 }
 
+// The manager fills in no defaults.
 function compiled(given) {
-    const settings = {};
-    for (const setting of JOB_TYPE.settings) {
-        if (setting.key in given) {
-            settings[setting.key] = given[setting.key];
-        } else if ("default" in setting) {
-            settings[setting.key] = setting.default;
-        } else if (setting.required) {
-            refuse("setting " + setting.key + " is required");
-        }
-    }
     const tasks = [];
-    compileJob({ name: "test", settings: settings, addTask: (task) => tasks.push(task) });
+    compileJob({ name: "test", settings: given, addTask: (task) => tasks.push(task) });
     return tasks.map((task) => ({
         name: task.name, type: task.type, commands: task.commands,
         dependencies: task.dependencies.map((other) => tasks.indexOf(other)),
@@ -80,7 +75,7 @@ function report(given) {
     let found;
     try {
         checkJobType();
-        found = { settings: JOB_TYPE.settings, tasks: compiled(given) };
+        found = { settings: JOB_TYPE.settings, tasks: compiled(given), given: given };
     } catch (error) {
         found = { error: error.message };
     }

@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -46,6 +47,7 @@ def test_settings_have_labels_and_descriptions_and_are_refused_where_they_make_n
     assert all(setting["description"] for setting in settings if setting.get("visible") != "hidden")
     keys = [setting["key"] for setting in settings]
     assert len(set(keys)) == len(keys) and {"blendfile", "output", "shards"} <= set(keys)
+    assert "command is render, expected one of bake, compare, shade" in compiled(tmp_path, command="render")["error"]
     for name, found in (("shards", "0, expected 1 or more"), ("output", "empty"), ("blendfile", "empty")):
         assert f"{name} is {found}" in compiled(tmp_path, **{name: 0 if name == "shards" else ""})["error"]
 
@@ -85,3 +87,57 @@ def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expect
         assert given.shard == (number, 2) and job.options.output == Path("/shared/out")
         found = {**vars(job.options), "frames": job.frames, "cameras": job.cameras}
         assert {name: found[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize("command", ["bake", "compare", "shade"])
+def test_the_example_of_further_arguments_is_taken_by_every_command(tmp_path, command):
+    (described,) = (s["description"] for s in compiled(tmp_path)["settings"] if s["key"] == "arguments")
+    example = described.partition("such as ")[2]
+    line, *_ = commands(compiled(tmp_path, command=command, arguments=example))
+    given = cli_commands.job_parsers()[command].parse_args(line[1:])
+    assert cli_commands.job_of(given, given.scenes).cameras == ("Left",)
+
+
+@pytest.mark.parametrize(
+    ("scene", "output", "expected"),
+    [
+        (SCENE, "//ltsh", "/shared/ltsh"),
+        (SCENE, "//../out", "/shared/../out"),
+        (SCENE, "//", "/shared/"),
+        ("{jobs}/room-1/room.flamenco.blend", "//ltsh/bake", "{jobs}/room-1/ltsh/bake"),
+        ("S:\\shows\\room.blend", "//ltsh", "S:\\shows\\ltsh"),
+        (SCENE, "/shared/out", "/shared/out"),
+    ],
+)
+def test_the_output_may_be_relative_to_the_scene(tmp_path, scene, output, expected):
+    found = compiled(tmp_path, blendfile=scene, output=output)
+    *shards, merge = commands(found)
+    assert all(line[line.index("-o") + 1] == expected for line in shards) and merge == ["merge", expected]
+    assert found["given"]["output"] == expected  # what Flamenco shows of the job
+
+
+def test_a_relative_output_needs_the_folder_of_the_scene(tmp_path):
+    error = compiled(tmp_path, blendfile="room.blend", output="//ltsh")["error"]
+    assert "output is //ltsh, but blendfile, room.blend, has no folder" in error
+
+
+def evaluated(tmp_path, key, filepath, command="bake"):
+    """What Flamenco's add-on makes of the expression of a setting: when the type is chosen and, where its button is
+    linked, when the job is submitted."""
+    (setting,) = (setting for setting in compiled(tmp_path)["settings"] if setting["key"] == key)
+    assert setting["evalInfo"]["showLinkButton"] and setting["evalInfo"]["description"]
+    names = {
+        "bpy": SimpleNamespace(data=SimpleNamespace(filepath=filepath)),
+        "C": SimpleNamespace(scene=SimpleNamespace(frame_current=12)),
+        "Path": Path,
+        "settings": SimpleNamespace(command=command),
+    }
+    return eval(setting["eval"], {}, names)
+
+
+def test_evaluated_settings_follow_the_scene(tmp_path):
+    """In a file without a name there is no folder yet: the manager refuses the job, the add-on does not fail."""
+    assert evaluated(tmp_path, "output", SCENE) == str(Path("/shared/ltsh/bake"))
+    assert evaluated(tmp_path, "output", SCENE, "compare") == str(Path("/shared/ltsh/compare"))
+    assert evaluated(tmp_path, "output", "") == ""
+    assert evaluated(tmp_path, "frames", "") == "12"

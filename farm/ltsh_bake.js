@@ -17,7 +17,7 @@ const JOB_TYPE = {
             eval: "str(Path(bpy.data.filepath).parent / 'ltsh' / settings.command) if bpy.data.filepath else ''",
             evalInfo: { showLinkButton: true, description: "ltsh/bake or the like beside the file" },
             description: "Folder that all workers see under the same path; one job, one folder. "
-                + "// is the folder of the .blend that the workers open",
+                + "// is the folder of this file",
         },
         {
             key: "shards", label: "Shards", type: "int32", default: 4, required: true, propargs: { min: 1, max: 1000 },
@@ -65,6 +65,8 @@ const JOB_TYPE = {
             key: "blendfile", label: "Scene", type: "string", required: true, visible: "web",
             description: "The .blend",
         },
+        // Flamenco may have workers open a copy of the file elsewhere, and checks a job under a name without a folder.
+        { key: "folder", label: "Folder", type: "string", visible: "hidden", eval: "str(Path(bpy.data.filepath).parent)" },
         { key: "blender", label: "Blender", type: "string", default: "{blender}", visible: "hidden" },
     ],
 };
@@ -96,17 +98,17 @@ function withDefaults(given) {
     return settings;
 }
 
-// Blender's // stands for the folder of the .blend.
+// Blender's // stands for the folder of the file that was submitted.
 function outputFolder(settings) {
     if (!settings.output.startsWith("//")) {
         return settings.output;
     }
-    const folder = settings.blendfile.replace(/[^\/\\]*$/, "");
-    if (folder === "") {
+    const folder = settings.folder || settings.blendfile.replace(/[\/\\]?[^\/\\]*$/, "");
+    if (!folder) {
         throw new Error("output is " + settings.output + ", but blendfile, " + settings.blendfile
             + ", has no folder: give a path that all workers see");
     }
-    return folder + settings.output.slice(2);
+    return folder + "/" + settings.output.slice(2);
 }
 
 function checkSettings(settings) {

@@ -98,19 +98,25 @@ def test_the_example_of_further_arguments_is_taken_by_every_command(tmp_path, co
     assert cli_commands.job_of(given, given.scenes).cameras == ("Left",)
 
 
+# Under this name the add-on lets the manager check a job before it submits the file.
+DUMMY = "dummy-for-job-check.blend"
+
+
 @pytest.mark.parametrize(
-    ("scene", "output", "expected"),
+    ("settings", "output", "expected"),
     [
-        (SCENE, "//ltsh", "/shared/ltsh"),
-        (SCENE, "//../out", "/shared/../out"),
-        (SCENE, "//", "/shared/"),
-        ("{jobs}/room-1/room.flamenco.blend", "//ltsh/bake", "{jobs}/room-1/ltsh/bake"),
-        ("S:\\shows\\room.blend", "//ltsh", "S:\\shows\\ltsh"),
-        (SCENE, "/shared/out", "/shared/out"),
+        ({"folder": "/shared"}, "//ltsh", "/shared/ltsh"),
+        ({"folder": "/shared", "blendfile": DUMMY}, "//ltsh", "/shared/ltsh"),
+        ({"folder": "/shared", "blendfile": "{jobs}/room-1/room.flamenco.blend"}, "//../out", "/shared/../out"),
+        ({"folder": "S:\\shows"}, "//ltsh\\bake", "S:\\shows/ltsh\\bake"),
+        ({}, "//ltsh", "/shared/ltsh"),
+        ({"blendfile": "S:\\shows\\room.blend"}, "//ltsh", "S:\\shows/ltsh"),
+        ({"folder": "/elsewhere"}, "/shared/out", "/shared/out"),
     ],
 )
-def test_the_output_may_be_relative_to_the_scene(tmp_path, scene, output, expected):
-    found = compiled(tmp_path, blendfile=scene, output=output)
+def test_the_output_may_be_relative_to_the_scene(tmp_path, settings, output, expected):
+    """That is the file which was submitted; a script that submits need not say where that lies."""
+    found = compiled(tmp_path, output=output, **settings)
     *shards, merge = commands(found)
     assert all(line[line.index("-o") + 1] == expected for line in shards) and merge == ["merge", expected]
     assert found["given"]["output"] == expected  # what Flamenco shows of the job
@@ -125,7 +131,8 @@ def evaluated(tmp_path, key, filepath, command="bake"):
     """What Flamenco's add-on makes of the expression of a setting: when the type is chosen and, where its button is
     linked, when the job is submitted."""
     (setting,) = (setting for setting in compiled(tmp_path)["settings"] if setting["key"] == key)
-    assert setting["evalInfo"]["showLinkButton"] and setting["evalInfo"]["description"]
+    if setting.get("visible") != "hidden":
+        assert setting["evalInfo"]["showLinkButton"] and setting["evalInfo"]["description"]
     names = {
         "bpy": SimpleNamespace(data=SimpleNamespace(filepath=filepath)),
         "C": SimpleNamespace(scene=SimpleNamespace(frame_current=12)),
@@ -141,3 +148,4 @@ def test_evaluated_settings_follow_the_scene(tmp_path):
     assert evaluated(tmp_path, "output", SCENE, "compare") == str(Path("/shared/ltsh/compare"))
     assert evaluated(tmp_path, "output", "") == ""
     assert evaluated(tmp_path, "frames", "") == "12"
+    assert evaluated(tmp_path, "folder", SCENE) == str(Path("/shared"))

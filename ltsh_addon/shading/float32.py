@@ -1,8 +1,9 @@
 """The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
 
 The warp and, for "ltc", the tilt of the lobe are multiplied into the local frame of a sample once, for all lights: a
-light's corners come out of one product. What single precision cannot do is left to `float64`, per block: points so
-close to a light's plane that an edge spans half a circle, tiny lights, sharp lobes.
+light's corners come out of one product. What single precision cannot do is left to `float64`: points so close to a
+light's plane that an edge spans half a circle, tiny lights, sharp lobes. Few such pairs of samples and lights are
+handed back, for `shade_pairs` takes those of many blocks together.
 """
 
 from __future__ import annotations
@@ -28,8 +29,12 @@ CORNERS = 4 * CHUNK
 NARROW_SPREAD = 0.35
 
 
-def shade_diffuse(samples, lights, radiance, scratch):
-    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
+    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners).
+
+    To the list `leftovers`, if there is one, come pairs that are left to `shade_pairs`, fewer than FLOAT64_CHUNK: the
+    samples (N,) and the positions (N,) of the lights among those that affect diffuse lobes.
+    """
     lights = [item for item in lights if item[0].affects_diffuse]
     lit = np.nonzero(_any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
@@ -46,10 +51,10 @@ def shade_diffuse(samples, lights, radiance, scratch):
                 integrate = ShadowedFormFactor(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
             colors = _columns(samples.diffuse_albedo, index)[None]
             lighting.add(Lobes(index, rows, clip_rows, integrate, colors, 1.0))
-    lighting.finish()
+    lighting.finish(leftovers)
 
 
-def shade_specular(samples, lights, table, radiance, scratch):
+def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     """As `shade_diffuse` for the specular lobes of `table`."""
     lights = [item for item in lights if item[0].affects_specular]
     ridges = moments32.prepare(table)
@@ -58,17 +63,23 @@ def shade_specular(samples, lights, table, radiance, scratch):
     lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & (samples.roughness < moments32.SHARP_ROUGHNESS)
 
-    def in_float64(part, items, target):
-        float64.shade_specular(part, items, table, target)
-
-    lighting = _Lighting(samples, lights, radiance, scratch, in_float64)
+    lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
             integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
             lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width))
-    lighting.add_in_float64(np.nonzero(sharp)[0], lights)
-    lighting.finish()
+    lighting.add_in_float64(np.nonzero(sharp)[0])
+    lighting.finish(leftovers)
+
+
+def specular_in_float64(table):
+    """What `shade_pairs` wants for specular lobes of `table`; for diffuse lobes that is `float64.shade_diffuse`."""
+
+    def shade(samples, lights, radiance):
+        float64.shade_specular(samples, lights, table, radiance)
+
+    return shade
 
 
 def _chunks(members):
@@ -134,45 +145,65 @@ class _Lighting:
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[group, index] += reflected.T
 
-    def add_in_float64(self, members, lights) -> None:
-        """Add the light of `lights` at the samples `members` (Q,)."""
+    def add_in_float64(self, members) -> None:
+        """Add the light of all lights at the samples `members` (Q,)."""
+        if len(members) * len(self.lights) < FLOAT64_CHUNK:
+            for (light, _, _), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
+                allowed = light.receives(self.samples.receiver, members)
+                needs_float64.append(members if allowed is None else members[allowed])
+            return
         for start in range(0, len(members), FLOAT64_CHUNK):
             index = members[start : start + FLOAT64_CHUNK]
             target = np.zeros((len(self.radiance), len(index), 3))
-            self.shade_in_float64(self.samples.take(index), lights, target)
+            self.shade_in_float64(self.samples.take(index), self.lights, target)
             self.radiance[:, index] += target.astype(np.float32)
 
-    def finish(self) -> None:
-        """Add what was left to float64: all plain lights with equally many corners in one batch, for there are few
-        such samples."""
-        plain: dict[int, list] = {}
-        for item, parts in zip(self.lights, self.needs_float64, strict=True):
-            if parts and (item[0].is_focused or item[0].is_round):
-                self.add_in_float64(np.concatenate(parts), [item])
-            elif parts:
-                plain.setdefault(len(item[2]), []).append((item, np.concatenate(parts)))
-        for _, chosen in sorted(plain.items()):
-            self._add_light_of_each(chosen)
-
-    def _add_light_of_each(self, chosen) -> None:
-        """Add the light of (light, group, corners) at the samples with it, lights with equally many corners."""
-        members = np.concatenate([index for _, index in chosen])
-        number = np.repeat(np.arange(len(chosen)), [len(index) for _, index in chosen])
-        group = np.array([item[1] for item, _ in chosen])[number]
-        corners = np.stack([item[2] for item, _ in chosen])
-        fields = {
-            name: np.stack([getattr(item[0], name) for item, _ in chosen])
-            for name in ("center", "direction", "radiance")
-        }
-        for start in range(0, len(members), FLOAT64_CHUNK):
-            part = slice(start, start + FLOAT64_CHUNK)
-            of = number[part]
-            light = float64.LightOfEachSample(**{name: values[of] for name, values in fields.items()})
-            target = np.zeros((1, len(of), 3))
-            own = [(light, 0, corners[of].transpose(1, 0, 2))]
-            self.shade_in_float64(self.samples.take(members[part]), own, target)
+    def finish(self, leftovers) -> None:
+        """Add what was left to float64, or put it into `leftovers`."""
+        counts = [sum(map(len, parts)) for parts in self.needs_float64]
+        if not any(counts):
+            return
+        members = np.concatenate([part for parts in self.needs_float64 for part in parts])
+        number = np.repeat(np.arange(len(counts)), counts)
+        if leftovers is not None and len(members) < FLOAT64_CHUNK:
+            leftovers.append((members.astype(np.int32), number.astype(np.int32)))
+            return
+        group = np.array([group for _, group, _ in self.lights])
+        for pairs, found in shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may be there for several lights.
-            np.add.at(self.radiance, (group[part], members[part]), target[0].astype(np.float32))
+            np.add.at(self.radiance, (group[number[pairs]], members[pairs]), found.astype(np.float32))
+
+
+def shade_pairs(samples, members, number, lights, shade_in_float64):
+    """Yield (pairs (Q,), radiance (Q, 3)) of samples `members` (N,) under the one light each that `number` (N,) says.
+
+    Lights with equally many corners make one batch, but for those whose corners hang on the sample.
+    """
+    batches: dict[tuple, list[int]] = {}
+    for position, (light, _, corners) in enumerate(lights):
+        own = (1, position) if light.is_focused or light.is_round else (0, len(corners))
+        batches.setdefault(own, []).append(position)
+    for (alone, _), chosen in sorted(batches.items()):
+        among = np.full(len(lights), -1)
+        among[chosen] = np.arange(len(chosen))
+        of_batch = np.nonzero(among[number] >= 0)[0]
+        for start in range(0, len(of_batch), FLOAT64_CHUNK):
+            pairs = of_batch[start : start + FLOAT64_CHUNK]
+            items = [lights[position] for position in chosen]
+            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, among[number[pairs]])
+            target = np.zeros((1, len(pairs), 3))
+            shade_in_float64(samples.take(members[pairs]), [own], target)
+            yield pairs, target[0]
+
+
+def _light_of_each(items, number):
+    """One (light, group, corners) in place of several with equally many corners, of which each sample has its own."""
+    fields = {
+        name: np.stack([getattr(light, name) for light, _, _ in items])[number]
+        for name in ("center", "direction", "radiance")
+    }
+    corners = np.stack([corners for _, _, corners in items])
+    return float64.LightOfEachSample(**fields), 0, corners[number].transpose(1, 0, 2)
 
 
 def _is_narrow(light, corners) -> bool:

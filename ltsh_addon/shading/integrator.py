@@ -64,17 +64,33 @@ class Task:
         corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
-    def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        """Radiance (G, B, 3) by pass of one block of B samples, and the error (B,) of the reference."""
+    def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
+        """Radiance (G, B, 3) by pass of one block of B samples, the error (B,) of the reference, and by pass the list
+        of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
+        leftovers: dict[str, list] = {name: [] for name in self.passes}
         plain = self._prepared(light for light in self.lights if not light.detail)
-        self._add(samples, plain, radiance, error, scratch)
+        self._add(samples, plain, radiance, error, scratch, leftovers)
         for light in self.lights:
             if light.detail:
                 for name in self.passes:
                     self._add_detailed(samples, light, name, radiance[name], error, scratch)
-        return radiance, error
+        return radiance, error, leftovers
+
+    def lights_of_pairs(self, name: str) -> list[AreaLight]:
+        """The lights that `shade_pairs` knows by their number."""
+        return [light for light in self.lights if getattr(light, f"affects_{name}") and not light.detail]
+
+    def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
+        """Radiance (N, 3) of one pass of N samples under one light each."""
+        in_float64 = float64.shade_diffuse if name == "diffuse" else float32.specular_in_float64(self.table)
+        lights, (used, number) = self.lights_of_pairs(name), np.unique(number, return_inverse=True)
+        lights = self._prepared(lights[one] for one in used)
+        result, every = np.zeros((len(samples), 3), self.dtype), np.arange(len(samples))
+        for pairs, found in float32.shade_pairs(samples, every, number, lights, in_float64):
+            result[pairs] = found
+        return result
 
     def _prepared(self, lights):
         return [(light, self.groups.index(light.group), light.polygon()) for light in lights]
@@ -84,18 +100,20 @@ class Task:
         for index, patches in fitting_patches(light, samples, name == "specular"):
             own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
-            self._add(samples.take(index), self._prepared(patches), own, own_error, scratch)
+            self._add(samples.take(index), self._prepared(patches), own, own_error, scratch, {})
             radiance[:, index] += own[name]
             if error is not None:
                 error[index] += own_error
 
-    def _add(self, samples, prepared, radiance, error, scratch) -> None:
-        """Add the light of the `prepared` lights to the passes in `radiance`."""
+    def _add(self, samples, prepared, radiance, error, scratch, leftovers) -> None:
+        """Add the light of the `prepared` lights to the passes in `radiance`, but for `leftovers`."""
         if self.single:
             if "diffuse" in radiance:
-                float32.shade_diffuse(samples, prepared, radiance["diffuse"], scratch)
+                left = leftovers.get("diffuse")
+                float32.shade_diffuse(samples, prepared, radiance["diffuse"], scratch, left)
             if "specular" in radiance:
-                float32.shade_specular(samples, prepared, self.table, radiance["specular"], scratch)
+                left = leftovers.get("specular")
+                float32.shade_specular(samples, prepared, self.table, radiance["specular"], scratch, left)
             return
         for start in range(0, len(samples), FLOAT64_CHUNK):
             chunk = slice(start, start + FLOAT64_CHUNK)
@@ -155,19 +173,49 @@ def shade(
     """
     task = _task(tuple(lights), technique, passes, dtype)
     count = len(samples)
-    shape = (len(task.groups), count, 3)
-    radiance = {name: np.zeros(shape, np.dtype(dtype)) for name in task.passes}
-    error = np.zeros(count) if task.has_error else None
-
-    def keep(block, found, estimates):
-        for name, values in found.items():
-            radiance[name][:, block] = values
-        if error is not None:
-            error[block] = estimates
-
+    result = _Result(task, count, np.dtype(dtype))
     blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
-    parallel.run(task, samples, blocks, workers, keep, progress)
-    return Shading(task.groups, radiance.get("specular"), radiance.get("diffuse"), error)
+    parallel.run(task, samples, blocks, workers, result, progress)
+    return Shading(task.groups, result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
+
+
+class _Result:
+    """Puts blocks together, and what they leave for the end."""
+
+    def __init__(self, task: Task, count: int, dtype: np.dtype):
+        self._task = task
+        self.radiance = {name: np.zeros((len(task.groups), count, 3), dtype) for name in task.passes}
+        self.error = np.zeros(count) if task.has_error else None
+        self._leftovers: dict[int, dict] = {}  # by start of the block
+
+    def keep(self, block: slice, radiance, error, leftovers) -> None:
+        """Take what `Task.shade` returns."""
+        for name, values in radiance.items():
+            self.radiance[name][:, block] = values
+        if self.error is not None:
+            self.error[block] = error
+        self._leftovers[block.start] = leftovers
+
+    def pairs(self) -> list[parallel.Pairs]:
+        """What all blocks have left, in batches. Neither these nor the order in them hangs on which block was done
+        first, and all that is left of a block is in one of them."""
+        found = []
+        for name in self._task.passes:
+            batch: list[tuple] = []
+            for start, leftovers in sorted(self._leftovers.items()):
+                if sum(len(members) for members, _ in batch) >= FLOAT64_CHUNK:
+                    found.append((name, batch))
+                    batch = []
+                batch += [(members + start, number) for members, number in leftovers[name]]
+            found.append((name, batch))
+        return [parallel.Pairs(name, *map(np.concatenate, zip(*batch, strict=True))) for name, batch in found if batch]
+
+    def keep_pairs(self, pairs: parallel.Pairs, radiance: np.ndarray) -> None:
+        """Add what `Task.shade_pairs` returns."""
+        lights = self._task.lights_of_pairs(pairs.name)
+        group = np.array([self._task.groups.index(light.group) for light in lights])
+        # A sample may be there for several lights.
+        np.add.at(self.radiance[pairs.name], (group[pairs.number], pairs.index), radiance)
 
 
 def _blocks(count: int, least: int, most: int) -> list[slice]:

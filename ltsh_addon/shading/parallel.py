@@ -3,7 +3,8 @@
 Threads do not pay off here, numpy's calls are too short. Children are interpreters started by path, never forked:
 inside Blender a fork would copy a process with threads and a window. The blocks and what happens in each do not depend
 on how many processes there are, so the result does not either; where no child can be started this process does it all.
-A block reaches a child, and its radiance comes back, through memory that both share.
+A block reaches a child, and its radiance comes back, through memory that both share. When all blocks are done, all
+processes take what those have left for double precision: few pairs of a sample and a light each, many together.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from ..scene import SCALAR_FIELDS, Cancelled, SurfaceSamples
 from . import moments32, worker
+from .lobes import FLOAT64_CHUNK
 
 # A child takes some 0.2 s to start: shorter tasks are done in this process.
 SECONDS_WORTH_A_CHILD = 0.5
@@ -99,8 +101,25 @@ def arrays_in(memory, layout) -> dict[str, np.ndarray]:
     return {name: np.ndarray(shape, dtype, memory, offset) for name, shape, dtype, offset in layout}
 
 
+@dataclass(frozen=True)
+class Pairs:
+    """Samples, each to be shaded under one light in one of the passes; fewer than two FLOAT64_CHUNK."""
+
+    name: str
+    index: np.ndarray  # (N,) of the samples, some several times
+    number: np.ndarray  # (N,) of the lights
+
+
+def _index(work):
+    return work.index if isinstance(work, Pairs) else work
+
+
+def _size(work):
+    return len(work.index) if isinstance(work, Pairs) else work.stop - work.start
+
+
 class ParentSide:
-    """Sends blocks of `samples`, of `block_size` samples at most, to one child that works on `task`."""
+    """Sends blocks and pairs of `samples`, of `block_size` samples at most, to one child that works on `task`."""
 
     def __init__(self, task, samples: SurfaceSamples, block_size: int):
         self.samples = samples
@@ -141,44 +160,53 @@ class ParentSide:
         layout, size = layout_of(arrays)
         return [entry for entry in layout if entry[0].startswith("in ")], layout, size
 
-    def put(self, block: slice) -> dict:
-        """Copy a block into the shared memory; the message that tells the child."""
-        inputs, layout, _ = self._layouts(block.stop - block.start)
+    def put(self, work: slice | Pairs) -> dict:
+        """Copy the samples into the shared memory; the message that tells the child."""
+        inputs, layout, _ = self._layouts(_size(work))
         for name, values in self.memory.arrays(inputs).items():
-            np.copyto(values, getattr(self.samples, name.removeprefix("in "))[block])
-        return {"layout": layout, "same": self.same, "count": block.stop - block.start}
+            np.copyto(values, getattr(self.samples, name.removeprefix("in "))[_index(work)])
+        pairs = (work.name, work.number) if isinstance(work, Pairs) else None
+        return {"layout": layout, "same": self.same, "count": _size(work), "pairs": pairs}
 
-    def take(self, block: slice):
-        """Radiance by pass and the error, views of the shared memory, once the child has answered."""
-        _, layout, _ = self._layouts(block.stop - block.start)
+    def take(self, work: slice | Pairs, leftovers):
+        """What the task returns, as views of the shared memory, once the child has answered with `leftovers`."""
+        _, layout, _ = self._layouts(_size(work))
         arrays = self.memory.arrays([entry for entry in layout if not entry[0].startswith("in ")])
-        return {name: arrays[f"out {name}"] for name in self.task.passes}, arrays.get("error")
+        if isinstance(work, Pairs):
+            return (arrays[f"out {work.name}"][0],)
+        return {name: arrays[f"out {name}"] for name in self.task.passes}, arrays.get("error"), leftovers
 
     def close(self) -> None:
         self.memory.close()
 
 
 class ChildSide:
-    """Shades the blocks that the parent puts into the memory."""
+    """Shades the samples that the parent puts into the memory."""
 
     def __init__(self, task, handle, size: int):
         self.task = task
         self.memory = attach(handle, size)
         self.scratch = moments32.Scratch()
 
-    def shade(self, message: dict) -> None:
-        """Shade the block that `message` describes; the result goes into the memory."""
+    def shade(self, message: dict) -> dict:
+        """Shade what `message` describes; the result goes into the memory, but for the leftovers."""
         arrays, count = arrays_in(self.memory, message["layout"]), message["count"]
         values = {name.removeprefix("in "): array for name, array in arrays.items() if name.startswith("in ")}
         values.update({name: values[other] for name, other in message["same"].items()})
         for field in fields(SurfaceSamples):
             if field.name not in values:
                 values[field.name] = np.broadcast_to(0.0, (count,) if field.name in SCALAR_FIELDS else (count, 3))
-        found, estimates = self.task.shade(SurfaceSamples(**values), self.scratch)
+        samples = SurfaceSamples(**values)
+        if message["pairs"]:
+            name, number = message["pairs"]
+            arrays[f"out {name}"][0] = self.task.shade_pairs(samples, name, number)
+            return {}
+        found, estimates, leftovers = self.task.shade(samples, self.scratch)
         for name, radiance in found.items():
             arrays[f"out {name}"][:] = radiance
         if estimates is not None:
             arrays["error"][:] = estimates
+        return leftovers
 
 
 def _is_zero_everywhere(values) -> bool:
@@ -191,19 +219,21 @@ def run(
     samples: SurfaceSamples,
     blocks: list[slice],
     workers: int | None,
-    keep: Callable,
+    result,
     progress: Callable[[float], bool | None] | None = None,
 ) -> None:
-    """Call keep(block, radiance, error) with the result of every block, from this thread or another one.
+    """Call result.keep(block, *task.shade()) for every block, from this thread or another one; then result.pairs()
+    once, and result.keep_pairs(pairs, task.shade_pairs()) for all that it returns.
 
     `workers` processes in all (None: as many as `cores` says). After every block `progress` is called from this
     thread; where it returns False Cancelled is raised. No child is left when this returns or raises.
     """
-    queue = _Queue(blocks, keep)
+    queue = _Queue(blocks, result)
     children = []
     try:
         for _ in range(_children_wanted(task, len(samples), blocks, workers)):
-            children.append(_Child(task, samples, queue, max(block.stop - block.start for block in blocks)))
+            most = max(2 * FLOAT64_CHUNK if task.single else 0, *map(_size, blocks))
+            children.append(_Child(task, samples, queue, most))
         _work(task, samples, queue, progress)
     finally:
         queue.stop()
@@ -235,41 +265,54 @@ def interpreter() -> str | None:
 
 
 def _work(task, samples, queue, progress):
-    """Shade blocks in this thread until all are done, by whomever."""
+    """Shade blocks and pairs in this thread until all are done, by whomever."""
     scratch = moments32.Scratch()
     while not queue.finished():
-        block = queue.next()
-        if block is None:
+        work = queue.next()
+        if work is None:
             queue.wait(PATIENCE_SECONDS)
+        elif isinstance(work, Pairs):
+            queue.done(work, task.shade_pairs(samples.take(work.index), work.name, work.number))
         else:
-            queue.done(block, *task.shade(samples.take(block), scratch))
+            queue.done(work, *task.shade(samples.take(work), scratch))
         if progress is not None and progress(queue.share()) is False:
             raise Cancelled("shading was stopped")
 
 
 class _Queue:
-    """The blocks that are left, for several threads."""
+    """The blocks that are left, for several threads; after the last one the pairs."""
 
-    def __init__(self, blocks, keep):
-        self._keep = keep
+    def __init__(self, blocks, result):
+        self._result = result
         self._left, self._total, self._done = deque(blocks), len(blocks), 0
+        self._blocks = len(blocks)
         self._changed = threading.Condition()
         self.stopped = False
 
     def next(self):
-        """A block that nobody works on, or None."""
+        """Something that nobody works on, or None."""
         with self._changed:
             return self._left.popleft() if self._left and not self.stopped else None
 
-    def give_back(self, block):
+    def next_of_all(self):
+        """As `next`, but None only at the end."""
+        while (work := self.next()) is None and not self.stopped and not self.finished():
+            self.wait(PATIENCE_SECONDS)
+        return work
+
+    def give_back(self, work):
         with self._changed:
-            self._left.append(block)
+            self._left.append(work)
             self._changed.notify_all()
 
-    def done(self, block, radiance, error):
-        self._keep(block, radiance, error)
+    def done(self, work, *found):
+        (self._result.keep_pairs if isinstance(work, Pairs) else self._result.keep)(work, *found)
         with self._changed:
             self._done += 1
+            if self._done == self._blocks:
+                pairs = self._result.pairs()
+                self._left.extend(pairs)
+                self._total += len(pairs)
             self._changed.notify_all()
 
     def wait(self, seconds):
@@ -283,14 +326,15 @@ class _Queue:
             self.stopped = True
 
     def share(self) -> float:
-        return self._done / self._total
+        """Of the blocks: what they leave takes little time."""
+        return min(self._done / self._blocks, 1.0)
 
     def finished(self) -> bool:
         return self._done == self._total
 
 
 class _Child:
-    """One worker process and the thread that feeds it. Whatever goes wrong, its block goes back to the queue."""
+    """One worker process and the thread that feeds it. Whatever goes wrong, its work goes back to the queue."""
 
     def __init__(self, task, samples, queue, block_size):
         self._side = ParentSide(task, samples, block_size)
@@ -316,7 +360,7 @@ class _Child:
         self._thread.start()
 
     def _feed(self):
-        block = None
+        work = None
         try:
             commands, answers = self._process.stdin, self._process.stdout
             memory = self._side.memory
@@ -324,22 +368,22 @@ class _Child:
                 commands, {"path": sys.path, "handle": memory.handle, "size": self._side.size, "package": _PACKAGE}
             )
             worker.send(commands, self._task)
-            self._check(worker.receive(answers))
-            while (block := self._queue.next()) is not None:
-                worker.send(commands, self._side.put(block))
-                self._check(worker.receive(answers))
-                self._queue.done(block, *self._side.take(block))
+            self._checked(worker.receive(answers))
+            while (work := self._queue.next_of_all()) is not None:
+                worker.send(commands, self._side.put(work))
+                self._queue.done(work, *self._side.take(work, self._checked(worker.receive(answers))))
         except (OSError, EOFError, ValueError, _ChildError) as error:
             if self._queue.stopped:
                 return  # `end` has killed the process
-            if block is not None:
-                # This process computes it instead, and meets the same error if the block is at fault.
-                self._queue.give_back(block)
+            if work is not None:
+                # This process computes it instead, and meets the same error if the samples are at fault.
+                self._queue.give_back(work)
             _logger.warning("worker process ended early (%s); shading goes on without", error or type(error).__name__)
 
-    def _check(self, answer):
-        if answer is not None:
+    def _checked(self, answer):
+        if isinstance(answer, str):
             raise _ChildError(answer.strip().splitlines()[-1])
+        return answer
 
     def end(self):
         """End and reap the process, wherever it is."""

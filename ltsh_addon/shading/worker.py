@@ -1,7 +1,8 @@
-"""What a worker process of `shade` runs, started by path: answers blocks of samples until its input ends.
+"""What a worker process of `shade` runs, started by path: shades samples until its input ends.
 
 Messages are pickles with their length in front. The first one brings the search path and the shared memory,
-the second the task; each later one the layout of a block. The answer is None, or the text of an error.
+the second the task; each later one the layout of a block or of pairs. The answer is what `ChildSide.shade` returns, or
+the text of an error.
 """
 
 from __future__ import annotations
@@ -63,8 +64,7 @@ def _serve(commands, answers) -> None:
     while True:
         message = receive(commands)
         try:
-            side.shade(message)
-            answer = None
+            answer = side.shade(message)
         except Exception:
             answer = traceback.format_exc()
         send(answers, answer)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kills import is_running
-from surface_scenes import four_lights, random_samples
+from surface_scenes import area_light, four_lights, random_samples
 
 from ltsh_addon import shading
 from ltsh_addon.scene import Cancelled
-from ltsh_addon.shading import integrator, parallel
+from ltsh_addon.shading import float32, integrator, parallel
 
 ROOT = Path(__file__).resolve().parents[2]
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -85,6 +85,40 @@ def test_workers_use_the_matrix_of_this_process(dtype, started, children_only):
     assert not np.array_equal(one.specular, plain.specular)
 
 
+def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started, children_only, monkeypatch):
+    """Lights of 2 mm, of two groups, several kinds, and one not for all; some lobes are sharp. Against double precision
+    for all, against children, and against blocks that leave little."""
+    generator = np.random.default_rng(5)
+    samples = random_samples(300, seed=11, lowest_roughness=0.02)
+    samples = replace(samples, receiver=np.arange(300) % 2, bump_alpha2=np.full(300, 0.1))
+    tiny = {"half_u": (0.001, 0, 0), "half_v": (0, -0.001, 0), "group": "Tiny"}
+    centers = np.append(generator.uniform(-0.5, 0.5, (4, 2)), np.full((4, 1), 1.5), axis=1)
+    lights = [area_light(center=center, **tiny) for center in centers]
+    lights[1] = replace(lights[1], receivers=(1,), group="Key")
+    lights[2] = replace(lights[2], shape="DISK")
+    lights[3] = replace(lights[3], spread=1.0)
+    asked = []
+    original = integrator.Task.shade_pairs
+
+    def counted(self, samples, name, number):
+        asked.append((name, len(number)))
+        return original(self, samples, name, number)
+
+    monkeypatch.setattr(integrator.Task, "shade_pairs", counted)
+    one = shading.shade(samples, lights, "ltsh4", workers=1)
+    assert [name for name, _ in asked] == list(shading.PASSES) and all(count > 100 for _, count in asked)
+    three = shading.shade(samples, lights, "ltsh4", workers=3)
+    monkeypatch.setattr(float32, "FLOAT64_CHUNK", 5)
+    at_once = shading.shade(samples, lights, "ltsh4", workers=1)
+    double = shading.shade(samples, lights, "ltsh4", workers=1, dtype=np.float64)
+    assert sum(count for _, count in asked[2:]) < 20 and len(started) == 2
+    for name in shading.PASSES:
+        found, expected = getattr(one, name), getattr(double, name)
+        assert np.abs(found - expected).max() < 1e-6 * expected.max() and (expected.max(axis=(1, 2)) > 0.0).all()
+        assert np.array_equal(found, getattr(three, name))
+        assert np.abs(found - getattr(at_once, name)).max() < 1e-6 * expected.max()
+
+
 def test_progress_is_reported_from_this_thread_and_reaches_one(started):
     seen, threads = [], set()
 
@@ -150,9 +184,9 @@ def test_few_samples_stay_in_this_process(monkeypatch, started):
 PARENT = """
 import sys, time
 sys.path[:0] = [{root!r}, {tests!r}]
-from surface_scenes import four_lights, random_samples
+from surface_scenes import area_light, four_lights, random_samples
 from ltsh_addon import shading
-from ltsh_addon.shading import integrator, parallel
+from ltsh_addon.shading import float32, integrator, parallel
 parallel.SECONDS_WORTH_A_CHILD = 0.0
 integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
 original = parallel.subprocess.Popen

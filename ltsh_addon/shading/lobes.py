@@ -168,10 +168,7 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
             # Only here do polygons wind several times around a point, beyond the range of one arc tangent.
             angle = solid_angle(project_to_sphere(corners[:3]))
             needs_float64 |= np.abs(angle) > np.float32(moments32.LARGEST_SAFE_ANGLE)
-        if not signed:
-            values *= np.sign(angle)
-            np.maximum(values, np.float32(0.0), out=values)
-        return values, needs_float64
+        return np.stack([values[0], np.sign(angle)]), needs_float64
 
     step = max(_FLOAT32_CORNERS // corners, 512)
     for start in range(0, count, step):
@@ -181,29 +178,41 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
         sine = np.sqrt((np.float32(1.0) - mu) * (np.float32(1.0) + mu))
         warp, weights, tilt = ridges.fetch((0,), mu, sine, rough, None, scratch)
         polygons, clip_rows = _warped(vertices[part], warp, tilt, scratch)
-        values, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 1, integrate)
-        result[part] = values[0]
-        redo[part] |= _needs_float64(vertices[part], signed)
+        found, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 2, integrate)
+        values, orientation = found
+        narrow, turns_back = _narrow_and_turning_back(vertices[part])
+        redo[part] |= narrow
+        if not signed:
+            if turns_back.any():
+                orientation[turns_back] = _orientations(vertices[part][turns_back])
+            values *= orientation
+            np.maximum(values, np.float32(0.0), out=values)
+        result[part] = values
     redo |= roughness < moments32.SHARP_ROUGHNESS
     return result, np.nonzero(redo)[0]
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def _needs_float64(vertices, signed):
-    """Mask (P,) of polygons (P, V, 3) that are narrow or, unless `signed`, do not fan out from their first corner one
-    way around: only of those may parts that are cut off or warped change the sign of the solid angle."""
-    first, *others = (tuple(vertices[:, corner, axis] for axis in range(3)) for corner in range(vertices.shape[1]))
-    sides = [[a - b for a, b in zip(corner, first, strict=True)] for corner in others]
-    longest = np.maximum.reduce([dot(side, side) for side in sides])
-    area, turned, back = np.zeros((3, len(vertices)), np.float32), False, False
-    for a, b in zip(sides[:-1], sides[1:], strict=True):
-        triangle = (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
-        for total, component in zip(area, triangle, strict=True):
-            total += component
-        volume = dot(first, triangle)
-        turned, back = turned | (volume > 0.0), back | (volume < 0.0)
-    narrow = np.maximum.reduce(np.abs(area)) < np.float32(2.0 * NARROWEST) * longest
-    return narrow if signed else narrow | (turned & back)
+def _narrow_and_turning_back(vertices):
+    """Masks (P,) of polygons (P, V, 3) that are narrow, and of those that do not fan out from their first corner one
+    way around: only of these may parts that are cut off or warped change the sign of the solid angle."""
+    corners = np.ascontiguousarray(vertices.transpose(2, 1, 0))
+    sides = corners[:, 1:] - corners[:, :1]
+    longest = dot(sides, sides).max(axis=0)
+    (ax, ay, az), (bx, by, bz) = sides[:, :-1], sides[:, 1:]
+    triangles = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    size = np.maximum.reduce([np.abs(np.add.reduce(triangle)) for triangle in triangles])
+    volumes = dot(corners[:, :1], triangles)
+    turns_back = (np.minimum.reduce(volumes) < 0.0) & (np.maximum.reduce(volumes) > 0.0)
+    return size < np.float32(2.0 * NARROWEST) * longest, turns_back
+
+
+def _orientations(vertices):
+    """Signs (P,) of the solid angles of the parts above the horizon of polygons (P, V, 3)."""
+    result = np.zeros(len(vertices), vertices.dtype)
+    for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
+        result[index] = np.sign(integrals_on_sphere(solid_angle, polygon))
+    return result
 
 
 def _warped(vertices, warp, tilt, scratch):

@@ -82,6 +82,8 @@ class AreaLight:
     s^2 + t^2 <= 1 for DISK and ELLIPSE. That of a POLYGON is inside `corners`, in the plane of center, half_u and
     half_v, which say how far it reaches. A `spread` below pi focuses the light as in Cycles: the radiance is multiplied
     by max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
+    At the distance t from its points it is also multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
+    Falloff node: 0 is quadratic, 1 linear, 2 constant.
     """
 
     name: str
@@ -98,6 +100,8 @@ class AreaLight:
     spread: float = np.pi  # rad, full angle of the cone into which the light shines
     receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
     detail: tuple[AreaLight, ...] = ()
+    falloff: int = 0  # power of the distance in m
+    smooth: float = 0.0  # m^2
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -122,6 +126,11 @@ class AreaLight:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
         if self.shape == "POLYGON" and self.is_focused:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape POLYGON")
+        if self.falloff not in (0, 1, 2) or not 0.0 <= self.smooth < np.inf:
+            raise ValueError(
+                f"light {self.name!r}: falloff is {self.falloff!r} and smooth is {self.smooth!r}, expected 0, 1 or 2 "
+                "and a finite number that is not negative"
+            )
         if self.receivers is not None:
             object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
         detail = tuple(part if isinstance(part, AreaLight) else AreaLight(**part) for part in self.detail)
@@ -141,6 +150,16 @@ class AreaLight:
     def is_focused(self) -> bool:
         """True where the spread matters: closer to pi the factor is 1 but for directions along the light's plane."""
         return self.spread < np.pi - 1e-5
+
+    @property
+    def has_falloff(self) -> bool:
+        """True where the distance matters: the light is not plainly quadratic."""
+        return self.falloff != 0 or self.smooth > 0.0
+
+    @property
+    def is_profiled(self) -> bool:
+        """True where it depends on the place on the light how bright a point sees it: by its spread or falloff."""
+        return self.is_focused or self.has_falloff
 
     def receives(self, receiver: np.ndarray, index=slice(None)) -> np.ndarray | None:
         """Mask (Q,) of the samples `index` whose `receiver` (P,) the light lights; None: it lights all."""

@@ -174,10 +174,10 @@ def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLigh
         return [_rectangle(light, cell)]
     if share <= 1e-9:
         return []
-    if not light.is_focused:
+    if not light.is_profiled:
         whole = _rectangle(light, cell)
         return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
-    # Polygons have no spread: small rectangles with the same power stand for the edge.
+    # Polygons may have no spread: small rectangles with the same power stand for the edge.
     if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
         return [part for half in _halves(cell) for part in _light_of_cell(light, outline, half)]
     bounds = np.stack([inside.min(axis=0), inside.max(axis=0)], axis=-1).ravel()

@@ -126,8 +126,8 @@ class _Lighting:
                 if allowed is not None:
                     facing &= allowed[part]
                 axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
-                if light.is_focused:
-                    integrate = FocusedIntegral(light, effort, offset, axes, integrate, len(colors))
+                if light.is_profiled:
+                    integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(colors))
                     axes = integrate.rows
                 polygons = local_corners(light, outline, offset, axes, self.scratch)
                 found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
@@ -181,7 +181,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.is_focused or light.is_round else (0, len(corners))
+        own = (1, position) if light.is_profiled or light.is_round else (0, len(corners))
         batches.setdefault(own, []).append(position)
     for (alone, _), chosen in sorted(batches.items()):
         among = np.full(len(lights), -1)
@@ -376,14 +376,15 @@ class LobeIntegral:
         return np.maximum(values, np.float32(0.0), out=values), needs_float64
 
 
-class FocusedIntegral:
-    """Integrals (F, Q) over polygons times the factor of the light's spread, by integrals over parts of the light.
+class ProfiledIntegral:
+    """Integrals (F, Q) over polygons times the profile of the light, by integrals over parts of the light.
 
     The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
     """
 
     def __init__(self, light, effort, offset, axes, integrate, count):
-        self.light, self.effort, self.integrate, self.count = light, effort, integrate, count
+        self.effort, self.integrate, self.count = effort, integrate, count
+        self.profile = light_cone.Profile.of(light)
         self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
         plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
         self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
@@ -396,7 +397,7 @@ class FocusedIntegral:
         for start in range(0, len(index), step):
             part = slice(start, start + step)
             flat, view = corners[-2:, :, part], self.view.take(index[part])
-            layers = light_cone.layers(view, flat, self.light.spread, self.effort)
+            layers = light_cone.layers(view, flat, self.profile, self.effort)
             for number, (near, weights, polygons) in enumerate(layers):
                 # The small disks count little, so that the rounding of their edges is lost in the sum.
                 smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE

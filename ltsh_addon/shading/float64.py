@@ -31,6 +31,7 @@ class LightOfEachSample:
     affects_diffuse: bool = True
     affects_specular: bool = True
     is_focused: bool = False
+    is_profiled: bool = False
     is_round: bool = False
 
     def receives(self, receiver, index):
@@ -61,9 +62,9 @@ def shade_diffuse(samples, lights, radiance):
             continue
         for candidates, second_normal, integral in kinds:
             for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
-                if light.is_focused:
+                if light.is_profiled:
                     view = light_view(samples, frame, light, index, lambda vectors: vectors)
-                    irradiance = _focused(light, view, effort, index, polygon, integral, 1)[0]
+                    irradiance = _profiled(light, view, effort, index, polygon, integral, 1)[0]
                 else:
                     irradiance = integral(polygon, index)
                 reflected = irradiance[:, None] * samples.diffuse_albedo[index]
@@ -75,11 +76,11 @@ def lobe_width(samples, index) -> np.ndarray:
     return np.maximum(samples.roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
-def _focused(light, view, effort, index, polygon, integral, count):
-    """Integrals (count, Q) over polygons (5, W, Q) times the factor of the light's spread; integral(polygons, index) is
-    that without it."""
+def _profiled(light, view, effort, index, polygon, integral, count):
+    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light; integral(polygons, index) is that
+    without it."""
     result = np.zeros((count, len(index)))
-    for near, weights, corners in light_cone.layers(view, polygon[3:], light.spread, effort):
+    for near, weights, corners in light_cone.layers(view, polygon[3:], light_cone.Profile.of(light), effort):
         result[:, near] += weights * integral(corners[3:], index[near])
     return result
 
@@ -143,7 +144,7 @@ def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon)
         part = lobe.take(index)
         return np.maximum(-polygon_integrals(table, part, polygon, part.coefficients), 0.0)
 
-    if not light.is_focused:
+    if not light.is_profiled:
         return integral(polygon, index)
     own = lobe.take(index)
 
@@ -152,4 +153,4 @@ def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon)
         return warped if own.tilt is None else tilted(warped, own.tilt)
 
     view = light_view(samples, frame, light, index, to_lobe)
-    return _focused(light, view, effort, index, polygon, integral, 4)
+    return _profiled(light, view, effort, index, polygon, integral, 4)

@@ -129,7 +129,7 @@ class Task:
 def _corners_integrated(light, is_reference):
     """About how many corners the integrals over a light have."""
     count = len(light.polygon()) * min(len(light.patches), PATCHES)
-    if light.is_focused:
+    if light.is_profiled:
         effort = light_cone.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count

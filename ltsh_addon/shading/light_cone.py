@@ -1,14 +1,15 @@
-"""Lights with a spread: integrals over the light in their cone, as integrals over parts of the light.
+"""Lights with a spread or a falloff: integrals over the light times a profile, as integrals over parts of the light.
 
-With the distance d of the point from the light's plane, r the distance in that plane from the foot of the point, and
-R = d tan h, h = spread / 2, the factor of `AreaLight` is s = (R - r)+ / (d (tan h - h)). As (R - r)+ is the length of
-the radii between r and R, any lobe integral over the light becomes one over disks around the foot,
+With the distance d of the point from the light's plane and r the distance in that plane from the foot of the point,
+the factors of `AreaLight` are a profile p(r): that of the spread is (R - r)+ / (d (tan h - h)), R = d tan h and h half
+the spread; that of the falloff is a function of t = sqrt(d^2 + r^2). Integration by parts makes of any lobe integral
+over the light one over disks around the foot,
 
-    int f s = 1 / (d (tan h - h)) int_0^R J(rho) drho,   J(rho) = int of f over the part of the light with r < rho,
+    int f p = p(r_1) J(r_1) - int_0^r_1 p'(rho) J(rho) drho,   J(rho) = int of f over the part of the light with r < rho,
 
-where J is 0 up to the least distance in the light and that of the whole light above the largest. Closed forms give J;
-the integral over rho takes a Gauss-Legendre rule whose nodes are dense where the lobe meets the light, for a sharp
-lobe makes J a step there.
+where J is 0 up to the least distance in the light, and r_1 is the largest, or R where that is less and p(R) = 0. Closed
+forms give J; the integral over rho takes a Gauss-Legendre rule whose nodes are dense where the lobe meets the light,
+for a sharp lobe makes J a step there.
 """
 
 from __future__ import annotations
@@ -34,6 +35,48 @@ def cone(spread: float) -> tuple[float, float]:
     return tangent, half**3 / 3.0 if half <= _SERIES else tangent - half
 
 
+# In place of tan h and tan h - h of a light without a spread: its factor is 1 up to far beyond any light.
+_WIDE_OPEN = 1e15
+# In m^2: squares in single precision do not become 0.
+_TINY = 1e-30
+
+
+@dataclass(frozen=True)
+class Profile:
+    """By what the radiance of a light is multiplied; all methods take arrays that broadcast."""
+
+    tangent: float
+    share: float
+    falloff: int
+    smooth: float
+
+    @classmethod
+    def of(cls, light) -> Profile:
+        """That of `light`."""
+        tangent, share = cone(light.spread) if light.is_focused else (_WIDE_OPEN, _WIDE_OPEN)
+        return cls(tangent, share, light.falloff, light.smooth)
+
+    def at(self, radius, distance):
+        """The factor at `radius` from the foot of a point that is at `distance` from the plane of the light."""
+        return self._spread(radius / distance) * self._falloff(distance * distance + radius * radius)
+
+    def descent(self, radius, distance):
+        """By how much the factor sinks per `radius`, inside of the cone."""
+        squared = np.maximum(distance * distance + radius * radius, _TINY)
+        share = self.falloff / squared
+        if self.smooth > 0.0:
+            share = share + 2.0 * self.smooth / (squared * (self.smooth + squared))
+        rise = self._spread(radius / distance) * radius * share
+        return self._falloff(squared) * (1.0 / (self.share * distance) - rise)
+
+    def _spread(self, tangent):
+        return np.maximum((self.tangent - tangent) / self.share, 0.0)
+
+    def _falloff(self, squared):
+        factor = squared / (squared + self.smooth) if self.smooth > 0.0 else 1.0
+        return factor * (1.0, np.sqrt(squared), squared)[self.falloff]
+
+
 def peak_factor(spread: float) -> float:
     """The factor straight ahead of the light, its largest value."""
     tangent, share = cone(spread)
@@ -54,17 +97,21 @@ class Effort:
     chords: int
 
 
-# Well inside the cone the factor hardly varies over a light. Sharp lobes see the difference of chords from a circle.
+# Well inside the cone, and far away, the profile hardly varies over a light. Sharp lobes see the difference of chords
+# from a circle.
 EFFORTS = (Effort(5, 2), Effort(8, 2), Effort(8, 4), Effort(8, 12))
 WELL_INSIDE = 0.25
 WIDE_LOBE, SHARP_LOBE = 0.09, 0.01
 
 
 def efforts(light, position, width):
-    """Yield (effort, chosen (Q',)) that keep the error of the spread below 0.3 % for points with x, y, z in `position`
-    (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    """Yield (effort, chosen (Q',)) that keep the error of the profile at about 0.3 % for points with x, y, z in
+    `position` (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
     extent, reach, beside = _place_in_cone(light, position)
-    inside = extent < WELL_INSIDE * (reach - beside)
+    length = reach - beside
+    if light.has_falloff:
+        length = np.minimum(length, np.sqrt(sum((position[axis] - light.center[axis]) ** 2 for axis in range(3))))
+    inside = extent < WELL_INSIDE * length
     number = np.where(width >= WIDE_LOBE, np.where(inside, 0, 1), np.where(inside, 0, 2))
     number = np.where(width < SHARP_LOBE, 3, number)
     for chosen in np.unique(number):
@@ -84,7 +131,7 @@ def _place_in_cone(light, position):
     distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
     beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
     extent = ROUND_MARGIN * np.sqrt((light.half_u**2).sum() + (light.half_v**2).sum())
-    return extent, cone(light.spread)[0] * distance, beside
+    return extent, Profile.of(light).tangent * distance, beside
 
 
 @dataclass(frozen=True)
@@ -146,25 +193,24 @@ class LightView:
         return np.where(seen, distance, 0.0), np.where(seen, width, np.inf)
 
 
-def layers(view: LightView, flat: np.ndarray, spread: float, effort: Effort):
+def layers(view: LightView, flat: np.ndarray, profile: Profile, effort: Effort):
     """Yield (index (Q,), weights (Q,), corners (C, W, Q)): lobe integrals over the corners times the weights add up to
-    the integral over the convex part `flat` (2, V, P) of the light times the factor of its spread. The polygons grow.
+    the integral over the convex part `flat` (2, V, P) of the light times its profile. The polygons grow.
     """
-    tangent, share = cone(spread)
     part = DiskParts(flat)
-    reach = tangent * view.distance
+    reach = profile.tangent * view.distance
     index = np.nonzero(part.least < reach)[0]
     if len(index) == 0:
         return
     if len(index) < flat.shape[2]:
         part, view, reach = DiskParts(flat[:, :, index]), view.take(index), reach[index]
-    scale = 1.0 / (share * view.distance)
     nodes, weights = _graded_nodes(part.least, np.minimum(part.largest, reach), *view.lobe_range(), effort.layers)
     for radius, weight in zip(nodes, weights, strict=True):
-        yield index, weight * scale, view.corners(part.inside(radius, effort.chords))
+        weight = weight * profile.descent(radius, view.distance)
+        yield index, weight, view.corners(part.inside(radius, effort.chords))
     whole = np.nonzero(part.largest < reach)[0]
     if len(whole):
-        weight = (reach - part.largest)[whole] * scale[whole]
+        weight = profile.at(part.largest[whole], view.distance[whole])
         yield index[whole], weight, view.take(whole).corners(part.flat[:, :, whole])
 
 

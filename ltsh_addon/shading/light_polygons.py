@@ -13,7 +13,7 @@ import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
 from . import light_cone
-from .polygon import split_at_horizon
+from .polygon import convex_pieces, split_at_horizon
 
 # Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
 MOSTLY_WHOLE = 0.6
@@ -40,12 +40,13 @@ def light_levels(light, corners, position, width):
     The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q), all in double
     precision, so that both paths come to the same decisions.
     """
-    if light.is_focused:
+    if light.is_profiled:
         for effort, chosen in light_cone.efforts(light, position, width):
             if light.is_round:
                 corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
                 effort = replace(effort, chords=2)
-            yield corners, effort, chosen
+            for piece in convex_pieces(corners) if light.shape == "POLYGON" else [corners]:
+                yield piece, effort, chosen
     elif light.is_round:
         for outline, chosen in round_levels(light, position, width):
             yield outline, None, chosen
@@ -178,7 +179,7 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
     """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on.
 
     Polygons are clipped at the shading horizon, and before that at the horizon of `second_normal` (P, 3). Those of a
-    focused light have two more coordinates, in the light's plane with the foot of the point as the origin.
+    profiled light have two more coordinates, in the light's plane with the foot of the point as the origin.
     """
     index = in_front(samples, light, candidates)
     if len(index) == 0:
@@ -186,7 +187,7 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
     corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
     offset = (corners - samples.position[index]).transpose(2, 0, 1)
     local = to_local(frame[:, :, index], offset)
-    if light.is_focused:
+    if light.is_profiled:
         local = np.concatenate([local, to_local(light_cone.plane_axes(light), offset)])
     parts = [(slice(None), local)]
     if second_normal is not None:
@@ -209,7 +210,7 @@ def seen_parts(samples, frame, light, corners, candidates, width, second_normal=
 
 
 def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:
-    """The view of a focused light from the points `index`; the first three coordinates are those of the lobe,
+    """The view of a profiled light from the points `index`; the first three coordinates are those of the lobe,
     to_lobe(vectors (3, Q)), the others local."""
     axes = frame[:, :, index]
     offset = (light.center - samples.position[index]).T

@@ -134,23 +134,23 @@ class EllipseBoundary:
 
 @dataclass(frozen=True)
 class Cone:
-    """The factor max(0, (tangent - tan theta) / share) of lights with a spread, theta the angle from `axis`."""
+    """The profiles of lights, by the angle theta from `axis`."""
 
     axis: np.ndarray  # (3, P) from the points straight to the lights' planes
-    tangent: float
-    share: float
+    distance: np.ndarray  # (P,) of those
+    profile: light_cone.Profile
     at_foot: np.ndarray  # (P,) points whose lights are best integrated around the axis, where the factor has its tip
 
     def take(self, index) -> Cone:
         """Those of the points `index` (Q,)."""
-        return Cone(self.axis[:, index], self.tangent, self.share, self.at_foot[index])
+        return Cone(self.axis[:, index], self.distance[index], self.profile, self.at_foot[index])
 
     def factor(self, direction: np.ndarray) -> np.ndarray:
         """Factors (..., P) for unit directions (3, ..., P)."""
         across = np.cross(direction, np.broadcast_to(self._axis_for(direction), direction.shape), axis=0)
         along = dot(direction, self._axis_for(direction))
         tangent = np.sqrt(dot(across, across)) / np.maximum(along, 1e-30)
-        return np.maximum((self.tangent - tangent) / self.share, 0.0)
+        return self.profile.at(tangent * self.distance, self.distance)
 
     def _axis_for(self, direction):
         return self.axis.reshape(3, *[1] * (direction.ndim - 2), -1)
@@ -264,7 +264,10 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
     else:
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
         batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
+    profile = light_cone.Profile.of(light)
     for index, make_boundary, cone in batches:
+        if cone is None and light.has_falloff:
+            cone = _whole_cone(samples, frame, light, index, profile)
         alpha = samples.roughness[index] ** 2
         setting = (cosine[index], alpha, samples.ior[index])
         integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone)
@@ -272,10 +275,17 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
         yield index, integrals
 
 
+def _whole_cone(samples, frame, light, index, profile) -> Cone:
+    """The falloff of a light without a spread, smooth all over it."""
+    axis = to_local(frame[:, :, index], -light.direction[:, None])
+    distance = ((samples.position[index] - light.center) * light.direction).sum(axis=1)
+    return Cone(axis, distance, profile, np.zeros(len(index), bool))
+
+
 def _polygons(samples, frame, light, corners, candidates):
     """Yield (index, make_boundary, None) of polygons."""
     for index, polygon in visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
-        yield index, partial(PolygonBoundary.warped, polygon=polygon), None
+        yield index, partial(PolygonBoundary.warped, polygon=polygon[:3]), None
 
 
 def _ellipses(samples, frame, light, corners, candidates):
@@ -308,7 +318,8 @@ def _ellipse_extent(normal, offset, light):
 def _cone_parts(samples, cosine, frame, light, corners, candidates):
     """As `_polygons`, with the cone: the part of a light in the cone of each point, cut in two where both the foot, at
     which the factor has its tip, and the peak of the lobe lie in it."""
-    tangent, share = light_cone.cone(light.spread)
+    profile = light_cone.Profile.of(light)
+    tangent = profile.tangent
     for index, polygon in visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
         warp = limit_warp(cosine[index], samples.roughness[index] ** 2)
         view = light_view(samples, frame, light, index, warp.to_original_domain)
@@ -321,7 +332,7 @@ def _cone_parts(samples, cosine, frame, light, corners, candidates):
         flat = part.inside(reach, _CONE_CHORDS)
         axis = view.foot[3:] / view.distance
         for chosen, boundary, at_foot in _around_foot_and_peak(part, reach, flat, view):
-            cone = Cone(axis[:, chosen], tangent, share, at_foot)
+            cone = Cone(axis[:, chosen], view.distance[chosen], profile, at_foot)
             yield index[chosen], partial(PolygonBoundary.warped, polygon=boundary), cone
 
 

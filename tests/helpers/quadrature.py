@@ -91,6 +91,7 @@ def radiance(samples, lights, brdf, count=64, weight=None) -> np.ndarray:
         directions = offset / np.sqrt(distance2)[..., None]
         cosine = np.maximum(-(directions @ light.direction), 0.0)
         geometry = area * cosine / distance2 * spread_factor(light, cosine)
+        geometry = geometry * distance2 ** (0.5 * light.falloff) * distance2 / (light.smooth + distance2)
         if light.receivers is not None:
             geometry = geometry * np.isin(samples.receiver, light.receivers)[:, None]
         if weight is not None:

@@ -17,7 +17,7 @@ from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
-from .emission import emission_of, open_studio
+from .emission import NO_FACTOR, Falloff, emission_of, open_studio
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
 from .textures import UnseenLight, look_at_area_lights
@@ -202,7 +202,9 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLig
         inventory.warn(
             f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
         )
-    return UnseenLight(light.original, matrix, emission.varies)
+    if emission.falloff is None:
+        inventory.warn(f"light {ob.original.name!r}: {NO_FACTOR}")
+    return UnseenLight(light.original, matrix, emission.varies, emission.falloff or Falloff())
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:

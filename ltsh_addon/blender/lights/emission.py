@@ -12,7 +12,8 @@ import numpy as np
 from mathutils import Matrix
 
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
-from ..materials.graph import Source, is_socket, shaders_behind, source_of, surface_of, value_of
+from ..materials.graph import Source, is_group, is_socket, shaders_behind, source_of, surface_of, tree_in_use, value_of
+from ..materials.values import value_at
 from ..render_settings import enable_passes
 
 # Nodes whose value is the same everywhere, as long as what they are fed is.
@@ -21,7 +22,7 @@ CONSTANT_NODES = frozenset(
     for name in (
         *("Value", "RGB", "Blackbody", "Wavelength", "Math", "VectorMath", "Mix", "MixRGB", "Clamp", "MapRange"),
         *("CombineColor", "SeparateColor", "CombineXYZ", "SeparateXYZ", "ValToRGB", "HueSaturation", "Gamma"),
-        *("BrightContrast", "Invert", "RGBCurve", "VectorCurve", "FloatCurve", "RGBToBW"),
+        *("BrightContrast", "Invert", "RGBCurve", "VectorCurve", "FloatCurve", "RGBToBW", "LightFalloff"),
     )
 ) | {"FunctionNodeInputColor", "FunctionNodeInputVector", "FunctionNodeInputInt", "FunctionNodeInputBool"}
 # Values that depend on where the light shines, by node and output; all outputs where none is named.
@@ -30,11 +31,31 @@ DIRECTIONAL = {
     "ShaderNodeLayerWeight": (),
     "ShaderNodeFresnel": (),
     "ShaderNodeCameraData": (),
-    "ShaderNodeLightFalloff": (),
     "ShaderNodeTexIES": (),
     "ShaderNodeNewGeometry": ("Incoming",),
     "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),
 }
+
+
+LIGHT_FALLOFF = "ShaderNodeLightFalloff"
+NO_FACTOR = (
+    "its emission is not a product of one Light Falloff and the rest; it is shaded as if Light Falloff nodes gave their "
+    "Strength at any distance"
+)
+POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # of the distance, by the node's outputs
+
+
+@dataclass(frozen=True)
+class Falloff:
+    """What the distance multiplies the light by: as `falloff` and `smooth` of an `AreaLight`."""
+
+    power: int = 0
+    smooth: float = 0.0
+
+    def times(self, other: Falloff) -> Falloff | None:
+        """The product; None where an `AreaLight` has none such."""
+        power = self.power + other.power
+        return None if power > 2 or (self.smooth and other.smooth) else Falloff(power, self.smooth + other.smooth)
 
 
 @dataclass
@@ -45,6 +66,7 @@ class Emission:
     plain: bool = False  # one Emission node, white, of strength 1
     varies: bool = False
     directional: set[str] = field(default_factory=set)  # labels of nodes
+    falloff: Falloff | None = Falloff()  # a factor of all of it; None: Light Falloff nodes do something else
 
 
 def emission_of(data) -> Emission:
@@ -61,6 +83,123 @@ def emission_of(data) -> Emission:
             _note_value(source_of(value, leaf.groups), found, seen)
         for factor in {factor for term in leaf.terms for factor in term}:
             _note_value(factor.source, found, seen)
+    falloffs = {_falloff_of(leaf) for leaf in leaves if emits(leaf.node)}
+    if falloffs:
+        found.falloff = falloffs.pop() if len(falloffs) == 1 else None
+    return found
+
+
+def _falloff_of(leaf) -> Falloff | None:
+    """The falloff that is a factor of what one shader node emits; None: it is none."""
+    others = [factor.source for term in leaf.terms for factor in term]
+    if "Alpha" in leaf.node.inputs:
+        others.append(source_of(leaf.node.inputs["Alpha"], leaf.groups))
+    if any(_has_falloff(source) for source in others):
+        return None
+    found = factors_of(leaf.source)
+    return None if found is None else found[1]
+
+
+def factors_of(source: Source) -> tuple[list[tuple], Falloff] | None:
+    """What the emitting node of `source` multiplies: inputs that do not depend on the distance, each with the groups
+    that it is in, and the falloff; None where the distance is no factor."""
+    both = [_factors(socket, source.groups) for socket in emission_sockets(source.node)]
+    return _joined(both)
+
+
+def _joined(parts) -> tuple[list[tuple], Falloff] | None:
+    if any(part is None for part in parts):
+        return None
+    falloff = Falloff()
+    for _, other in parts:
+        falloff = None if falloff is None else falloff.times(other)
+    return None if falloff is None else ([entry for entries, _ in parts for entry in entries], falloff)
+
+
+def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
+    """As `factors_of` for an input socket."""
+    source = source_of(socket, groups)
+    if not _has_falloff(source):
+        return [(socket, groups)], Falloff()
+    node, groups = source.node, source.groups
+    if node.bl_idname != LIGHT_FALLOFF:
+        entries = _multiplied(node, socket.type == "VALUE")
+        return None if entries is None else _joined([_factors(entry, groups) for entry in entries])
+    smooth = value_at(node.inputs["Smooth"], groups)
+    if smooth is None or not smooth.is_constant or source.socket.name not in POWERS:
+        return None
+    own = [], Falloff(POWERS[source.socket.name], max(float(smooth.offset[0]), 0.0))
+    return _joined([own, _factors(node.inputs["Strength"], groups)])
+
+
+def _multiplied(node, as_number: bool):
+    """The inputs whose product `node` is, None if it is none; `as_number`: a color would be made a number."""
+    kind = node.bl_idname
+    if kind == "ShaderNodeMath":
+        return node.inputs[:2] if node.operation == "MULTIPLY" and not node.use_clamp else None
+    if as_number:
+        return None
+    if kind == "ShaderNodeVectorMath":
+        return {"MULTIPLY": node.inputs[:2], "SCALE": [node.inputs["Vector"], node.inputs["Scale"]]}.get(node.operation)
+    if kind == "ShaderNodeMix" and node.data_type == "RGBA":
+        entries, is_clamped = node.inputs[6:8], node.clamp_result
+    elif kind == "ShaderNodeMixRGB":
+        entries, is_clamped = node.inputs[1:3], node.use_clamp
+    else:
+        return None
+    return entries if node.blend_type == "MULTIPLY" and not is_clamped and value_of(node.inputs[0]) == 1.0 else None
+
+
+def _has_falloff(source: Source | None) -> bool:
+    """True where a Light Falloff node is among what `source` is made of."""
+    seen, found = set(), [source]
+    while found:
+        source = found.pop()
+        if source is None or source.node is None or (source.node, source.groups) in seen:
+            continue
+        if source.node.bl_idname == LIGHT_FALLOFF:
+            return True
+        seen.add((source.node, source.groups))
+        found += [source_of(entry, source.groups) for entry in source.node.inputs]
+    return False
+
+
+@contextmanager
+def falloff_left_out(blocks):
+    """Meanwhile the Light Falloff nodes of materials and lights give their Strength, at any distance."""
+    moved, smooths = [], []
+    try:
+        for tree in _trees_of(blocks):
+            for node in tree.nodes:
+                if node.bl_idname != LIGHT_FALLOFF:
+                    continue
+                smooth = node.inputs["Smooth"]
+                smooths.append((smooth, smooth.default_value, [link.from_socket for link in smooth.links]))
+                for link in list(smooth.links):
+                    tree.links.remove(link)
+                smooth.default_value = 0.0
+                own = [(output, link.to_socket) for output in node.outputs for link in output.links]
+                moved += own
+                for _, target in own:
+                    tree.links.new(node.outputs["Quadratic"], target)
+        yield
+    finally:
+        for start, end in moved:
+            start.id_data.links.new(start, end)
+        for smooth, value, starts in smooths:
+            smooth.default_value = value
+            for start in starts:
+                smooth.id_data.links.new(start, smooth)
+
+
+def _trees_of(blocks) -> list:
+    """The node trees of materials and lights and of the groups in them."""
+    found, waiting = [], [tree_in_use(block) for block in blocks if block is not None]
+    while waiting:
+        tree = waiting.pop()
+        if tree is not None and tree not in found:
+            found.append(tree)
+            waiting += [node.node_tree for node in tree.nodes if is_group(node)]
     return found
 
 

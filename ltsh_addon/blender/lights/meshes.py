@@ -14,7 +14,7 @@ from ...cycles.planar_polygons import FlatPolygon
 from ...scene import AreaLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, live_link, material_output
-from .emission import PIXELS, Emission, Studio, emission_of
+from .emission import NO_FACTOR, PIXELS, Emission, Falloff, Studio, emission_of, falloff_left_out
 from .linking import Receivers
 
 
@@ -49,6 +49,11 @@ class MeshLight:
         """Full names of the materials that may emit."""
         pairs = zip(self.materials, self.emission, strict=True)
         return [material.name_full for material, emission in pairs if emission.emits]
+
+    def light_of(self, slot: int) -> AreaLight:
+        """The stand-in for what the material of a `slot` emits."""
+        falloff = self.emission[slot].falloff or Falloff()
+        return replace(self.light, falloff=falloff.power, smooth=falloff.smooth)
 
 
 def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies: bool = True) -> list[MeshLight]:
@@ -183,7 +188,7 @@ def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, wa
     """
     for mesh_light in found:
         _note_what_is_lost(mesh_light, warn)
-    with _undisplaced(found):
+    with _undisplaced(found), falloff_left_out(material for light in found for material in light.materials):
         return _lights_of_all(found, studio, eye, warn)
 
 
@@ -238,6 +243,8 @@ def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
         if emission.emits and emission.directional:
             nodes = ", ".join(sorted(emission.directional))
             warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
+        if emission.emits and emission.falloff is None:
+            warn(f"material {material.name!r}: {NO_FACTOR}")
         if emission.emits and material.displacement_method != "BUMP" and displaces(material):
             warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
@@ -284,7 +291,7 @@ def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[
             for way in _sides(side):
                 value = radiance[polygon.label][0 if way > 0 else 1]
                 if np.any(value):
-                    lights.append(polygon_light(mesh_light.light, polygon, way, value))
+                    lights.append(polygon_light(mesh_light.light_of(polygon.label), polygon, way, value))
     return lights
 
 
@@ -349,7 +356,7 @@ def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, wa
         with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
             for polygon in polygons:
                 for way in _sides(side):
-                    light = polygon_light(mesh_light.light, polygon, way, np.ones(3))
+                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
                     image, covered = _look_at_polygon(studio, light, PIXELS if count <= FEW_POLYGONS else PIXELS // 4)
                     patches = cut_into_patches(image, covered, most)
                     lights.extend(split_light(light, patches))
@@ -403,7 +410,7 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
         with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
             for polygon in largest:
                 for way in _sides(side):
-                    light = polygon_light(mesh_light.light, polygon, way, np.ones(3))
+                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
                     image, covered = _look_at_polygon(studio, light, PIXELS // 16)
                     area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
                     share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
@@ -413,7 +420,9 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
             for way in _sides(side):
                 *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
                 if area > 0.0 and np.any(light_sum):
-                    lights.append(polygon_light(mesh_light.light, polygon, way, np.array(light_sum) / area))
+                    lights.append(
+                        polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
+                    )
     warn(f"object {mesh_light.ob.name!r}: its texture on more than {MOST_LOOKS} faces is shaded as its mean")
     return lights
 

@@ -11,7 +11,7 @@ from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
 from ...scene import AreaLight
 from ..materials.values import Value, is_srgb, opaque_pixels
-from .emission import PIXELS, Studio
+from .emission import PIXELS, Falloff, Studio, falloff_left_out
 
 # Lights of one data block, with the same texture, that are looked at one by one; the others get what the first has.
 MOST_LOOKS = 100
@@ -26,6 +26,7 @@ class UnseenLight:
     data: object  # the original light data block
     matrix: np.ndarray  # (4, 4) in the world
     varies: bool  # over the light's surface, as far as its nodes tell
+    falloff: Falloff
 
 
 def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
@@ -44,6 +45,7 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
             factor, covered = own[0]
             if source.varies:
                 warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the texture of the first")
+        light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
         result.extend(_with_factor(light, factor, covered, warn))
     return result
 
@@ -65,7 +67,7 @@ def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.n
     ob = bpy.data.objects.new("Look at a light", source.data)
     ob.visible_camera = True
     pixels = PIXELS if source.varies else 8
-    with studio.show(ob, source.matrix):
+    with falloff_left_out([source.data]), studio.show(ob, source.matrix):
         image, _ = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
     if np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0:
         image = image[::-1]

@@ -5,6 +5,7 @@ First its area lights and flat emissive meshes, as far as constants and images t
 
 from __future__ import annotations
 
+import functools
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -26,13 +27,13 @@ from ..evaluated import (
     visibility,
 )
 from ..lights.area import area_light, note_unsupported, reason_to_leave_out
-from ..lights.emission import emission_of
+from ..lights.emission import emission_of, factors_of
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import ShownTextures
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
-from ..materials.values import input_value, product
+from ..materials.values import product, value_at
 from .meshes import MeshBatches, mesh_batches
 from .textures import look_values, uniform_buffer
 
@@ -104,21 +105,24 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
 
 def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str]) -> list[AreaLight]:
     """`light` with what constants and images in its node tree make of it."""
-    if tree_in_use(data) is None or emission_of(data).plain:
+    emission = None if tree_in_use(data) is None else emission_of(data)
+    if emission is None or emission.plain:
         return [light]
     surface = surface_of(data)
     source = source_of(surface) if surface is not None else None
     if source is None or source.node is None:
         return []
-    if source.node.bl_idname == "ShaderNodeEmission":
-        factor = product(input_value(source, "Color"), input_value(source, "Strength"))
+    if source.node.bl_idname == "ShaderNodeEmission" and emission.falloff is not None:
+        light = replace(light, falloff=emission.falloff.power, smooth=emission.falloff.smooth)
+        entries, _ = factors_of(source)
+        factor = functools.reduce(product, [value_at(*entry) for entry in entries])
         if factor is not None and factor.is_constant:
             return [replace(light, radiance=light.radiance * factor.offset)]
         patches = None if factor is None else textures.split(light, factor, notes)
         if patches is not None:
             return patches
     notes.append(f"{light.name}: its nodes are not resolved, it shines as without them")
-    return [light]
+    return [replace(light, falloff=0, smooth=0.0)]
 
 
 # In place of a receiver's number: nothing is seen there, nor behind it.

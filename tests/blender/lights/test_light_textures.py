@@ -122,7 +122,7 @@ def test_a_texture_too_fine_is_named_with_its_error():
     assert any("'Fine'" in line and "4096 patches" in line and " 4" in line for line in warnings), warnings
 
 
-@pytest.mark.parametrize("kind", ["LightFalloff", "LightPath", "LayerWeight"])
+@pytest.mark.parametrize("kind", ["LightPath", "LayerWeight"])
 def test_emission_that_depends_on_the_direction_is_named(kind):
     start()
     tree, emission = light_tree(scene_parts.add_area_light("Odd"))

@@ -9,7 +9,7 @@ from ltsh_addon.scene import AreaLight, SurfaceSamples
 EYE = np.array([0.25, -4.0, 2.0])
 SURFACES = ("plain", "sharp", "grazing", "head-on", "tilted")
 LIGHTS = ("plain", "near", "horizon", "tiny", "tiny disk", "huge", "disk", "polygon", "linked")
-FOCUSED_LIGHTS = ("spread", "narrow", "spread disk")
+PROFILED_LIGHTS = ("spread", "narrow", "spread disk", "linear", "constant disk", "smooth")
 GROUPS = 4
 
 
@@ -118,6 +118,8 @@ def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
         corners=_star(random, rounded(center), half_u, half_v) if shape == "POLYGON" else None,
         spread=spread,
         receivers=tuple(random.choice(GROUPS, 2, replace=False)) if kind == "linked" else None,
+        falloff={"linear": 1, "constant disk": 2}.get(kind, 0),
+        smooth=0.5 if kind == "smooth" else 0.0,
     )
 
 

@@ -223,6 +223,7 @@ def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, w
         radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
         side = _emitting_side(mesh_light, eye, warn)
         own = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+        own = [replace(light, falloff=0, smooth=0.0) for light in own]
         if len(own) > MOST_POLYGONS:
             warn(f"object {mesh_light.ob.name!r}: it emits from {len(own)} flat faces, more than {MOST_POLYGONS}")
         else:

@@ -131,7 +131,7 @@ class LightingPass:
         uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
         self._lights = uploaded.texture
         self._shares = shares([_loops(light) for light in uploaded.lights])
-        self._has_focused = any(light.is_focused for light in uploaded.lights)
+        self._has_focused = any(light.is_profiled for light in uploaded.lights)
 
     def draw(
         self,
@@ -193,6 +193,6 @@ class LightingPass:
 
 def _loops(light: AreaLight) -> int:
     """About how many times the loops over a light's corners go round at the most."""
-    if light.is_focused:
+    if light.is_profiled:
         return 16000 if light.is_round else 2000
     return 2500 if light.is_round else 10 * len(light.polygon())

@@ -62,7 +62,7 @@ class Features:
     diffuse: bool
     geometric: bool  # a horizon of its own for the specular lobe
     bumped: bool  # a horizon of its own for the diffuse lobe
-    focused: bool = False  # lights with a spread
+    focused: bool = False  # lights with a spread or a falloff
     turned: bool = False  # a diffuse normal of its own
 
     @property

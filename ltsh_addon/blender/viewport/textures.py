@@ -103,7 +103,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
     )
 
 
-HEADER = 6
+HEADER = 7
 WIDTH = 256
 DIFFUSE, SPECULAR, ROUND = 1, 2, 4
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -164,7 +164,8 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         2   half_v; flags
         3   direction; texel of the first receiver
         4   radiance; number of receivers, -1: all
-        5   tan h and 1 / (tan h - h) of the spread, 0 without one; largest half length; bound
+        5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
+        6   power of the falloff; its smoothing
 
     No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
     """
@@ -206,7 +207,8 @@ def _outline(light, place):
 def _header(light, first, count, half_v, first_receiver):
     flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
     receivers = -1 if light.receivers is None else len(light.receivers)
-    tangent, share = light_cone.cone(light.spread) if light.is_focused else (0.0, np.inf)
+    profile = light_cone.Profile.of(light)
+    tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     return np.array([
         [*light.center, first],
@@ -215,6 +217,7 @@ def _header(light, first, count, half_v, first_receiver):
         [*light.direction, first_receiver],
         [*light.radiance, receivers],
         [tangent, 1.0 / share, reach, _bound(light)],
+        [light.falloff, light.smooth, 0.0, 0.0],
     ])  # fmt: skip
 
 

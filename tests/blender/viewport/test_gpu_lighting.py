@@ -16,8 +16,8 @@ WIDTH, HEIGHT = 32, 16
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4")
 # What the preview promises: below the differences between techniques, and nothing the eye could see.
 RELATIVE, ABSOLUTE = 1e-3, 1e-5
-# The quadrature over a cone is good to 3e-3 in both, and which one is taken may depend on rounding.
-RELATIVE_OF_CONES = 3e-3
+# The quadrature over a profile is good to 3e-3 in both, and which one is taken may depend on rounding.
+RELATIVE_OF_PROFILES = 3e-3
 
 
 def drawn(lighting, samples, canvas, passes, **placement):
@@ -46,7 +46,7 @@ def excess(found, expected, relative):
     ("surface", "kinds", "techniques"),
     [(surface, random_surfaces.LIGHTS, TECHNIQUES) for surface in random_surfaces.SURFACES]
     # One technique each: llvmpipe takes seconds to compile one.
-    + [("plain", random_surfaces.FOCUSED_LIGHTS, ("ltsh4",)), ("tilted", random_surfaces.FOCUSED_LIGHTS, ("ltsh2",))],
+    + [("plain", random_surfaces.PROFILED_LIGHTS, ("ltsh4",)), ("tilted", random_surfaces.PROFILED_LIGHTS, ("ltsh2",))],
 )
 def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
     def compare():
@@ -62,7 +62,7 @@ def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
                 for name in shading.PASSES:
                     found = drawn(lighting, samples, canvas, name)
                     shaded = shading.shade(samples, lights, technique, passes=(name,), workers=1, dtype=np.float64)
-                    times = excess(found, shaded.combined, RELATIVE_OF_CONES if lights[0].is_focused else RELATIVE)
+                    times = excess(found, shaded.combined, RELATIVE_OF_PROFILES if lights[0].is_profiled else RELATIVE)
                     brightest[name] = max(brightest[name], float(shaded.combined.max()))
                     assert times.max() <= 1.0, f"{kind}, {technique}, {name}: {times.max():.1f} x at {times.argmax()}"
         # There is enough light that the absolute part of the tolerance is not what lets them pass.

@@ -53,6 +53,19 @@ def test_what_is_shown_otherwise_or_not_at_all_is_named():
     assert "'Dark': negative power" in notes and "'Sheared': its transform is sheared" in notes
 
 
+@pytest.mark.parametrize("output", ["Linear", "Constant", "Quadratic"])
+def test_a_falloff_is_that_of_the_render(output):
+    parts.empty_scene()
+    tree, emission = light_tree(parts.add_area_light("Fading"))
+    node = tree.nodes.new("ShaderNodeLightFalloff")
+    node.inputs["Strength"].default_value, node.inputs["Smooth"].default_value = 0.5, 0.25
+    tree.links.new(node.outputs[output], emission.inputs["Strength"])
+    parts.add_camera()
+    ((light,), notes), (expected,) = seen(), parts.prepare()[2].lights
+    assert not notes and (light.falloff, light.smooth) == (expected.falloff, 0.25)
+    np.testing.assert_allclose(light.radiance, expected.radiance, rtol=1e-5)
+
+
 def picture_light(pixels, **settings):
     """An area light with an image of float `pixels` (H, W, 3)."""
     light = parts.add_area_light("Picture", **settings)

@@ -1,10 +1,11 @@
-/* The integral of a lobe over a light with a spread, as in `shading.light_cone`, node by node.
+/* The integral of a lobe over a light with a spread or a falloff, as in `shading.light_cone`, node by node.
 
    The part of the light above all horizons is kept as a list of corners, since every disk around the foot of the point
    cuts it anew. What lies outside a disk is drawn to its circle along radii, edge by edge, and arcs become chords. */
 vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, float width, bool used)
 {
     vec4 cone = ltsh_light_texel(header + 5);
+    vec2 falloff = ltsh_light_texel(header + 6).xy;
     float distance = max(-dot(light.offset, light.direction), 1e-30);
     float reach = cone.x * distance;
     vec2 extent = vec2(length(light.half_u), length(light.half_v));
@@ -14,7 +15,7 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
     vec2 flat_v = vec2(dot(light.half_v, axis_u), dot(light.half_v, axis_v));
     float beside = length(center);
     float radius_of_light = LTSH_ROUND_MARGIN * length(extent);
-    ltsh_effort effort = ltsh_effort_of(light, width, radius_of_light, reach, beside);
+    ltsh_effort effort = ltsh_effort_of(light, falloff, width, radius_of_light, reach, beside);
 
     ltsh_part part;
     part.count = used && beside < reach + radius_of_light ? effort.count : 0;
@@ -75,8 +76,9 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
         float place = first + half_range * (1.0 + node.x);
         float grown = exp(place);
         float radius = all_of_it ? part.largest : middle + peak_width * 0.5 * (grown - 1.0 / grown);
-        float weight = all_of_it ? reach - part.largest
-                                 : node.y * half_range * peak_width * 0.5 * (grown + 1.0 / grown);
+        float weight = all_of_it ? ltsh_profile(cone, falloff, radius, distance)
+                                 : node.y * half_range * peak_width * 0.5 * (grown + 1.0 / grown)
+                                       * ltsh_descent(cone, falloff, radius, distance);
         float lowest = 4.0;
         float highest = -4.0;
         for (int i = 0; i < part.count; ++i) {
@@ -122,5 +124,5 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
         }
         values += weight * @VALUE@;
     }
-    return values * cone.y / distance;
+    return values;
 }

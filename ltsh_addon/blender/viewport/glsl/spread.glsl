@@ -11,9 +11,32 @@ struct ltsh_cut { float first; float last; float start; float entry; float leave
 
 float ltsh_cross2(vec2 a, vec2 b) { return a.x * b.y - a.y * b.x; }
 
-ltsh_effort ltsh_effort_of(ltsh_light light, float width, float extent, float reach, float beside)
+/* By what the falloff, its power and smoothing, multiplies the light of places at the square of a distance. */
+float ltsh_falloff(vec2 falloff, float squared)
 {
-    bool inside = extent < LTSH_WELL_INSIDE * (reach - beside);
+    float power = falloff.x < 0.5 ? 1.0 : (falloff.x < 1.5 ? sqrt(squared) : squared);
+    return power * (falloff.y > 0.0 ? squared / (squared + falloff.y) : 1.0);
+}
+
+/* The profile of a light, and by how much it sinks per radius, as in `shading.light_cone`. */
+float ltsh_profile(vec4 cone, vec2 falloff, float radius, float distance)
+{
+    return max((cone.x - radius / distance) * cone.y, 0.0) * ltsh_falloff(falloff, distance * distance + radius * radius);
+}
+
+float ltsh_descent(vec4 cone, vec2 falloff, float radius, float distance)
+{
+    float squared = max(distance * distance + radius * radius, 1e-30);
+    float share = falloff.x / squared;
+    share += falloff.y > 0.0 ? 2.0 * falloff.y / (squared * (falloff.y + squared)) : 0.0;
+    float rise = max((cone.x - radius / distance) * cone.y, 0.0) * radius * share;
+    return ltsh_falloff(falloff, squared) * (cone.y / distance - rise);
+}
+
+ltsh_effort ltsh_effort_of(ltsh_light light, vec2 falloff, float width, float extent, float reach, float beside)
+{
+    bool fades = falloff.x > 0.0 || falloff.y > 0.0;
+    bool inside = extent < LTSH_WELL_INSIDE * (fades ? min(reach - beside, length(light.offset)) : reach - beside);
     bool sharpest = width < LTSH_SHARP_LOBE;
     bool sharp = width < LTSH_WIDE_LOBE && !inside;
     ltsh_effort effort;

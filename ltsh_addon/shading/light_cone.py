@@ -5,7 +5,7 @@ the factors of `AreaLight` are a profile p(r): that of the spread is (R - r)+ / 
 the spread; that of the falloff is a function of t = sqrt(d^2 + r^2). Integration by parts makes of any lobe integral
 over the light one over disks around the foot,
 
-    int f p = p(r_1) J(r_1) - int_0^r_1 p'(rho) J(rho) drho,   J(rho) = int of f over the part of the light with r < rho,
+    int f p = p(r_1) J(r_1) - int_0^r_1 p'(rho) J(rho) drho,   J(rho) = int of f over the part with r < rho,
 
 where J is 0 up to the least distance in the light, and r_1 is the largest, or R where that is less and p(R) = 0. Closed
 forms give J; the integral over rho takes a Gauss-Legendre rule whose nodes are dense where the lobe meets the light,

@@ -39,7 +39,7 @@ DIRECTIONAL = {
 
 LIGHT_FALLOFF = "ShaderNodeLightFalloff"
 NO_FACTOR = (
-    "its emission is not a product of one Light Falloff and the rest; it is shaded as if Light Falloff nodes gave their "
+    "its emission is not a product of one Light Falloff and the rest; shaded as if Light Falloff nodes gave their "
     "Strength at any distance"
 )
 POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # of the distance, by the node's outputs

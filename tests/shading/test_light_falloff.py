@@ -62,11 +62,15 @@ def test_a_falloff_is_that_of_many_small_lights(name, height, roughness):
         assert np.linalg.norm(values - wanted) < 4e-3 * np.linalg.norm(wanted)
 
 
+CORNERS = light(1.5).polygon()
+# The last corner moves inside, over the diagonal.
+DART = [*CORNERS[:3], 0.7 * CORNERS[1] + 0.3 * CORNERS[3]]
 SHAPES = {
     "rectangle": {"falloff": 1},
     "disk": {"shape": "DISK", "falloff": 2},
     "smooth ellipse": {"shape": "ELLIPSE", "smooth": 1.0},
-    "triangle": {"shape": "POLYGON", "falloff": 2, "corners": light(1.5).polygon()[:3]},
+    "triangle": {"shape": "POLYGON", "falloff": 2, "corners": CORNERS[:3]},
+    "dart": {"shape": "POLYGON", "falloff": 1, "corners": DART},
     "rectangle with a spread": {"falloff": 2, "smooth": 0.5, "spread": 1.2},
     "disk with a spread": {"shape": "DISK", "falloff": 1, "spread": 2.0},
 }

@@ -141,6 +141,12 @@ class AreaLight:
         """The lights without a detail that together are this one; itself where it has none."""
         return tuple(patch for part in self.detail for patch in part.patches) if self.detail else (self,)
 
+    def moved(self, offset: np.ndarray) -> AreaLight:
+        """The same light elsewhere by `offset` (3,) in m."""
+        corners = None if self.corners is None else self.corners + offset
+        detail = tuple(part.moved(offset) for part in self.detail)
+        return replace(self, center=self.center + offset, corners=corners, detail=detail)
+
     @property
     def is_round(self) -> bool:
         """True for DISK and ELLIPSE."""

@@ -298,7 +298,8 @@ class ObjectBaker:
 
     def _metadata(self, tile) -> dict[str, str]:
         options, view = self.options, self.view
-        vector = ", ".join(f"{value:g}" for value in view.vector)
+        place = np.add(view.vector, self.manifest["origin"]) if view.kind == "point" else view.vector
+        vector = ", ".join(f"{value:g}" for value in place)
         seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
         return {
             "ltsh:scene": Path(options.scene).name,

@@ -29,6 +29,7 @@ from ..materials.graph import ensure_nodes
 from ..materials.maps import MaterialPlan, SavedImages
 from ..render_settings import working_space
 from . import pixels
+from .origin import middle_of, move_to_origin
 from .pixels import SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
@@ -285,6 +286,7 @@ class BakeScene:
     scene: object
     camera: str
     view: BakeView
+    origin: np.ndarray  # (3,) m in the file, of all positions here
     lights: list
     warnings: list[str]
     names: list[str]
@@ -350,6 +352,8 @@ def _open(job: dict) -> BakeScene:
         override = view_layer.material_override.name
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
+    origin = move_to_origin(scene, middle_of(objects[0]), warnings)
+    seen_from = job["view"] if isinstance(job["view"], str) else tuple(np.subtract(job["view"], origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name))
     give_default_material(bare)
@@ -363,11 +367,11 @@ def _open(job: dict) -> BakeScene:
     if not lights:
         raise pixels.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
-    view = view_of(job["view"], camera, bent=job["cycles_samples"] > 0)
-    _look_from(scene, camera, job)
+    view = view_of(seen_from, camera, bent=job["cycles_samples"] > 0)
+    _look_from(scene, camera, seen_from)
     remove_occlusion(scene)
     name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
-    return BakeScene(scene, name, view, lights, warnings, names, meshes, problems, lobes, folder)
+    return BakeScene(scene, name, view, origin, lights, warnings, names, meshes, problems, lobes, folder)
 
 
 def _camera(scene, job):
@@ -380,11 +384,11 @@ def _camera(scene, job):
     return camera
 
 
-def _look_from(scene, camera, job) -> None:
+def _look_from(scene, camera, wanted) -> None:
     """Make Cycles' bake see the surfaces as `view_of` does."""
-    scene.render.bake.view_from = "ABOVE_SURFACE" if job["view"] == "above" else "ACTIVE_CAMERA"
-    if not isinstance(job["view"], str):
-        camera.location = job["view"]
+    scene.render.bake.view_from = "ABOVE_SURFACE" if wanted == "above" else "ACTIVE_CAMERA"
+    if not isinstance(wanted, str):
+        camera.location, camera.delta_location = wanted, (0.0, 0.0, 0.0)
     bpy.context.view_layer.update()
 
 
@@ -449,6 +453,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         "color_space": working_space(),
         "warnings": opened.warnings,
         "view": vars(opened.view),
+        "origin": opened.origin.tolist(),
         "camera": opened.camera,
         "objects": records,
         "seconds": time.monotonic() - started,

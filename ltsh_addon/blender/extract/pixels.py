@@ -31,6 +31,7 @@ from ..render_settings import (
     sub_pixel_offsets,
     working_space,
 )
+from .origin import move_to_origin
 
 
 def render_pixel_samples(
@@ -164,6 +165,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
     render_settings.prepare_surfaces(warnings)
+    origin = move_to_origin(scene, np.array(camera.matrix_world, dtype=np.float64)[:3, 3], warnings)
 
     def visit(depsgraph):
         surfaces = rendered_surfaces(depsgraph)
@@ -172,6 +174,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
         return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    inventory.origin = origin
     default = give_default_material(bare)
     of_materials = inject_aovs(materials + ([default] if default else []), inventory.emitting_materials)
     inventory.receivers.mark()
@@ -220,7 +223,8 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [light_record(light) for light in inventory.lights],
+        "lights": [light_record(light.moved(inventory.origin)) for light in inventory.lights],
+        "origin": inventory.origin.tolist(),
         "warnings": warnings,
         "samples": samples,
         "reference": reference,

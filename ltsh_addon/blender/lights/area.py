@@ -41,6 +41,7 @@ class LightInventory:
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m in the file, of all positions here
 
     def __post_init__(self):
         self._noted = set(self.warnings)

@@ -6,7 +6,7 @@ import errno
 import importlib.metadata
 import re
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -113,6 +113,7 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
         channels = _rendered(folder / name)
         gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
+        samples = replace(samples, position=samples.position + manifest["origin"])
         renders.append((samples, pixel))
         unusable += bad
         if index == 0:

@@ -1,0 +1,127 @@
+"""A scene that lies far from the origin is moved to it (in the child).
+
+Blender and Cycles hold positions in single precision: 100 km away they are 8 mm apart. Everything that is rendered is
+moved by the same vector, and moved back where one object does not follow.
+"""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ...scene import listed
+from ..evaluated import SURFACE_TYPES, with_render_depsgraph
+from ..materials.graph import tree_in_use
+
+# In m from the origin; nearer, positions are at most 0.12 mm apart.
+FAR = 2000.0
+# In m: how far from its place a moved object may be, besides the rounding of where it was.
+TOLERANCE = 1e-3
+NAMED = 3
+
+
+def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
+    """Move `scene` so that the light nearest to `eye` (3,) is near the origin, if it is far; where the origin was
+    moved to (3,), in m."""
+    nowhere = np.zeros(3)
+    if not any(np.abs(_corners(ob)).max() > FAR for ob in scene.objects):
+        return nowhere
+    places = with_render_depsgraph(scene, _places)
+    lights = [place[:3, 3] for (_, kind), place in places if kind == "LIGHT"] or [eye]
+    nearest = min(lights, key=lambda place: np.linalg.norm(place - eye))
+    if not np.isfinite(nearest).all() or np.abs(nearest).max() <= FAR:
+        return nowhere
+    origin = np.round(nearest).astype(np.float32).astype(np.float64)
+    apart = float(np.spacing(np.float32(np.abs(origin).max())))
+    where = f"the light nearest to the view is {np.linalg.norm(origin):.3g} m from the origin"
+    lost = _moved(scene, origin, places)
+    if lost:
+        warnings.append(
+            f"{where}: positions there are {1000.0 * apart:.2g} mm apart, which changes light from 1 m away by some "
+            f"{min(1000.0 * apart, 100.0):.2g} %, in Cycles and in the techniques; the scene could not be moved to the "
+            f"origin, for {listed(lost, NAMED)} would not follow: move it there"
+        )
+        return nowhere
+    warnings.append(
+        f"{where}, where positions are {1000.0 * apart:.2g} mm apart: techniques and Cycles show it as if it lay at "
+        "the origin; in Blender, Cycles shows it with that rounding"
+    )
+    return origin
+
+
+def _corners(ob) -> np.ndarray:
+    """Corners (N, 3) of the box around an object, or its place."""
+    matrix = np.array(ob.matrix_world, dtype=np.float64)
+    corners = np.array(ob.bound_box, dtype=np.float64) if ob.type in SURFACE_TYPES else np.zeros((1, 3))
+    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def middle_of(ob) -> np.ndarray:
+    """Middle (3,) of the box around an object."""
+    return _corners(ob).mean(axis=0)
+
+
+def _places(depsgraph) -> list[tuple]:
+    """((name, type), matrix (4, 4)) of all that is rendered, and of the camera, in an order that stays."""
+    found = []
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if ob.type in ("LIGHT", *SURFACE_TYPES) and (ob.type != "LIGHT" or ob.data.type == "AREA"):
+            found.append(((ob.original.name, ob.type), np.array(instance.matrix_world, dtype=np.float64)))
+    camera = depsgraph.scene_eval.camera
+    if camera is not None:
+        found.append(((camera.original.name, "CAMERA"), np.array(camera.matrix_world, dtype=np.float64)))
+    return found
+
+
+def _moved(scene, origin: np.ndarray, places) -> list[str]:
+    """Move the scene by -origin; names of what did not follow, where all is as before."""
+    roots = [ob for ob in scene.objects if ob.parent is None]
+    collections = {collection for ob in scene.objects for collection in ob.users_collection}
+    before = {ob: tuple(ob.delta_location) for ob in roots}
+    offsets = {collection: tuple(collection.instance_offset) for collection in collections}
+    for ob in roots:
+        ob.delta_location = np.array(ob.delta_location) - origin
+    for collection in collections - {scene.collection}:
+        # Instances of objects that are moved themselves.
+        collection.instance_offset = np.array(collection.instance_offset) - origin
+    lost = _lost(places, with_render_depsgraph(scene, _places), origin)
+    if lost:
+        for ob, own in before.items():
+            ob.delta_location = own
+        for collection, own in offsets.items():
+            collection.instance_offset = own
+        bpy.context.view_layer.update()
+        return lost
+    _keep_texture_space(origin)
+    return []
+
+
+def _lost(before, after, origin) -> list[str]:
+    """Names of what is not where it was less `origin`."""
+    if [key for key, _ in before] != [key for key, _ in after]:
+        return ["an instancer"]
+    lost = {}
+    for ((name, _), old), (_, new) in zip(before, after, strict=True):
+        # Half the last digit of a coordinate, for each that was added up.
+        rounding = 4.0 * np.spacing(np.abs(old[:3, 3]).max().astype(np.float32))
+        same_axes = np.allclose(old[:3, :3], new[:3, :3], rtol=1e-5, atol=1e-5 * np.abs(old[:3, :3]).max())
+        if not same_axes or np.abs(old[:3, 3] - origin - new[:3, 3]).max() > TOLERANCE + rounding:
+            lost[name] = None
+    return [repr(name) for name in lost]
+
+
+def _keep_texture_space(origin: np.ndarray) -> None:
+    """Let materials and lights see the positions that were."""
+    trees = [tree_in_use(block) for block in (*bpy.data.materials, *bpy.data.lights)]
+    for tree in [*filter(None, trees), *(group for group in bpy.data.node_groups if group.type == "SHADER")]:
+        for node in list(tree.nodes):
+            output = node.outputs.get("Position") if node.bl_idname == "ShaderNodeNewGeometry" else None
+            if output is None or not output.links:
+                continue
+            targets = [link.to_socket for link in output.links]
+            back = tree.nodes.new("ShaderNodeVectorMath")
+            back.operation, back.inputs[1].default_value = "ADD", origin
+            tree.links.new(output, back.inputs[0])
+            for target in targets:
+                tree.links.new(back.outputs[0], target)

@@ -39,7 +39,7 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
         warnings.append(
             f"{where}: positions there are {1000.0 * apart:.2g} mm apart, which changes light from 1 m away by some "
             f"{min(1000.0 * apart, 100.0):.2g} %, in Cycles and in the techniques; the scene could not be moved to the "
-            f"origin, for {listed(lost, NAMED)} would not follow: move it there"
+            f"origin, for {listed(map(repr, lost), NAMED)} would not follow: move it there"
         )
         return nowhere
     warnings.append(
@@ -86,21 +86,27 @@ def _moved(scene, origin: np.ndarray, places) -> list[str]:
         # Instances of objects that are moved themselves.
         collection.instance_offset = np.array(collection.instance_offset) - origin
     lost = _lost(places, with_render_depsgraph(scene, _places), origin)
-    if lost:
-        for ob, own in before.items():
-            ob.delta_location = own
-        for collection, own in offsets.items():
-            collection.instance_offset = own
-        bpy.context.view_layer.update()
-        return lost
-    _keep_texture_space(origin)
-    return []
+    carried = [ob for ob in roots if ob.name in lost]
+    if carried:
+        # Constraints may move them along with what has moved.
+        for ob in carried:
+            ob.delta_location = before[ob]
+        lost = _lost(places, with_render_depsgraph(scene, _places), origin)
+    if not lost:
+        _keep_texture_space(origin)
+        return []
+    for ob, own in before.items():
+        ob.delta_location = own
+    for collection, own in offsets.items():
+        collection.instance_offset = own
+    bpy.context.view_layer.update()
+    return lost
 
 
 def _lost(before, after, origin) -> list[str]:
     """Names of what is not where it was less `origin`."""
     if [key for key, _ in before] != [key for key, _ in after]:
-        return ["an instancer"]
+        return [name for name, _ in dict.fromkeys(key for key, _ in before)]
     lost = {}
     for ((name, _), old), (_, new) in zip(before, after, strict=True):
         # Half the last digit of a coordinate, for each that was added up.
@@ -108,7 +114,7 @@ def _lost(before, after, origin) -> list[str]:
         same_axes = np.allclose(old[:3, :3], new[:3, :3], rtol=1e-5, atol=1e-5 * np.abs(old[:3, :3]).max())
         if not same_axes or np.abs(old[:3, 3] - origin - new[:3, 3]).max() > TOLERANCE + rounding:
             lost[name] = None
-    return [repr(name) for name in lost]
+    return list(lost)
 
 
 def _keep_texture_space(origin: np.ndarray) -> None:

@@ -19,6 +19,10 @@ HITS_PER_BLOCK = 65536
 # Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
 # on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
 COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
+# Positions that are rounded to more than this share of the distance from the nearest light, if there are more than that
+# share of them, are worth a warning.
+ROUNDED, ROUNDED_SHARE = 2e-3, 0.02
+FEW_SAMPLES = 1000  # are asked
 RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
 
 
@@ -113,4 +117,27 @@ def coarse_meshes(samples: SurfaceSamples) -> list[str]:
         f"{count} of {len(samples)} samples lie on faces whose smooth normals are more than {degrees:.0f} degrees from "
         "their own: there it depends on how Cycles samples how much light comes from between both horizons (2 %); "
         "more faces help"
+    ]
+
+
+def rounded_positions(position: np.ndarray, lights) -> list[str]:
+    """The warning about positions (P, 3) so far from the origin that single precision tells them badly apart."""
+    some = position[:: max(1, len(position) // FEW_SAMPLES)]
+    if len(some) == 0 or not lights:
+        return []
+    apart = np.spacing(np.abs(some).max(axis=1).astype(np.float32)).astype(np.float64)
+    nearest = np.full(len(some), np.inf)
+    for light in lights:
+        size = np.linalg.norm(light.half_u) + np.linalg.norm(light.half_v)
+        distance = np.linalg.norm(some - light.center, axis=1) - size
+        height = np.abs((some - light.center) @ light.direction)
+        nearest = np.minimum(nearest, np.maximum(distance, height))
+    share = apart / np.maximum(nearest, 1e-30)
+    if np.mean(share > ROUNDED) <= ROUNDED_SHARE:
+        return []
+    return [
+        f"positions are up to {np.abs(some).max():.3g} m from the origin, where they are rounded to "
+        f"{1000.0 * apart.max():.2g} mm, in Cycles too: for half of the samples that is over "
+        f"{100.0 * min(np.median(share), 1.0):.2g} % of the distance from the nearest light, and their light is about "
+        "as uncertain, more in sharp reflections; move the scene to the origin"
     ]

@@ -21,19 +21,21 @@ NAMED = 3
 
 
 def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
-    """Move `scene` so that the light nearest to `eye` (3,) is near the origin, if it is far; where the origin was
-    moved to (3,), in m."""
+    """Move `scene` so that the light nearest to `eye` (3,) is near the origin, if it is far and that does not take the
+    eye farther away, else the eye; where the origin was moved to (3,), in m."""
     nowhere = np.zeros(3)
     if not any(np.abs(_corners(ob)).max() > FAR for ob in scene.objects):
         return nowhere
     places = with_render_depsgraph(scene, _places)
     lights = [place[:3, 3] for (_, kind), place in places if kind == "LIGHT"] or [eye]
     nearest = min(lights, key=lambda place: np.linalg.norm(place - eye))
-    if not np.isfinite(nearest).all() or np.abs(nearest).max() <= FAR:
+    if np.abs(nearest).max() > FAR and np.linalg.norm(nearest - eye) > np.linalg.norm(eye):
+        nearest = eye
+    if not (np.abs(nearest).max() > FAR and np.isfinite(nearest).all()):
         return nowhere
     origin = np.round(nearest).astype(np.float32).astype(np.float64)
     apart = float(np.spacing(np.float32(np.abs(origin).max())))
-    where = f"the light nearest to the view is {np.linalg.norm(origin):.3g} m from the origin"
+    where = f"what is seen, or its nearest light, is {np.linalg.norm(origin):.3g} m from the origin"
     lost = _moved(scene, origin, places)
     if lost:
         warnings.append(
@@ -53,7 +55,8 @@ def _corners(ob) -> np.ndarray:
     """Corners (N, 3) of the box around an object, or its place."""
     matrix = np.array(ob.matrix_world, dtype=np.float64)
     corners = np.array(ob.bound_box, dtype=np.float64) if ob.type in SURFACE_TYPES else np.zeros((1, 3))
-    return corners @ matrix[:3, :3].T + matrix[:3, 3]
+    with np.errstate(invalid="ignore"):  # an object may be nowhere
+        return corners @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def middle_of(ob) -> np.ndarray:

@@ -223,7 +223,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [light_record(light.moved(inventory.origin)) for light in inventory.lights],
+        "lights": [light_record(light) for light in inventory.lights],
         "origin": inventory.origin.tolist(),
         "warnings": warnings,
         "samples": samples,

@@ -86,6 +86,10 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings = _read_samples(manifest, folder)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
+        warnings += gbuffer.rounded_positions(samples.position, lights)
+        # In the file, where double precision tells positions apart.
+        samples = replace(samples, position=samples.position + manifest["origin"])
+        lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
         return Extraction(
             lights=lights,
             samples=end_at_horizons_of_cycles(samples, lights),
@@ -113,7 +117,6 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
         channels = _rendered(folder / name)
         gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
-        samples = replace(samples, position=samples.position + manifest["origin"])
         renders.append((samples, pixel))
         unusable += bad
         if index == 0:

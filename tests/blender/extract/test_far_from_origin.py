@@ -1,5 +1,7 @@
 """Scenes far from the origin are shaded and rendered as the same scenes at the origin."""
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from lit_plane import add_instancer, assert_agrees, into_collection
 
 from ltsh_addon.blender.extract import origin
 from ltsh_addon.blender.process import client
+from ltsh_addon.cycles import gbuffer
 
 # Where positions are 1/128 m apart: those of the scenes below are multiples of that, so that both places are the same.
 PLACE = np.array([100000.0, -70000.0, 40.0])
@@ -152,6 +155,29 @@ def test_scenes_at_the_origin_are_left_alone(monkeypatch):
     build()
     monkeypatch.setattr(origin, "with_render_depsgraph", lambda *_: pytest.fail("evaluates a scene for nothing"))
     scene_parts.prepare()
+
+
+def test_a_far_light_does_not_take_the_scene_away():
+    build()
+    bpy.data.objects["Light"].location = (0.0, 0.0, 1e6)
+    bpy.context.view_layer.update()
+    assert not scene_parts.prepare()[2].origin.any()
+
+
+def test_positions_that_stay_far_are_named_with_their_effect():
+    """8 mm at 1 m from a light, also where it is wide, and at 100 m; a single pixel near a light counts for nothing."""
+    build()
+    (light,) = scene_parts.prepare()[2].lights
+    light = light.moved((1e5, 0.0, 0.0) - light.center)
+    position = np.tile([1e5, 0.0, 1.0], (100, 1))
+    wide = replace(light, half_u=1e3 * light.half_u, direction=(0.0, 0.0, -1.0))
+    for other in (light, wide):
+        (line,) = gbuffer.rounded_positions(position, [other])
+        assert "1e+05 m" in line and "7.8 mm" in line
+    far = position + [0.0, 0.0, 99.0]
+    assert gbuffer.rounded_positions(far, [light]) == gbuffer.rounded_positions(position, []) == []
+    far[0] = position[0]
+    assert gbuffer.rounded_positions(far, [light]) == []
 
 
 def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):

@@ -14,7 +14,12 @@ from ..scene import Border, SceneError, listed
 from ..shading.parallel import cores
 from .evaluated import SURFACE_TYPES
 
-DEFAULTS = {"film_exposure": 1.0, "is_portal": False, "use_bump_map_correction": True}
+DEFAULTS = {
+    "film_exposure": 1.0,
+    "is_portal": False,
+    "use_bump_map_correction": True,
+    "use_multiple_importance_sampling": True,
+}
 
 
 def cycles_setting(owner, name: str):

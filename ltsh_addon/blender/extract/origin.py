@@ -28,12 +28,9 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
         return nowhere
     places = with_render_depsgraph(scene, _places)
     lights = [place[:3, 3] for (_, kind), place in places if kind == "LIGHT"] or [eye]
-    nearest = min(lights, key=lambda place: np.linalg.norm(place - eye))
-    if np.abs(nearest).max() > FAR and np.linalg.norm(nearest - eye) > np.linalg.norm(eye):
-        nearest = eye
-    if not (np.abs(nearest).max() > FAR and np.isfinite(nearest).all()):
+    origin = new_origin(np.array(lights), eye)
+    if not origin.any():
         return nowhere
-    origin = np.round(nearest).astype(np.float32).astype(np.float64)
     apart = float(np.spacing(np.float32(np.abs(origin).max())))
     where = f"what is seen, or its nearest light, is {np.linalg.norm(origin):.3g} m from the origin"
     lost = _moved(scene, origin, places)
@@ -49,6 +46,16 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
         "the origin; in Blender, Cycles shows it with that rounding"
     )
     return origin
+
+
+def new_origin(lights: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """Whole m (3,) from the origin to the one of `lights` (N, 3) that is nearest to `eye` (3,), or to the eye where
+    that is nearer to the origin than to the light; 0 where the light is not far from the origin, or the eye."""
+    nearest = lights[np.argmin(np.linalg.norm(lights - eye, axis=1))]
+    if np.abs(nearest).max() > FAR and np.linalg.norm(nearest - eye) > np.linalg.norm(eye):
+        nearest = eye
+    is_far = np.abs(nearest).max() > FAR and np.isfinite(nearest).all()
+    return np.round(nearest).astype(np.float32).astype(np.float64) if is_far else np.zeros(3)
 
 
 def _corners(ob) -> np.ndarray:

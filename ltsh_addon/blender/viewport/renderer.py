@@ -8,6 +8,7 @@ import gpu
 import numpy as np
 
 from ...shading.header import definitions
+from ..extract.origin import new_origin
 from ..materials.values import Value
 from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
@@ -35,6 +36,14 @@ class ShownPicture:
     line_width: float = 1.0
     second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
     white: float = 1.0  # brightness of no difference, before the scene's own exposure
+
+
+def _origin_of(lights, view: View) -> np.ndarray:
+    """Near what is seen: single precision tells places far from the origin badly apart."""
+    if not lights:
+        return np.zeros(3)
+    places = np.array([light.center for light in lights])
+    return new_origin(places, places.mean(axis=0) if view.is_parallel else view.eye)
 
 
 class PicturePass:
@@ -79,12 +88,13 @@ class ViewRenderer:
         self._gbuffer: GBufferTextures | None = None
         self._lit_gbuffer: GBufferTextures | None = None
         self._lights: UploadedLights | None = None
-        self._drawn = self._uploaded = None
+        self._drawn, self._uploaded = None, (None, None)
 
     def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
         """Draw the scene into `frame_buffer`, which has `size` pixels."""
+        view = view.around(_origin_of(mirror.lights, view))
         surfaces_changed = self._draw_surfaces(mirror, view, size)
-        lights_changed = self._upload_lights(mirror)
+        lights_changed = self._upload_lights(mirror, view)
         if surfaces_changed or lights_changed or self._lit_gbuffer is None:
             self._choose_horizons(mirror, view)
         techniques = [shown.technique]
@@ -99,7 +109,7 @@ class ViewRenderer:
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
         """Draw the G-buffer if anything has changed, and tell that."""
-        drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), size)
+        drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), view.origin.tobytes(), size)
         if drawn == self._drawn:
             return False
         self._drawn = None
@@ -107,12 +117,16 @@ class ViewRenderer:
         self._drawn = drawn
         return True
 
-    def _upload_lights(self, mirror) -> bool:
-        """Upload the lights if they have changed, and tell that."""
-        if self._uploaded is mirror.lights:
+    def _upload_lights(self, mirror, view: View) -> bool:
+        """Upload the lights if they, or the origin of the view, have changed, and tell that."""
+        lights, origin = self._uploaded
+        if lights is mirror.lights and np.array_equal(origin, view.origin):
             return False
-        self._lights = upload_lights(mirror.lights)
-        self._uploaded = mirror.lights
+        is_moved = view.origin.any()
+        self._lights = upload_lights(
+            [light.moved(-view.origin) for light in mirror.lights] if is_moved else mirror.lights
+        )
+        self._uploaded = mirror.lights, view.origin
         return True
 
     def _choose_horizons(self, mirror, view: View) -> None:
@@ -184,7 +198,7 @@ class ViewRenderer:
             if horizons is not None:
                 horizons.free()
         self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = self._lobe_horizons = None
-        self._drawn = self._uploaded = None
+        self._drawn, self._uploaded = None, (None, None)
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import bpy
 import gpu
@@ -38,11 +38,13 @@ MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class View:
-    """From where a picture is seen: matrices (4, 4), and the eye's place or, in parallel views, the way to it."""
+    """From where a picture is seen: the eye's place or, in parallel views, the way to it. All places that are drawn are
+    relative to `origin`."""
 
-    projection: np.ndarray  # world to clip space
+    projection: np.ndarray  # (4, 4) to clip space
     eye: np.ndarray  # (3,)
     is_parallel: bool
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
 
     @classmethod
     def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
@@ -50,6 +52,13 @@ class View:
         to_world = view_matrix.inverted()
         eye = to_world.col[2].xyz.normalized() if is_parallel else to_world.translation
         return cls(np.array(window_matrix @ view_matrix, np.float64), np.array(eye), is_parallel)
+
+    def around(self, origin: np.ndarray) -> View:
+        """The same view of the world, with places relative to `origin` (3,)."""
+        to_world = np.eye(4)
+        to_world[:3, 3] = origin - self.origin
+        eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
+        return View(self.projection @ to_world, eye, self.is_parallel, origin)
 
     @property
     def homogeneous_eye(self) -> tuple[float, ...]:
@@ -151,9 +160,10 @@ class SurfacePass:
         shader.uniform_block("view", self._view_values)
         for name, table in self._tables.items() if not is_emission else ():
             shader.uniform_sampler(name, table)
+        to_view = Matrix.Translation(-view.origin)
         # From near to far: what is hidden need not be computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
-            shader.uniform_float("model", instance.model)
+            shader.uniform_float("model", to_view @ instance.model)
             if not is_emission:
                 marks = instance.mesh.is_smooth, instance.is_only_user
                 shader.uniform_float("placement", (instance.receiver, instance.side, *marks))

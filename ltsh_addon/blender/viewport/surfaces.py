@@ -49,9 +49,10 @@ class View:
     @classmethod
     def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
         """That of a region's matrices."""
-        to_world = view_matrix.inverted()
-        eye = to_world.col[2].xyz.normalized() if is_parallel else to_world.translation
-        return cls(np.array(window_matrix @ view_matrix, np.float64), np.array(eye), is_parallel)
+        to_view = np.array(view_matrix, np.float64)
+        to_world = np.linalg.inv(to_view)
+        eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
+        return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
 
     def around(self, origin: np.ndarray) -> View:
         """The same view of the world, with places relative to `origin` (3,)."""

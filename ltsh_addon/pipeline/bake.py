@@ -298,8 +298,7 @@ class ObjectBaker:
 
     def _metadata(self, tile) -> dict[str, str]:
         options, view = self.options, self.view
-        place = np.add(view.vector, self.manifest["origin"]) if view.kind == "point" else view.vector
-        vector = ", ".join(f"{value:g}" for value in place)
+        vector = ", ".join(f"{value:g}" for value in view.vector)
         seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
         return {
             "ltsh:scene": Path(options.scene).name,

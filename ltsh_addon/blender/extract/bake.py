@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -108,13 +108,17 @@ def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
     return tiles_of(uv[triangles].reshape(-1, 3, 2))[0]
 
 
-def read_mesh(ob, depsgraph, uv_name: str | None) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
-    """The object `ob` as `depsgraph` evaluates it, the name of its UV map, and all of its UV maps (T, 3, 2) by name, ""
-    for the one that renders. Raises ObjectError."""
+def read_mesh(
+    ob, depsgraph, uv_name: str | None, origin=(0.0, 0.0, 0.0)
+) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
+    """The object `ob` as `depsgraph` evaluates it around `origin` (3,), the name of its UV map, and all of its UV maps
+    (T, 3, 2) by name, "" for the one that renders. Raises ObjectError."""
     evaluated = ob.evaluated_get(depsgraph)
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
-        return _read(ob, mesh, np.array(evaluated.matrix_world, dtype=np.float64), uv_name)
+        matrix = np.array(evaluated.matrix_world, dtype=np.float64)
+        matrix[:3, 3] += origin
+        return _read(ob, mesh, matrix, uv_name)
     finally:
         evaluated.to_mesh_clear()
 
@@ -286,7 +290,6 @@ class BakeScene:
     scene: object
     camera: str
     view: BakeView
-    origin: np.ndarray  # (3,) m in the file, of all positions here
     lights: list
     warnings: list[str]
     names: list[str]
@@ -355,23 +358,25 @@ def _open(job: dict) -> BakeScene:
     origin = move_to_origin(scene, middle_of(objects[0]), warnings)
     seen_from = job["view"] if isinstance(job["view"], str) else tuple(np.subtract(job["view"], origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
-    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name))
+    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name), origin)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
     for material in bpy.data.materials:
         if material.name_full not in inventory.emitting_materials:
             material.cycles.emission_sampling = "NONE"
     inventory.receivers.mark()
-    lights = seen_lights(scene, inventory)
+    lights = [light.moved(origin) for light in seen_lights(scene, inventory)]
     warnings.extend(inventory.warnings)
     if not lights:
         raise pixels.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     view = view_of(seen_from, camera, bent=job["cycles_samples"] > 0)
+    if view.kind == "point":
+        view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
     remove_occlusion(scene)
     name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
-    return BakeScene(scene, name, view, origin, lights, warnings, names, meshes, problems, lobes, folder)
+    return BakeScene(scene, name, view, lights, warnings, names, meshes, problems, lobes, folder)
 
 
 def _camera(scene, job):
@@ -392,7 +397,7 @@ def _look_from(scene, camera, wanted) -> None:
     bpy.context.view_layer.update()
 
 
-def _inspect(scene, objects, uv_name, folder):
+def _inspect(scene, objects, uv_name, folder, origin):
     """Lights, meshes of objects by name, what is wrong with the others by name, and surfaces without material."""
 
     def visit(depsgraph):
@@ -402,7 +407,7 @@ def _inspect(scene, objects, uv_name, folder):
         for number, ob in enumerate(objects):
             try:
                 check_object(ob)
-                found = read_mesh(ob, depsgraph, uv_name)
+                found = read_mesh(ob, depsgraph, uv_name, origin)
                 if ob.name_full not in rendered:
                     raise ObjectError(f"object {ob.name!r} is not rendered: its collection is excluded or hidden")
                 meshes[ob.name] = _saved(*found, folder, number)
@@ -453,7 +458,6 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         "color_space": working_space(),
         "warnings": opened.warnings,
         "view": vars(opened.view),
-        "origin": opened.origin.tolist(),
         "camera": opened.camera,
         "objects": records,
         "seconds": time.monotonic() - started,

@@ -189,10 +189,11 @@ def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):
     assert np.abs(light.center - PLACE - (0.25, 0.5, 1.5)).max() < 1e-6
     assert np.abs(found.samples.position[:, 2] - PLACE[2]).max() < 1e-5
     view = tuple(PLACE + (1.0, 2.0, 3.0))
-    _, files = baked(path, tmp_path / "far", techniques=("ltsh4",), passes=("combined",), view=view)
+    report, files = baked(path, tmp_path / "far", techniques=("ltsh4",), passes=("combined",), view=view)
     build()
     _, expected = baked(
         save(tmp_path), tmp_path / "near", techniques=("ltsh4",), passes=("combined",), view=(1.0, 2.0, 3.0)
     )
     mine, theirs = (layers["Plane.exr"]["ltsh4.combined"] for layers in (files, expected))
+    assert report["view"]["vector"] == list(view)
     assert np.abs(mine - theirs).max() < 1e-5 * theirs.max() and theirs.max() > 0.0

@@ -102,6 +102,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
 
 # Pairs of overlapping lights that are named.
 NAMED_PAIRS = 3
+# No more are looked for.
+MOST_PAIRS = 1000
 # Points along each side of a light that are tried for an overlap.
 TRIED = 16
 # Lights that are compared with all others at once.
@@ -110,9 +112,11 @@ CHUNK = 256
 
 def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLight, float]]:
     """Lights that lie in one plane, as far as single precision tells, shine to the same side on the same objects and
-    overlap, and the share of the smaller one that lies in the other."""
+    overlap, and the share of the smaller one that lies in the other; at most MOST_PAIRS."""
     if len(lights) < 2:
         return []
+    axis = np.ptp([light.center for light in lights], axis=0).argmax()
+    lights = sorted(lights, key=lambda light: light.center[axis])
     center, direction, half_u, half_v = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "direction", "half_u", "half_v")
     )
@@ -121,15 +125,22 @@ def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLigh
     found = []
     for start in range(0, len(lights), CHUNK):
         part = slice(start, start + CHUNK)
-        offset = center[None] - center[part, None]
-        near = (offset**2).sum(axis=-1) < (reach[part, None] + reach) ** 2
-        near &= np.abs((offset * direction[part, None]).sum(axis=-1)) <= np.maximum(rounding[part, None], rounding)
-        near &= direction[part] @ direction.T > 1.0 - 1e-6
-        for first, second in zip(*np.nonzero(np.triu(near, start + 1)), strict=True):
-            pair = lights[start + first], lights[second]
+        # Those before have been compared with these.
+        end = np.searchsorted(center[:, axis], center[part, axis].max() + reach[part].max() + reach.max(), "right")
+        other = slice(start, end)
+        offset = center[None, other] - center[part, None]
+        near = (offset**2).sum(axis=-1) < (reach[part, None] + reach[other]) ** 2
+        near &= np.abs((offset * direction[part, None]).sum(axis=-1)) <= np.maximum(
+            rounding[part, None], rounding[other]
+        )
+        near &= direction[part] @ direction[other].T > 1.0 - 1e-6
+        for first, second in zip(*np.nonzero(np.triu(near, 1)), strict=True):
+            pair = lights[start + first], lights[start + second]
             share = 0.0 if _never_meet(*pair) else _overlap(*pair)
             if share > 0.0:
                 found.append((*pair, share))
+            if len(found) == MOST_PAIRS:
+                return found
     return found
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from . import float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, NARROWEST
-from .polygon import dot
+from .polygon import convex_pieces, dot
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
@@ -117,7 +117,7 @@ class _Lighting:
             if light.is_focused:
                 near = light_cone.may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
-            if light.spread < NARROW_SPREAD or _is_narrow(light, corners):
+            if light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners):
                 needs_float64.append(index if allowed is None else index[allowed])
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width):
@@ -210,6 +210,11 @@ def _is_narrow(light, corners) -> bool:
     """True for lights whose long edges cancel beyond what single precision can tell."""
     sides = corners - corners[0]
     return np.linalg.norm(light.area_vector) < NARROWEST * (sides * sides).sum(axis=1).max()
+
+
+def _is_in_pieces(light, corners) -> bool:
+    """True for lights that `light_levels` takes apart: what double precision does, it does for all pieces."""
+    return light.is_profiled and light.shape == "POLYGON" and len(convex_pieces(corners)) > 1
 
 
 def _batches(light, corners, position, width):

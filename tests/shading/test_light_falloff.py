@@ -87,8 +87,9 @@ def test_the_reference_is_the_quadrature_with_the_falloff(name):
         assert np.linalg.norm(values - expected) < 2e-3 * np.linalg.norm(expected)
 
 
-def test_single_precision_is_as_good_as_double():
-    samples, whole = surface(0.3), light(0.5, falloff=2)
+@pytest.mark.parametrize("settings", [{}, {"shape": "POLYGON", "corners": DART}], ids=["near", "dart"])
+def test_single_precision_is_as_good_as_double(settings):
+    samples, whole = surface(0.3), light(1.5 if settings else 0.5, falloff=2, **settings)
     single, double = (shade(samples, [whole], "ltsh4", workers=1, dtype=dtype) for dtype in (np.float32, np.float64))
     for name in ("specular", "diffuse"):
         expected = getattr(double, name)

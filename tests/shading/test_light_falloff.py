@@ -10,7 +10,7 @@ from random_surfaces import unit
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading import shade
 
-COUNT = 24  # small lights along each side
+COUNT = 16  # small lights along each side
 
 
 def surface(roughness, count=40):
@@ -52,7 +52,7 @@ FALLOFFS = {"linear": (1, 0.0), "constant": (2, 0.0), "smooth": (0, 2.0), "smoot
 @pytest.mark.parametrize("name", FALLOFFS)
 @pytest.mark.parametrize(("height", "roughness"), [(1.5, 0.3), (0.8, 0.6), (4.0, 0.2)])
 def test_a_falloff_is_that_of_many_small_lights(name, height, roughness):
-    """`light_cone` promises 0.3 %; the small lights, a twelfth of a meter wide, are off by their size over the distance
+    """`light_cone` promises 0.3 %; the small lights, an eighth of a meter wide, are off by their size over the distance
     squared, over 24: less than 1e-3."""
     falloff, smooth = FALLOFFS[name]
     samples, whole = surface(roughness), light(height, falloff=falloff, smooth=smooth)

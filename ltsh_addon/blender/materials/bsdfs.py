@@ -78,7 +78,9 @@ BSDFS = {
         CONDUCTOR, {**ROUGHNESS, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
     (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo"),
-    (SHEEN, "ASHIKHMIN"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
+    (SHEEN, "ASHIKHMIN"): Bsdf(
+        "velvet", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo, and in Cycles' passes it is specular"
+    ),
     # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
     (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
     ("ShaderNodeSubsurfaceScattering", ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),

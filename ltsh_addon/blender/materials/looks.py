@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...cycles.closures import sheen_albedo
+from ...cycles.closures import sheen_albedo, velvet_albedo
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
@@ -73,7 +73,7 @@ class Look:
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_stand_in: bool = False  # of a node that is not shaded
-    albedo: float = 1.0  # of sheen: the mean over all views, by which its color is shown
+    albedo: float = 1.0  # of sheen and velvet: the mean over all views, by which its color is shown
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -106,10 +106,13 @@ def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
     return Look("diffuse", {"color": constant(color)}, notes=notes)
 
 
-def mean_sheen_albedo(roughness: float) -> float:
-    """Share of uniform light that sheen of `roughness` reflects."""
+ALBEDOS = {"sheen": sheen_albedo, "velvet": velvet_albedo}
+
+
+def mean_albedo(kind: str, roughness: float) -> float:
+    """Share of uniform light that sheen or velvet of `roughness` reflects."""
     cosine = (np.arange(64) + 0.5) / 64.0
-    return float(np.average(sheen_albedo(cosine, np.full(64, roughness)), weights=cosine))
+    return float(np.average(ALBEDOS[kind](cosine, np.full(64, roughness)), weights=cosine))
 
 
 def default_look() -> Look:
@@ -283,10 +286,10 @@ class _Reader:
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
-        if bsdf.kind == "sheen":
+        if bsdf.kind in ALBEDOS:
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
             roughness = values["roughness"]
-            look = replace(look, albedo=mean_sheen_albedo(roughness.offset[0] if roughness.is_constant else 0.5))
+            look = replace(look, albedo=mean_albedo(bsdf.kind, roughness.offset[0] if roughness.is_constant else 0.5))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look

@@ -28,7 +28,7 @@ KINDS = {
     ("BsdfMetallic", "F82"): "metal",
     ("BsdfMetallic", "PHYSICAL_CONDUCTOR"): CONDUCTOR,
     ("BsdfSheen", "MICROFIBER"): "sheen",
-    ("BsdfSheen", "ASHIKHMIN"): "diffuse",
+    ("BsdfSheen", "ASHIKHMIN"): "velvet",
     ("BsdfToon", "DIFFUSE"): "diffuse",
     ("SubsurfaceScattering", ""): "diffuse",
 }

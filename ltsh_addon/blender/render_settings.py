@@ -280,6 +280,8 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     render.use_freestyle = render.use_persistent_data = False
     render.use_file_extension = render.use_overwrite = True
     cycles.device = "CPU"
+    # AOVs need the other shading system, and without scripts both show the same.
+    cycles.shading_system = cycles.shading_system and bool(script_nodes())
     # The exposure is multiplied into what is read from the file, free of the property's limits.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
@@ -290,6 +292,31 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     cycles.light_sampling_threshold = 0.0
     cycles.caustics_reflective = True
     view_layer.samples = 0
+
+
+SCRIPT = "ShaderNodeScript"
+
+
+def script_nodes() -> list:
+    """The nodes of materials, lights and groups in the file that run Open Shading Language."""
+    owners = (*bpy.data.materials, *bpy.data.lights)
+    trees = [owner.node_tree for owner in owners if owner.node_tree is not None] + list(bpy.data.node_groups)
+    return [node for tree in trees for node in tree.nodes if node.bl_idname == SCRIPT and not node.mute]
+
+
+@contextmanager
+def without_scripts(scene):
+    """Meanwhile Cycles renders without Open Shading Language, as if nothing were linked to the nodes that run it."""
+    before, nodes = scene.cycles.shading_system, script_nodes()
+    scene.cycles.shading_system = False
+    for node in nodes:
+        node.mute = True
+    try:
+        yield
+    finally:
+        scene.cycles.shading_system = before
+        for node in nodes:
+            node.mute = False
 
 
 def _steps_after_rendering(scene) -> list[str]:

@@ -200,7 +200,8 @@ class ObjectBake:
                 plan.show(number)
             # With a fixed seed the bytes do not depend on what was baked before.
             self.scene.cycles.seed, self.scene.cycles.samples = 0, 1
-            found.append(self._bake(block, "EMIT", set()))
+            with render_settings.without_scripts(self.scene):
+                found.append(self._bake(block, "EMIT", set()))
         return np.array(found)
 
     def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:

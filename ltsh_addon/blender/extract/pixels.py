@@ -29,6 +29,7 @@ from ..render_settings import (
     render_exr,
     shifted_pixels,
     sub_pixel_offsets,
+    without_scripts,
     working_space,
 )
 
@@ -41,7 +42,7 @@ def render_pixel_samples(
     enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
     files, offsets = [], sub_pixel_offsets(scene, sub_samples)
-    with pinned_pixel_filter(scene):
+    with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import bpy
 
 from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from ..render_settings import SCRIPT
 from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
 from .graph import (
     MIX,
@@ -37,10 +38,11 @@ from .graph import (
     total,
 )
 
-# Nodes that send rays from where they are evaluated, and what is said of them.
-TRACING_NODES = {
+# Nodes of values that are not what Cycles makes of them, and what is said of them.
+NOTED_NODES = {
     "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
     "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
+    SCRIPT: "is Open Shading Language, which is not read: what it feeds keeps the value of its own socket",
 }
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
 RECEIVER_PROPERTY = "ltsh_receiver"
@@ -95,7 +97,7 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
     notes = []
     if live_link(output.inputs["Volume"]) is not None:
         notes.append("its volume is not shaded; left out of the Cycles reference as well")
-    notes += [f"node {node.name!r} {TRACING_NODES[node.bl_idname]}" for node in _tracing_nodes(output.id_data)]
+    notes += [f"node {node.name!r} {NOTED_NODES[node.bl_idname]}" for node in _noted_nodes(output.id_data)]
     for found in shaders.cuts:
         notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
     leaves = shaders.leaves
@@ -118,14 +120,14 @@ def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
     return [leaves[index] for index in sorted(order[:MAX_LOBES])], [leaves[index] for index in order[MAX_LOBES:]]
 
 
-def _tracing_nodes(tree) -> list:
-    """Nodes of TRACING_NODES in `tree` and its groups that feed something."""
+def _noted_nodes(tree) -> list:
+    """Nodes of NOTED_NODES in `tree` and its groups that feed something."""
     found = []
     for node in tree.nodes:
         if is_group(node) and node.node_tree is not None:
-            found += _tracing_nodes(node.node_tree)
-        elif node.bl_idname in TRACING_NODES and not node.mute and any(socket.is_linked for socket in node.outputs):
-            found.append(node)
+            found += _noted_nodes(node.node_tree)
+        elif node.bl_idname in NOTED_NODES and not node.mute:
+            found += [node] * any(socket.is_linked and socket.type != "SHADER" for socket in node.outputs)
     return found
 
 

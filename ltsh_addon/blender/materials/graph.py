@@ -14,15 +14,18 @@ from typing import Any
 
 import bpy
 
+from ..render_settings import SCRIPT
+
 MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
 TRANSPARENT_NODES = ("ShaderNodeBsdfTransparent", "ShaderNodeHoldout")
 GROUP_SOCKET_NAME = "ltsh"
 
 
 def live_link(socket):
-    """The link that feeds the input `socket`, or None."""
+    """The link that feeds the input `socket`, or None. No values are read from Open Shading Language."""
     for link in socket.links:
-        if not link.is_muted and link.is_valid:
+        is_script = link.from_node.bl_idname == SCRIPT and not link.from_node.mute and socket.type != "SHADER"
+        if not link.is_muted and link.is_valid and not is_script:
             return link
     return None
 

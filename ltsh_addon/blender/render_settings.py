@@ -288,6 +288,8 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     cycles.use_animated_seed = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
+    # What is wholly transparent is seen through, however much of it there is, and leaves no trace in the passes.
+    cycles.transparent_max_bounces, view_layer.pass_alpha_threshold = 1024, 0.5
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.light_sampling_threshold = 0.0
     cycles.caustics_reflective = True

@@ -16,6 +16,7 @@ from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind
 from ..render_settings import SCRIPT
 from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
 from .graph import (
+    CLEAR,
     MIX,
     Factor,
     Leaf,
@@ -29,6 +30,7 @@ from .graph import (
     fill_with_bsdf,
     is_constant,
     is_group,
+    is_seen_through,
     is_socket,
     live_link,
     material_output,
@@ -36,6 +38,7 @@ from .graph import (
     product,
     shaders_behind,
     total,
+    value_of,
 )
 
 # Nodes of values that are not what Cycles makes of them, and what is said of them.
@@ -44,6 +47,7 @@ NOTED_NODES = {
     "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
     SCRIPT: "is Open Shading Language, which is not read: what it feeds keeps the value of its own socket",
 }
+LEFT_OUT = "left out of the Cycles reference as well"
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
 RECEIVER_PROPERTY = "ltsh_receiver"
 
@@ -66,18 +70,20 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    cut(output.inputs["Volume"])
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
             bypass(found.node, live_link(found.other).from_socket)
         else:
             cut(found.clear)
-    if not shaders.leaves:
-        # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
-        black = tree.nodes.new("ShaderNodeBsdfDiffuse")
-        black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-        tree.links.new(black.outputs[0], surface)
-    elif all(leaf.is_transparent for leaf in shaders.leaves):
+    is_clear = is_seen_through(output, shaders)
+    cut(output.inputs["Volume"])
+    if is_clear:
+        _show(surface, CLEAR, 1.0)
+    elif not shaders.leaves:
+        # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
+        _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
+        warnings = (*warnings, f"material {material.name!r}: it has no surface shader and is black, as in Cycles")
+    if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         return MaterialLobes((), (), warnings, is_transparent=True)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
@@ -92,17 +98,23 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     return MaterialLobes(tuple(leaves), values, warnings)
 
 
+def _show(surface, node_type: str, level: float) -> None:
+    """Link a new node of a gray `level` to the input `surface`."""
+    node = surface.id_data.nodes.new(node_type)
+    node.inputs["Color"].default_value = (level, level, level, 1.0)
+    surface.id_data.links.new(node.outputs[0], surface)
+
+
 def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
     """What of a material is not shaded as Cycles does; `emitter`: it is a light. Nothing is changed."""
-    notes = []
+    notes, leaves = [], shaders.leaves
     if live_link(output.inputs["Volume"]) is not None:
-        notes.append("its volume is not shaded; left out of the Cycles reference as well")
+        notes.append(f"its volume is not shaded{'' if leaves else ', it is seen through'}; {LEFT_OUT}")
     notes += [f"node {node.name!r} {NOTED_NODES[node.bl_idname]}" for node in _noted_nodes(output.id_data)]
     for found in shaders.cuts:
         notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
-    leaves = shaders.leaves
     if all(leaf.is_transparent for leaf in leaves):
-        return notes
+        return notes + _tinted(leaves)
     if not emitter and any(is_emission(leaf.node) or emits(leaf.node) for leaf in leaves):
         notes.append("emission is not shaded and lights nothing, in the Cycles reference neither")
     notes += [note for leaf in leaves if not is_emission(leaf.node) for note in notes_of(leaf.node)]
@@ -111,6 +123,14 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
         names = ", ".join(repr(leaf.node.name) for leaf in left_out)
         notes.append(f"it has {MAX_LOBES + len(left_out)} BSDF nodes, of which {MAX_LOBES} are shaded, not {names}")
     return notes
+
+
+def _tinted(leaves) -> list[str]:
+    """Notes about transparency that is not clear."""
+    white = 1.0, 1.0, 1.0
+    nodes = [leaf.node for leaf in leaves if leaf.node.bl_idname == CLEAR]
+    nodes = [node for node in nodes if not is_constant(value_of(node.inputs["Color"]), white)]
+    return [f"node {node.name!r} is shaded as clear; its color is {LEFT_OUT}" for node in nodes]
 
 
 def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:

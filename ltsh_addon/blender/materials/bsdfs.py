@@ -13,9 +13,9 @@ import numpy as np
 from ...cycles.closures import f82_dip
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS
 from ...shading.brdf import schlick_curve
-from .graph import is_constant, is_socket, live_link, product, value_of
+from .graph import PRINCIPLED, is_constant, is_socket, live_link, product, value_of
 
-PRINCIPLED, EMISSION = "ShaderNodeBsdfPrincipled", "ShaderNodeEmission"
+EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 NOT_SUPPORTED = "is not supported, it is not shaded"

@@ -11,7 +11,17 @@ from ...cycles.closures import sheen_albedo, velvet_albedo
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
-from .graph import Factor, Leaf, Source, SurfaceShaders, shaders_behind, source_of, surface_of, tree_in_use
+from .graph import (
+    Factor,
+    Leaf,
+    Source,
+    SurfaceShaders,
+    is_seen_through,
+    shaders_behind,
+    source_of,
+    surface_of,
+    tree_in_use,
+)
 from .values import ImageUse, Value, constant, constant_inputs, input_value, value_at
 
 # Quantities that may come from an image; all others are constants.
@@ -72,6 +82,7 @@ class Look:
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
+    is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # of a node that is not shaded
     albedo: float = 1.0  # of sheen and velvet: the mean over all views, by which its color is shown
 
@@ -137,7 +148,11 @@ def look_of(material) -> Look:
     if bpy.app.version < (5, 0, 0) and not material.use_nodes:
         return plain_look(material.diffuse_color)
     surface = surface_of(material)
-    return plain_look(0.0) if surface is None else _Reader(material, shaders_behind(surface)).look()
+    if surface is None:
+        return plain_look(0.0)
+    shaders = shaders_behind(surface)
+    look = _Reader(material, shaders).look()
+    return replace(look, is_clear=True) if is_seen_through(surface.node, shaders) else look
 
 
 @dataclass(frozen=True)

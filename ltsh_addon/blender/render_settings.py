@@ -358,11 +358,17 @@ def _world_shines(world) -> bool:
     return False
 
 
+GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")
+
+
 def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
     """Take the objects `names` and all volumes out of every collection; children keep their parents."""
     for ob in bpy.data.objects:
         if ob.type == "VOLUME" and ob.name_full in {other.name_full for other in scene.objects}:
             warnings.append(f"volume {ob.name!r} is not shaded; left out of the Cycles reference as well")
+        elif ob.type in GREASE_PENCIL and ob.name_full in {other.name_full for other in scene.objects}:
+            warnings.append(f"grease pencil {ob.name!r} is not shaded, nor does Cycles render it")
+            continue
         elif ob.name_full not in names:
             continue
         ob.hide_render = True

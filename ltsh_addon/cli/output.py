@@ -42,10 +42,10 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
     """Assemble and print what a whole job has made; the document for --json, and the exit code as of `do_job`."""
     merged = merge(output, bar)
     bar.finish()
+    _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     if not arguments.json:
         _complain(bar, "warning", _warnings(merged))
     _print(_summary(merged, output), arguments, bar)
-    _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     _complain(bar, "missing", merged.missing)
     worse = []
     if baseline is not None:

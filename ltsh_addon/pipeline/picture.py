@@ -275,6 +275,7 @@ class Comparison:
             "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
             "passes": {name: self._pass_report(name) for name in options.passes},
+            "problems": list(extraction.problems),
             "warnings": list(extraction.warnings),
         }
 

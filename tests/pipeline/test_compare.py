@@ -140,7 +140,7 @@ def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("spe
     types = {
         "scene": str, "camera": str, "frame": int, "resolution": list, "sub_samples": int, "surface_samples": int,
         "cycles_samples": int, "lights": list, "versions": dict, "tables": dict, "passes": dict,
-        "warnings": list, "exposure": float, "color_space": str,
+        "problems": list, "warnings": list, "exposure": float, "color_space": str,
         "pixel_aspect": float, "pixel_filter": str,
     }  # fmt: skip
     assert set(report) - {"seconds"} == {*types, "reference", "border"}

@@ -174,7 +174,8 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     default = give_default_material(bare)
-    of_materials = inject_aovs(materials + ([default] if default else []), inventory.emitting_materials)
+    materials += [default] if default else []
+    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded)
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -223,6 +224,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         **picture,
         "lights": [light_record(light) for light in inventory.lights],
         "warnings": warnings,
+        "unshaded": inventory.unshaded,
         "samples": samples,
         "reference": reference,
         "passes": render_settings.pass_names(),

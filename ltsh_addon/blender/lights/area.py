@@ -41,6 +41,7 @@ class LightInventory:
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
+    unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
 
     def __post_init__(self):
         self._noted = set(self.warnings)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import bpy
 
 from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from ...scene import listed
 from ..render_settings import SCRIPT
 from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
 from .graph import (
@@ -60,6 +61,7 @@ class MaterialLobes:
     values: tuple[dict, ...]  # of `bsdfs.lobe_values`, and the weight
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
+    unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
@@ -84,7 +86,8 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
         warnings = (*warnings, f"material {material.name!r}: it has no surface shader and is black, as in Cycles")
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
-        return MaterialLobes((), (), warnings, is_transparent=True)
+        unshaded = f"material {material.name!r} is transparent"
+        return MaterialLobes((), (), warnings, is_transparent=True, unshaded=unshaded)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             cut(leaf.node.inputs["Alpha"])
@@ -95,7 +98,11 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     weights = [weight_of(leaf) for leaf in leaves]
     shares = [{} if is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
     values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
-    return MaterialLobes(tuple(leaves), values, warnings)
+    unknown = [leaf.node.name for leaf in shaders.leaves if bsdf_of(leaf.node) is None and not is_emission(leaf.node)]
+    unshaded = ""
+    if unknown and not leaves:
+        unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
+    return MaterialLobes(tuple(leaves), values, warnings, unshaded=unshaded)
 
 
 def _show(surface, node_type: str, level: float) -> None:
@@ -193,11 +200,15 @@ class _Weights:
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
-def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list[str]:
+def inject_aovs(
+    materials: list, emitters: frozenset[str] = frozenset(), unshaded: list[str] | None = None
+) -> list[str]:
     """Make every material write its lobes into AOVs; warnings.
 
-    Materials light nothing, but for those with a full name in `emitters`.
+    Materials light nothing, but for those with a full name in `emitters`. A material that is not shaded at all writes
+    -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry.
     """
+    unshaded = [] if unshaded is None else unshaded
     found, warnings = [], []
     for material in materials:
         ensure_nodes(material)
@@ -209,6 +220,9 @@ def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list
         if not lobes.is_transparent:
             found.append(lobes)
             _write_hit(material)
+            if lobes.unshaded:
+                unshaded.append(lobes.unshaded)
+                _write_aov(material.node_tree, lobe_aov("kind", 0), -len(unshaded))
     # A slot has the same AOVs in all materials.
     for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
         users = [lobes for lobes in found if len(lobes.leaves) > slot]

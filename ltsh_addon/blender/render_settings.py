@@ -342,6 +342,10 @@ def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
     world = view_layer.world_override or scene.world
     if world is not None and _world_shines(world):
         warnings.append(f"world {world.name!r}: its light is not shaded; left out of the Cycles reference as well")
+    has_nodes = world is not None and (bpy.app.version >= (5, 0, 0) or world.use_nodes) and world.node_tree
+    output = world.node_tree.get_output_node("CYCLES") if has_nodes else None
+    if output is not None and output.inputs["Volume"].is_linked:
+        warnings.append(f"world {world.name!r}: its volume is not shaded; left out of the Cycles reference as well")
     view_layer.world_override = scene.world = None
 
 

@@ -170,7 +170,7 @@ def in_front(samples, light, candidates):
 
 
 # Samples at which lights are tried first, and pairs of samples and lights that are tried at all.
-FEW_SAMPLES, MOST_PAIRS = 1024, 10**8
+FEW_SAMPLES, MOST_PAIRS = 1024, 2 * 10**7
 CHUNK = 16384
 
 
@@ -188,8 +188,11 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
     reached = set()
     for part in (samples.take(slice(None, None, max(1, len(samples) // FEW_SAMPLES))), samples):
         lobes, pairs = has_lobe(part), 0
+        ends = np.stack([part.position.min(axis=0, initial=np.inf), part.position.max(axis=0, initial=-np.inf)])
         for light in lights:
-            if light.name not in reached:
+            # How far the box around the samples reaches in front of the light.
+            ahead = ((ends - light.center) * light.direction).max(axis=0).sum()
+            if light.name not in reached and ahead > 0.0:
                 pairs += len(part)
                 if pairs > MOST_PAIRS or _reaches(light, part, lobes):
                     reached.add(light.name)

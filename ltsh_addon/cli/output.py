@@ -33,8 +33,8 @@ def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[
     text = f"{shard[0]}/{shard[1]}"
     kept = f" ({done.kept} were there already)" if done.kept else ""
     tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
-    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
     _complain(bar, "problem", done.problems)
+    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
     return {"shard": text, **vars(done)}, 1 if done.problems else 0
 
 

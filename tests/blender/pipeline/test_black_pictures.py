@@ -89,6 +89,17 @@ def test_a_black_picture_says_why(capsys, tmp_path, command, case):
         assert ("is not shaded" in page.partition("<table>")[0]) == bool(expected)
 
 
+def test_of_several_pictures_the_black_ones_are_named(capsys, tmp_path):
+    hair()
+    path, out = scene_parts.save(tmp_path / "scene.blend"), tmp_path / "out"
+    code, stdout, stderr = run(capsys, "shade", path, "-o", out, "--quiet", "--frames", "1-2", *OPTIONS["shade"])
+    expected = [f"failed: shade_000{frame}: 100 % of {CAMERA} is not shaded: {REASON}" for frame in (1, 2)]
+    assert code == 1 and stderr.splitlines()[:2] == expected
+    assert json.loads((out / "report.json").read_text(encoding="utf-8"))["problems"] == [
+        line.removeprefix("failed: ") for line in expected
+    ]
+
+
 @pytest.mark.parametrize("sub_samples", [1, 3])
 def test_the_engine_and_the_panels_have_the_same_problem(tmp_path, sub_samples):
     hair()

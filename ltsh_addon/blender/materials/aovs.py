@@ -84,7 +84,6 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     elif not shaders.leaves:
         # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
-        warnings = (*warnings, f"material {material.name!r}: it has no surface shader and is black, as in Cycles")
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
         return MaterialLobes((), (), warnings, is_transparent=True, unshaded=unshaded)
@@ -117,6 +116,8 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
     notes, leaves = [], shaders.leaves
     if live_link(output.inputs["Volume"]) is not None:
         notes.append(f"its volume is not shaded{'' if leaves else ', it is seen through'}; {LEFT_OUT}")
+    elif not leaves:
+        notes.append("it has no surface shader and is black, as in Cycles")
     notes += [f"node {node.name!r} {NOTED_NODES[node.bl_idname]}" for node in _noted_nodes(output.id_data)]
     for found in shaders.cuts:
         notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")

@@ -285,16 +285,45 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     render.use_freestyle = render.use_persistent_data = False
     render.use_file_extension = render.use_overwrite = True
     cycles.device = "CPU"
+    # AOVs need the other shading system, and without scripts both show the same.
+    cycles.shading_system = cycles.shading_system and bool(script_nodes())
     # The exposure is multiplied into what is read from the file, free of the property's limits.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
     cycles.use_animated_seed = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
+    # What is wholly transparent is seen through, however much of it there is, and leaves no trace in the passes.
+    cycles.transparent_max_bounces, view_layer.pass_alpha_threshold = 1024, 0.5
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.light_sampling_threshold = 0.0
     cycles.caustics_reflective = True
     view_layer.samples = 0
+
+
+SCRIPT = "ShaderNodeScript"
+
+
+def script_nodes() -> list:
+    """The nodes of materials, lights and groups in the file that run Open Shading Language."""
+    owners = (*bpy.data.materials, *bpy.data.lights)
+    trees = [owner.node_tree for owner in owners if owner.node_tree is not None] + list(bpy.data.node_groups)
+    return [node for tree in trees for node in tree.nodes if node.bl_idname == SCRIPT and not node.mute]
+
+
+@contextmanager
+def without_scripts(scene):
+    """Meanwhile Cycles renders without Open Shading Language, as if nothing were linked to the nodes that run it."""
+    before, nodes = scene.cycles.shading_system, script_nodes()
+    scene.cycles.shading_system = False
+    for node in nodes:
+        node.mute = True
+    try:
+        yield
+    finally:
+        scene.cycles.shading_system = before
+        for node in nodes:
+            node.mute = False
 
 
 def _steps_after_rendering(scene) -> list[str]:
@@ -318,6 +347,10 @@ def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
     world = view_layer.world_override or scene.world
     if world is not None and _world_shines(world):
         warnings.append(f"world {world.name!r}: its light is not shaded; left out of the Cycles reference as well")
+    has_nodes = world is not None and (bpy.app.version >= (5, 0, 0) or world.use_nodes) and world.node_tree
+    output = world.node_tree.get_output_node("CYCLES") if has_nodes else None
+    if output is not None and output.inputs["Volume"].is_linked:
+        warnings.append(f"world {world.name!r}: its volume is not shaded; left out of the Cycles reference as well")
     view_layer.world_override = scene.world = None
 
 
@@ -334,11 +367,17 @@ def _world_shines(world) -> bool:
     return False
 
 
+GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")
+
+
 def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
     """Take the objects `names` and all volumes out of every collection; children keep their parents."""
     for ob in bpy.data.objects:
         if ob.type == "VOLUME" and ob.name_full in {other.name_full for other in scene.objects}:
             warnings.append(f"volume {ob.name!r} is not shaded; left out of the Cycles reference as well")
+        elif ob.type in GREASE_PENCIL and ob.name_full in {other.name_full for other in scene.objects}:
+            warnings.append(f"grease pencil {ob.name!r} is not shaded, nor does Cycles render it")
+            continue
         elif ob.name_full not in names:
             continue
         ob.hide_render = True

@@ -33,8 +33,8 @@ def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[
     text = f"{shard[0]}/{shard[1]}"
     kept = f" ({done.kept} were there already)" if done.kept else ""
     tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
-    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
     _complain(bar, "problem", done.problems)
+    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
     return {"shard": text, **vars(done)}, 1 if done.problems else 0
 
 
@@ -42,10 +42,10 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
     """Assemble and print what a whole job has made; the document for --json, and the exit code as of `do_job`."""
     merged = merge(output, bar)
     bar.finish()
+    _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     if not arguments.json:
         _complain(bar, "warning", _warnings(merged))
     _print(_summary(merged, output), arguments, bar)
-    _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     _complain(bar, "missing", merged.missing)
     worse = []
     if baseline is not None:

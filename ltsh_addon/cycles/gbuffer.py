@@ -89,9 +89,19 @@ def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
 
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
-    """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV."""
+    """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV and is no holdout."""
     depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")
-    return int(np.count_nonzero((depth < 1e9) & (read_aov(channels, "hit") == 0.0)))
+    shown = (depth < 1e9) & (read_layer(channels, "Combined", "A") != 0.0)
+    return int(np.count_nonzero(shown & (read_aov(channels, "hit") == 0.0)))
+
+
+def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
+    """Hits (count,) of a one-sample render on each of the materials that are not shaded, as `inject_aovs` numbers
+    them."""
+    if not count:
+        return np.zeros(0, dtype=int)
+    number = -np.rint(read_aov(channels, lobe_aov("kind", 0))[read_aov(channels, "hit") == 1.0]).astype(int)
+    return np.bincount(number[number > 0] - 1, minlength=count)
 
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
 
 from ..scene import SurfaceSamples
 from . import closures
-from .closures import sheen_albedo
+from .closures import sheen_albedo, velvet_albedo
 from .horizons import bump_alpha2, unit, valid_specular_normal
 
 AOV_PREFIX = "ltsh_"
@@ -59,6 +59,7 @@ LOBE_KINDS = {
     "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
     "glass": 8.0,
     "sheen": 9.0,
+    "velvet": 10.0,
 }
 
 
@@ -231,6 +232,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
     slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
     parts_of_slots = [_parts_of(slot) for slot in slots]
     parts = [part for own in parts_of_slots for part in own]
+    hits = _with_velvet(hits, slots, parts_of_slots)
     for slot, own in zip(slots, parts_of_slots, strict=True):
         if slot.has("sheen_weight"):
             _put_under_sheen(hits, slot, own, parts)
@@ -302,6 +304,16 @@ def _parts_of(slot: LobeSlot) -> list[_Part]:
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
     return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
+
+
+def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_Part]]) -> Hits:
+    """The hits with a diffuse albedo that has velvet too, which Cycles counts as specular."""
+    if hits.diffuse_albedo is None or not any(slot.of("velvet").any() for slot in slots):
+        return hits
+    albedo = hits.diffuse_albedo.copy()
+    for slot, (base, *_) in zip(slots, parts_of_slots, strict=True):
+        albedo[slot.index] += np.where(slot.of("velvet"), base.diffuse, 0.0)
+    return replace(hits, diffuse_albedo=albedo)
 
 
 def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
@@ -396,9 +408,10 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
     """Everything but coat and transmission."""
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
-    if slot.of("sheen").any():
-        albedo = sheen_albedo(slot.cosine(slot.normal), slot.roughness)[:, None]
-        diffuse = np.where(slot.of("sheen"), slot.color * albedo, diffuse)
+    for kind, albedo_of in (("sheen", sheen_albedo), ("velvet", velvet_albedo)):
+        if slot.of(kind).any():
+            albedo = albedo_of(slot.cosine(slot.normal), slot.roughness)[:, None]
+            diffuse = np.where(slot.of(kind), slot.color * albedo, diffuse)
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
     for kind in ("conductor", "conductor_4_5"):
         if slot.of(kind).any():

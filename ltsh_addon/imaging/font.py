@@ -169,15 +169,15 @@ def shorten(text: str, width: int, size: float = 14.0, *, bold: bool = False) ->
     return text + "\u2026"
 
 
-def wrap(text: str, width: int, size: float = 14.0) -> list[str]:
+def wrap(text: str, width: int, size: float = 14.0, *, bold: bool = False) -> list[str]:
     """`text` broken between words into lines that fit into `width` pixels; a longer single word is shortened."""
     lines: list[str] = []
     for word in text.split():
-        if lines and text_size(f"{lines[-1]} {word}", size)[0] <= width:
+        if lines and text_size(f"{lines[-1]} {word}", size, bold=bold)[0] <= width:
             lines[-1] += f" {word}"
         else:
             lines.append(word)
-    return [shorten(line, width, size) for line in lines]
+    return [shorten(line, width, size, bold=bold) for line in lines]
 
 
 def _drawable(text: str) -> str:

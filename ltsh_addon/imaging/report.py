@@ -73,6 +73,7 @@ def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, re
     body = [
         f"<h1>{_text(report['scene'])}</h1>",
         f'<p class="facts">{_text(facts)}</p>',
+        *(f"<p><strong>{_text(problem)}</strong></p>" for problem in report.get("problems", ())),
         f'<p><a href="{sheet}"><img src="{sheet}" alt="Cycles and the techniques, with signed errors"></a></p>',
         *(_pass_table(name, figures) for name, figures in report["passes"].items()),
         _warnings(report["warnings"]),

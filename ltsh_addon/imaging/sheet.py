@@ -13,19 +13,24 @@ from .font import draw_text, shorten, text_size, wrap
 COLUMNS = 5
 TILE_WIDTHS = (240, 480)  # tiny images are enlarged to the first, large ones reduced to the second
 _PAPER, _INK, _FAINT, _FRAME = (250, 250, 249), (28, 28, 30), (106, 106, 112), (198, 198, 202)
-_MARGIN, _GUTTER = 28, 16
+_GRAY = (128, 128, 128)  # what is not known
+_MARGIN, _GUTTER, _BAR = 28, 16, 18
 _TITLE, _LABEL, _TEXT = 26.0, 18.0, 14.0
 _SCALE_PERCENTILE = 99.5
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One technique: linear image (H, W, 3), signed error (H, W, 3), lines of text."""
+    """One technique: linear image (H, W, 3), signed error (H, W, 3), lines of text.
+
+    Pixels that `missing` (H, W) names have neither and are gray; None: there are none.
+    """
 
     label: str
     image: np.ndarray
     error: np.ndarray
     caption: Sequence[str] = field(default=())
+    missing: np.ndarray | None = None
 
 
 def comparison_sheet(
@@ -47,17 +52,43 @@ def comparison_sheet(
                 raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
     exposure = exposure_factor(image)
     scale = common_error_scale([tile.error for tile in techniques], image)
-    pictures = [to_srgb8(exposure * _resized(part)) for part in (image, *(tile.image for tile in techniques))]
-    errors = [_to_8bit(signed_error_colors(_resized(tile.error), scale)) for tile in techniques]
-    height, width = pictures[0].shape[:2]
-    lines = max((len(tile.caption) for tile in techniques), default=0)
-    sheet = _Sheet(title, width, height, count=len(pictures), caption_lines=lines)
-    legend = [*notes, f"exposure {np.log2(exposure):+.1f} EV"]
-    sheet.place(0, label, pictures[0], None, ())
+    first = to_srgb8(exposure * _resized(image))
+    height, width = first.shape[:2]
+    meaning = "signed error: technique \u2212 Cycles, in radiance; red is too bright, blue too dark"
+    legend = _wrapped((meaning, *notes, f"exposure {np.log2(exposure):+.1f} EV"), width)
+    captions = [_wrapped(tile.caption, width) for tile in techniques]
+    lines = max(map(len, captions), default=0)
+    sheet = _Sheet(title, width, height, count=1 + len(techniques), lines=(len(legend), lines))
+    sheet.place(0, label, first, None, ())
     sheet.legend(legend, scale)
-    for index, (tile, picture, error) in enumerate(zip(techniques, pictures[1:], errors, strict=True), start=1):
-        sheet.place(index, tile.label, picture, error, tile.caption)
+    for index, (tile, caption) in enumerate(zip(techniques, captions, strict=True), start=1):
+        picture = _with_gray(to_srgb8(exposure * _known(tile.image, tile.missing)), tile.missing)
+        error = _to_8bit(signed_error_colors(_known(tile.error, tile.missing), scale))
+        sheet.place(index, tile.label, picture, _with_gray(error, tile.missing), caption)
     return sheet.pixels
+
+
+def _wrapped(texts: Sequence[str], width: int) -> list[str]:
+    return [line for text in texts for line in wrap(text, width, _TEXT)]
+
+
+def _known(image: np.ndarray, missing: np.ndarray | None) -> np.ndarray:
+    """`image` resized, where it is reduced the mean of pixels that are not `missing`."""
+    if missing is None:
+        return _resized(image)
+    known = np.where(missing, 0.0, 1.0)[..., None]
+    share = _resized(known)
+    return np.divide(
+        _resized(np.where(known, image, 0.0)), share, out=np.zeros((*share.shape[:2], 3)), where=share > 0.0
+    )
+
+
+def _with_gray(pixels: np.ndarray, missing: np.ndarray | None) -> np.ndarray:
+    """8-bit `pixels` (H, W, 3) of a resized picture, gray where all pixels of the picture are `missing`."""
+    if missing is None:
+        return pixels
+    share = _resized((~missing[..., None]).astype(np.float64))
+    return np.where(share > 0.0, pixels, _GRAY).astype(np.uint8)
 
 
 def common_error_scale(errors, image) -> float:
@@ -101,25 +132,31 @@ def _to_8bit(colors: np.ndarray) -> np.ndarray:
 class _Sheet:
     """The paper and where things go on it."""
 
-    def __init__(self, title: str, width: int, height: int, *, count: int, caption_lines: int):
+    def __init__(self, title: str, width: int, height: int, *, count: int, lines: tuple[int, int]):
+        legend_lines, caption_lines = lines
         self.width, self.height = width, height
         self.columns = min(count, COLUMNS)
         self.rows = -(-count // self.columns)
         self.line = text_size("Ag", _TEXT)[1] + 4
         self.label_height = text_size("Ag", _LABEL, bold=True)[1] + 8
         self.caption_height = caption_lines * self.line + 10
-        self.row_height = self.label_height + 2 * height + 10 + self.caption_height + 18
-        title_height = text_size("Ag", _TITLE, bold=True)[1] + 18
-        self.top = _MARGIN + title_height
+        below = 2 * height + 10 + self.caption_height
+        legend = height + 10 + _BAR + 12 + (1 + legend_lines) * self.line
+        # The legend stands in the first row, and may need more room than the errors beside it.
+        self.heights = [self.label_height + max(below, legend) + 18]
+        self.heights += (self.rows - 1) * [self.label_height + below + 18]
         page_width = 2 * _MARGIN + self.columns * width + (self.columns - 1) * _GUTTER
-        page_height = self.top + self.rows * self.row_height + _MARGIN - 18
+        heading = wrap(title, page_width - 2 * _MARGIN, _TITLE, bold=True)
+        title_line = text_size("Ag", _TITLE, bold=True)[1]
+        self.top = _MARGIN + len(heading) * title_line + 18
+        page_height = self.top + sum(self.heights) + _MARGIN - 18
         self.pixels = np.full((page_height, page_width, 3), _PAPER, dtype=np.uint8)
-        fitting = shorten(title, page_width - 2 * _MARGIN, _TITLE, bold=True)
-        draw_text(self.pixels, _MARGIN, _MARGIN, fitting, _INK, _TITLE, bold=True)
+        for number, text in enumerate(heading):
+            draw_text(self.pixels, _MARGIN, _MARGIN + number * title_line, text, _INK, _TITLE, bold=True)
 
     def _corner(self, index: int) -> tuple[int, int]:
         row, column = divmod(index, self.columns)
-        return _MARGIN + column * (self.width + _GUTTER), self.top + row * self.row_height
+        return _MARGIN + column * (self.width + _GUTTER), self.top + sum(self.heights[:row])
 
     def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
         """Put label, picture, error and caption into cell `index`."""
@@ -132,7 +169,7 @@ class _Sheet:
             self._picture(x, y, error)
         y += self.height + 8
         for line in caption:
-            draw_text(self.pixels, x, y, shorten(line, self.width, _TEXT), _FAINT, _TEXT)
+            draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
             y += self.line
 
     def _picture(self, x: int, y: int, picture: np.ndarray) -> None:
@@ -140,19 +177,16 @@ class _Sheet:
         self.pixels[y - 1 : y + height + 1, x - 1 : x + width + 1] = _FRAME
         self.pixels[y : y + height, x : x + width] = picture
 
-    def legend(self, notes: Sequence[str], scale: float) -> None:
-        """Below the reference: the color bar with numbers, what the colors mean, the notes."""
+    def legend(self, lines: Sequence[str], scale: float) -> None:
+        """Below the reference: the color bar with numbers, then the `lines`."""
         x, y = self._corner(0)
         y += self.label_height + self.height + 10
-        bar_height = 18
-        self._picture(x, y + 1, _to_8bit(color_bar(self.width, bar_height)))
-        y += bar_height + 6
+        self._picture(x, y + 1, _to_8bit(color_bar(self.width, _BAR)))
+        y += _BAR + 6
         for text, align in ((f"\u2212{scale:g}", 0.0), ("0", 0.5), (f"+{scale:g}", 1.0)):
             width = text_size(text, _TEXT)[0]
             draw_text(self.pixels, x + round(align * (self.width - width)), y, text, _INK, _TEXT)
         y += self.line + 6
-        meaning = "signed error: technique \u2212 Cycles, in radiance; red is too bright, blue too dark"
-        for text in (meaning, *notes):
-            for line in wrap(text, self.width, _TEXT):
-                draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
-                y += self.line
+        for line in lines:
+            draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
+            y += self.line

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import temporary_folder
-from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples
+from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples, listed
 from ..shading.parallel import cores
 from . import picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
@@ -206,7 +206,8 @@ class ObjectBaker:
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; how many texels there were."""
-        options, covered, covers, overlaps = self.options, 0, 0, 0
+        options, covered, covers, overlaps, unshaded, lit = self.options, 0, 0, 0, 0, False
+        is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
         triangles = self._raster.in_tile(self.mesh.uv, *options.size, _place(tile))
 
@@ -219,6 +220,8 @@ class ObjectBaker:
             covered += len(texels.index)
             covers += texels.covers
             overlaps += texels.overlaps
+            unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+            lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
             planes.put(first, min(rows, height - first), texels, _channels(layers))
             for pass_name, (a, b) in halves.items():
                 errors.add_halves(pass_name, a, b)
@@ -227,7 +230,8 @@ class ObjectBaker:
             share = (number + 1) / len(firsts)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
-        return {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        return {**found, "unshaded_texels": unshaded, "is_lit": lit}
 
     def _threads(self) -> int:
         """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
@@ -398,7 +402,11 @@ def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = list(dict.fromkeys([*manifest["warnings"], *lines]))
+    reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
+        wrong, note = _darkness(record, reasons[record["name"]])
+        problems += wrong
+        warnings += note
         if record["outside"] > NOTED_SHARE_OUTSIDE:
             share = f"{100 * record['outside']:.3g} %"
             warnings.append(
@@ -419,6 +427,18 @@ def _report(options, manifest, records) -> dict:
         "warnings": warnings,
         "versions": picture.versions(manifest["blender_version"]),
     }
+
+
+def _darkness(record, reasons) -> tuple[list[str], list[str]]:
+    """The problem of an object whose texels are mostly not shaded for the `reasons` of its materials, or the warning
+    about one that no light reaches."""
+    tiles, name = record["tiles"].values(), f"object {record['name']!r}"
+    texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
+    if 2 * unshaded > texels:
+        share = f"{100.0 * unshaded / texels:.3g} %"
+        return [f"{name}: {share} of its texels are not shaded: {listed(dict.fromkeys(filter(None, reasons)))}"], []
+    is_dark = texels > 0 and not any(tile["is_lit"] for tile in tiles)
+    return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []
 
 
 def summary(report: dict, seconds: dict) -> list[str]:

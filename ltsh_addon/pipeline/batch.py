@@ -160,7 +160,13 @@ def merge(output: Path, progress=None) -> Merged:
         _unit(job, output, list(members), found, progress) for _, members in groupby(tasks, key=lambda task: task.unit)
     ]
     units = [unit for unit in units if unit is not None]
-    problems = [problem for _, report in units for problem in report.get("problems", ())]
+    # Of a bake they name the objects.
+    is_plain = job["single"] or job["command"] == "bake"
+    problems = [
+        problem if is_plain else f"{name}: {problem}"
+        for name, report in units
+        for problem in report.get("problems", ())
+    ]
     problems += [record["problem"] for record in found.values() if record and "problem" in record]
     problems += _different_versions(found)
     seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}

@@ -15,7 +15,18 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import check_takes_files
-from ..scene import CYCLES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, VERSION, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import (
+    CYCLES,
+    PASSES,
+    REFERENCE,
+    SHIPPED_TABLES,
+    TECHNIQUES,
+    VERSION,
+    Cancelled,
+    Film,
+    Progress,
+    SurfaceSamples,
+)
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
@@ -275,6 +286,7 @@ class Comparison:
             "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
             "passes": {name: self._pass_report(name) for name in options.passes},
+            "problems": list(extraction.problems),
             "warnings": list(extraction.warnings),
         }
 
@@ -296,7 +308,7 @@ class Comparison:
         facts = self._reference_facts()
         if facts is None or facts["samples"] == facts["of"]:
             return ""
-        return f"reference on {facts['samples']} of {facts['of']} samples, randomly chosen pixels; elsewhere zero"
+        return f"reference on {facts['samples']} of {facts['of']} samples, randomly chosen pixels"
 
     def _pass_report(self, pass_name: str) -> dict:
         report = {}
@@ -345,7 +357,7 @@ class Comparison:
         if self.extraction.border is not None:
             metadata["ltsh:border"] = str(self.extraction.border)
         if notice := self._subset_notice():
-            metadata["ltsh:reference"] = notice
+            metadata["ltsh:reference"] = f"{notice}; elsewhere zero"
         layers, sheet = self.layers(), self.sheet() if with_cycles else None
         chromaticities = imaging.chromaticities(self.extraction.color_space)
         files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
@@ -388,27 +400,45 @@ class Comparison:
         return layers
 
     def sheet(self) -> np.ndarray:
-        """The comparison sheet (H, W, 3), 8 bit: the specular pass where there is one."""
-        pass_name = "specular" if "specular" in self.options.passes else self.options.passes[0]
-        halves = self.cycles[pass_name]
+        """The comparison sheet (H, W, 3), 8 bit: all light together where it was shaded, then each pass."""
+        wanted = [name for name in PASSES if name in self.options.passes]
+        parts = [(name,) for name in wanted] if len(wanted) == 1 else [PASSES, *((name,) for name in wanted)]
+        return np.concatenate([self._sheet_of(passes) for passes in parts])
+
+    def _sheet_of(self, passes: tuple[str, ...]) -> np.ndarray:
+        """The sheet of the sum of `passes`."""
+        halves = sum(self.cycles[name] for name in passes)
         mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
         hit = self.film.coverage() > 0.0
-        noise = imaging.reference_noise(halves[0], halves[1], hit)
         tiles = []
         for name, result in self.results.items():
-            report = self._technique_report(name, pass_name)
-            error = np.where(self._mask(result)[..., None], self.images[name, pass_name] - mean, 0.0)
-            label = _title(name)
-            image = self.images[name, pass_name]
-            tiles.append(imaging.Tile(label, rec709(image), rec709(error), _caption(report)))
-        title = f"{Path(self.options.scene).stem}: {pass_name} radiance beside Cycles"
+            image, mask = sum(self.images[name, part] for part in passes), self._mask(result)
+            error, missing = np.where(mask[..., None], image - mean, 0.0), None
+            if result.subset is not None:
+                missing = hit & ~mask
+            tiles.append(imaging.Tile(_title(name), rec709(image), rec709(error), self._caption(name, passes), missing))
+        title = passes[0] if len(passes) == 1 else "combined"
         notes = [
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
-            f"noise of the Cycles reference {percent(noise)}",
+            f"noise of the Cycles reference {percent(imaging.reference_noise(*halves, hit))}",
         ]
         if notice := self._subset_notice():
-            notes.append(notice)
+            notes.append(f"{notice}; elsewhere gray")
+        title = f"{Path(self.options.scene).stem}: {title} radiance beside Cycles"
         return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
+
+    def _caption(self, name: str, passes: tuple[str, ...]) -> list[str]:
+        """The errors of a technique in the sum of `passes`."""
+        result, halves = self.results[name], sum(self.cycles[part] for part in passes)
+        image = sum(self.images[name, part] for part in passes)
+        beside = imaging.noisy_error_statistics(image, *halves, self._mask(result)).to_dict()
+        lines, reference = [f"against Cycles {unbiased(beside)}"], self.results.get(REFERENCE)
+        if reference is not None and name != REFERENCE:
+            index = slice(None) if reference.subset is None else reference.subset
+            values = sum(self._radiance(result, part).sum(axis=0)[index] for part in passes)
+            truth = sum(self._radiance(reference, part).sum(axis=0) for part in passes)
+            lines.append(f"against reference {percent(imaging.error_statistics(values, truth).relative_l2)}")
+        return lines
 
 
 def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:
@@ -424,13 +454,6 @@ def _group_names(groups) -> list[str]:
     while ungrouped in groups:
         ungrouped += "_"
     return [group or ungrouped for group in groups]
-
-
-def _caption(report: dict) -> list[str]:
-    lines = [f"against Cycles {unbiased(report['against_cycles'])}"]
-    if "against_reference" in report:
-        lines.append(f"against reference {percent(report['against_reference']['relative_l2'])}")
-    return lines
 
 
 def _light_report(light) -> dict:

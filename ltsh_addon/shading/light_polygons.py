@@ -170,6 +170,52 @@ def in_front(samples, light, candidates):
     return candidates[facing if allowed is None else facing & allowed]
 
 
+# Samples at which lights are tried first, and pairs of samples and lights that are tried at all.
+FEW_SAMPLES, MOST_PAIRS = 1024, 2 * 10**7
+CHUNK = 16384
+
+
+def has_lobe(samples: SurfaceSamples) -> np.ndarray:
+    """Mask (2, P) of the samples that have a diffuse and a specular lobe."""
+    terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip, samples.dielectric)
+    return np.stack([samples.diffuse_albedo.any(axis=1), np.logical_or.reduce([term.any(axis=1) for term in terms])])
+
+
+def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
+    """Names of the `lights` of which no part is above the horizon of a lobe of any sample, in front of it.
+
+    Lights of one name are one light. Where there are more than MOST_PAIRS left to try, the others are taken as seen.
+    """
+    reached = set()
+    for part in (samples.take(slice(None, None, max(1, len(samples) // FEW_SAMPLES))), samples):
+        lobes, pairs = has_lobe(part), 0
+        ends = np.stack([part.position.min(axis=0, initial=np.inf), part.position.max(axis=0, initial=-np.inf)])
+        for light in lights:
+            # How far the box around the samples reaches in front of the light.
+            ahead = ((ends - light.center) * light.direction).max(axis=0).sum()
+            if light.name not in reached and ahead > 0.0:
+                pairs += len(part)
+                if pairs > MOST_PAIRS or _reaches(light, part, lobes):
+                    reached.add(light.name)
+    return [name for name in dict.fromkeys(light.name for light in lights) if name not in reached]
+
+
+def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bool:
+    """True where a corner of the light is above both horizons of one of the `lobes` (2, P)."""
+    diffuse = lobes[0] & light.affects_diffuse, (samples.diffuse_normal, samples.smooth_normal)
+    specular = lobes[1] & light.affects_specular, (samples.normal, samples.geometric_normal)
+    corners = light.polygon()[:, None]
+    for lobe, horizons in (diffuse, specular):
+        candidates = np.flatnonzero(lobe)
+        for start in range(0, len(candidates), CHUNK):
+            index = in_front(samples, light, candidates[start : start + CHUNK])
+            offset = corners - samples.position[index]
+            heights = [(offset * normal[index]).sum(axis=-1).max(axis=0) for normal in horizons]
+            if (np.minimum(*heights) > 0.0).any():
+                return True
+    return False
+
+
 def to_local(axes, vectors):
     """World vectors (3, ..., P) in local frames (3, 3, P)."""
     return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])

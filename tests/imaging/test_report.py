@@ -107,6 +107,44 @@ def test_tiny_images_are_enlarged_by_whole_factors_and_large_ones_reduced_withou
     assert np.allclose(sheet._resized(np.full((333, 1000, 3), 0.25)), 0.25, rtol=1e-12)
 
 
+def test_pixels_that_were_not_taken_are_gray_and_change_no_mean():
+    """Enlarged one by one; reduced, each pixel of the sheet is the mean of those that were taken."""
+    for width, height in ((16, 9), (960, 12)):
+        missing = np.random.default_rng(1).random((height, width)) < 0.7
+        image = np.where(missing[..., None], 0.0, 0.5) * np.ones(3)
+        tile = Tile("T", image, 0.0 * image, ["1 %"], missing)
+        page = comparison_sheet("title", ("Cycles", np.full((height, width, 3), 0.5)), [tile])
+        bright, gray = to_srgb8(np.array([0.9, 0.9, 0.9])), np.array([128, 128, 128], np.uint8)
+        share = sheet._resized((~missing[..., None]).astype(float))
+        assert contains(page, np.where(share > 0.0, bright, gray).astype(np.uint8))
+        assert not (page == 0).all(axis=-1).any()
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 2), (240, 30), (700, 20)])
+def test_every_word_of_the_legend_and_of_captions_stands_on_small_sheets(monkeypatch, width, height):
+    drawn = []
+    draw = sheet.draw_text
+
+    def watch(image, x, y, text, color, size, **more):
+        box = font.text_size(text, size, bold=more.get("bold", False))
+        assert 0 <= x and 0 <= y and x + box[0] <= image.shape[1] + 2 and y + box[1] <= image.shape[0], text
+        drawn.append(text)
+        return draw(image, x, y, text, color, size, **more)
+
+    monkeypatch.setattr(sheet, "draw_text", watch)
+    image, notes = (
+        np.ones((height, width, 3)),
+        [f"a note of several words, of which this is number {n}" for n in range(4)],
+    )
+    caption = "an error against something with a long name 12.34 %"
+    tiles = [Tile(f"T{n}", image, 0.0 * image, [caption]) for n in range(6)]
+    title = "a scene of a long name that needs more than a line: combined radiance beside Cycles " * 2
+    comparison_sheet(title, ("Cycles", image), tiles, notes=notes)
+    words = " ".join(drawn)
+    assert "\u2026" not in words and all(text in words for text in (*notes, caption, " ".join(title.split())))
+    assert words.count(caption) == 6
+
+
 def test_odd_images_make_a_sheet_and_images_of_different_size_are_refused():
     image, error = picture(32, 18), picture(32, 18, 1) - 1.0
     broken = np.where(image > 1.9, np.nan, np.where(image < 0.1, np.inf, image))

@@ -140,7 +140,7 @@ def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("spe
     types = {
         "scene": str, "camera": str, "frame": int, "resolution": list, "sub_samples": int, "surface_samples": int,
         "cycles_samples": int, "lights": list, "versions": dict, "tables": dict, "passes": dict,
-        "warnings": list, "exposure": float, "color_space": str,
+        "problems": list, "warnings": list, "exposure": float, "color_space": str,
         "pixel_aspect": float, "pixel_filter": str,
     }  # fmt: skip
     assert set(report) - {"seconds"} == {*types, "reference", "border"}
@@ -244,21 +244,29 @@ def test_a_reference_on_a_subset_is_stated_and_zero_elsewhere(child, tmp_path):
     assert stated.encode() in (tmp_path / "out" / "compare.exr").read_bytes()
 
 
-def test_the_passes_and_techniques_that_were_asked_for_alone_the_specular_one_first_on_the_sheet(
-    child, tmp_path, monkeypatch
-):
+def test_the_sheet_has_all_light_first_and_then_the_passes_that_were_shaded(child, tmp_path, monkeypatch):
     sheets = []
     make_sheet = imaging.comparison_sheet
     monkeypatch.setattr(imaging, "comparison_sheet", lambda *a, **k: sheets.append(a) or make_sheet(*a, **k))
-    compare_scene(options(tmp_path, passes=("diffuse", "specular")))
+    compare_scene(options(tmp_path, passes=("diffuse", "specular"), reference_samples=20))
+    layers = written(tmp_path)
+    assert [title.split()[1] for title, _, _ in sheets] == ["combined", "specular", "diffuse"]
+    for (_, (_, image), tiles), names in zip(
+        sheets, (("specular", "diffuse"), ("specular",), ("diffuse",)), strict=True
+    ):
+        assert np.allclose(image, sum(layers[f"cycles.{name}"] for name in names))
+        assert np.allclose(tiles[1].image, sum(layers[f"ltsh4.{name}"] for name in names))
+        missing = (layers["coverage.hit"] > 0.0) & ~layers["reference.specular"].any(axis=2)
+        assert np.array_equal(tiles[2].missing, missing) and missing.any() and tiles[0].missing is None
+    compare_scene(options(tmp_path, passes=("diffuse",), techniques=("ltsh2",)))
+    assert len(sheets) == 4 and "diffuse" in sheets[3][0]
+
+
+def test_the_passes_and_techniques_that_were_asked_for_alone(child, tmp_path):
     report = compare_scene(options(tmp_path, passes=("diffuse",), techniques=("ltsh2",)))
     check_schema(report, pixels=18, samples=35, passes=("diffuse",), techniques=("ltsh2",))
-    layers = written(tmp_path)
     assert report["reference"] is None
-    assert not [name for name in layers if "specular" in name and not name.startswith("samples.")]
-    title, (_, image), tiles = sheets[1]
-    assert "specular" in sheets[0][0] and "diffuse" in title and np.allclose(image, layers["cycles.diffuse"])
-    assert np.allclose(tiles[0].image, layers["ltsh2.diffuse"])
+    assert not [name for name in written(tmp_path) if "specular" in name and not name.startswith("samples.")]
 
 
 def test_no_samples_at_all(monkeypatch, tmp_path):

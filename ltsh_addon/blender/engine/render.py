@@ -95,6 +95,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
         job = _job_of(self, depsgraph)
         scene_file = saved_copy()
         picture = stoppable(lambda report: final_picture(job, scene_file, report), self._progress())
+        for problem in picture.problems:
+            self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:
             self.report({"WARNING"}, warning)
         for name in picture.passes:
@@ -172,6 +174,7 @@ class FinalPicture:
     combined: np.ndarray
     passes: dict[str, np.ndarray]
     warnings: tuple[str, ...]
+    problems: tuple[str, ...] = ()
 
 
 def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
@@ -206,7 +209,8 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     if job.shown == "combined":
         color = color + emission
     coverage = inside_border(extraction.film.coverage(), extraction.border)
-    return FinalPicture(_over_background(color, coverage, job, extraction.exposure), passes, extraction.warnings)
+    combined = _over_background(color, coverage, job, extraction.exposure)
+    return FinalPicture(combined, passes, extraction.warnings, extraction.problems)
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -205,7 +205,8 @@ class ObjectBake:
                 plan.show(number)
             # With a fixed seed the bytes do not depend on what was baked before.
             self.scene.cycles.seed, self.scene.cycles.samples = 0, 1
-            found.append(self._bake(block, "EMIT", set()))
+            with render_settings.without_scripts(self.scene):
+                found.append(self._bake(block, "EMIT", set()))
         return np.array(found)
 
     def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
@@ -472,6 +473,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     shutil.copyfile(read.mesh, folder / "mesh.npz")
     distinct = list({id(plan): plan for plan in plans}.values())
     record = {"folder": folder.name, "uv": read.uv_name, "materials": [plan.record() for plan in plans]}
+    record["unshaded"] = [opened.lobes[slot.material.name_full].unshaded for slot in ob.material_slots]
     record |= {"warnings": warnings, "receiver": int(ob.get(RECEIVER_PROPERTY, 0))}
     used = sorted({texture["uv"] for plan in plans for texture in plan.textures})
     record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}

@@ -29,6 +29,7 @@ from ..render_settings import (
     render_exr,
     shifted_pixels,
     sub_pixel_offsets,
+    without_scripts,
     working_space,
 )
 from .origin import move_to_origin
@@ -42,7 +43,7 @@ def render_pixel_samples(
     enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
     files, offsets = [], sub_pixel_offsets(scene, sub_samples)
-    with pinned_pixel_filter(scene):
+    with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
@@ -176,7 +177,8 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     inventory.origin = origin
     default = give_default_material(bare)
-    of_materials = inject_aovs(materials + ([default] if default else []), inventory.emitting_materials)
+    materials += [default] if default else []
+    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded)
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -226,6 +228,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "lights": [light_record(light) for light in inventory.lights],
         "origin": inventory.origin.tolist(),
         "warnings": warnings,
+        "unshaded": inventory.unshaded,
         "samples": samples,
         "reference": reference,
         "passes": render_settings.pass_names(),

@@ -13,8 +13,11 @@ from dataclasses import dataclass
 import bpy
 
 from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from ...scene import listed
+from ..render_settings import SCRIPT
 from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
 from .graph import (
+    CLEAR,
     MIX,
     Factor,
     Leaf,
@@ -28,6 +31,7 @@ from .graph import (
     fill_with_bsdf,
     is_constant,
     is_group,
+    is_seen_through,
     is_socket,
     live_link,
     material_output,
@@ -35,13 +39,16 @@ from .graph import (
     product,
     shaders_behind,
     total,
+    value_of,
 )
 
-# Nodes that send rays from where they are evaluated, and what is said of them.
-TRACING_NODES = {
+# Nodes of values that are not what Cycles makes of them, and what is said of them.
+NOTED_NODES = {
     "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
     "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
+    SCRIPT: "is Open Shading Language, which is not read: what it feeds keeps the value of its own socket",
 }
+LEFT_OUT = "left out of the Cycles reference as well"
 # Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
 RECEIVER_PROPERTY = "ltsh_receiver"
 
@@ -54,6 +61,7 @@ class MaterialLobes:
     values: tuple[dict, ...]  # of `bsdfs.lobe_values`, and the weight
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
+    unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
@@ -64,19 +72,21 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    cut(output.inputs["Volume"])
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
             bypass(found.node, live_link(found.other).from_socket)
         else:
             cut(found.clear)
-    if not shaders.leaves:
-        # Without any shader Cycles shows black, and counts AOVs twice; a black BSDF looks the same.
-        black = tree.nodes.new("ShaderNodeBsdfDiffuse")
-        black.inputs["Color"].default_value = (0.0, 0.0, 0.0, 1.0)
-        tree.links.new(black.outputs[0], surface)
-    elif all(leaf.is_transparent for leaf in shaders.leaves):
-        return MaterialLobes((), (), warnings, is_transparent=True)
+    is_clear = is_seen_through(output, shaders)
+    cut(output.inputs["Volume"])
+    if is_clear:
+        _show(surface, CLEAR, 1.0)
+    elif not shaders.leaves:
+        # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
+        _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
+    if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
+        unshaded = f"material {material.name!r} is transparent"
+        return MaterialLobes((), (), warnings, is_transparent=True, unshaded=unshaded)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             cut(leaf.node.inputs["Alpha"])
@@ -87,20 +97,32 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     weights = [weight_of(leaf) for leaf in leaves]
     shares = [{} if is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
     values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
-    return MaterialLobes(tuple(leaves), values, warnings)
+    unknown = [leaf.node.name for leaf in shaders.leaves if bsdf_of(leaf.node) is None and not is_emission(leaf.node)]
+    unshaded = ""
+    if unknown and not leaves:
+        unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
+    return MaterialLobes(tuple(leaves), values, warnings, unshaded=unshaded)
+
+
+def _show(surface, node_type: str, level: float) -> None:
+    """Link a new node of a gray `level` to the input `surface`."""
+    node = surface.id_data.nodes.new(node_type)
+    node.inputs["Color"].default_value = (level, level, level, 1.0)
+    surface.id_data.links.new(node.outputs[0], surface)
 
 
 def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
     """What of a material is not shaded as Cycles does; `emitter`: it is a light. Nothing is changed."""
-    notes = []
+    notes, leaves = [], shaders.leaves
     if live_link(output.inputs["Volume"]) is not None:
-        notes.append("its volume is not shaded; left out of the Cycles reference as well")
-    notes += [f"node {node.name!r} {TRACING_NODES[node.bl_idname]}" for node in _tracing_nodes(output.id_data)]
+        notes.append(f"its volume is not shaded{'' if leaves else ', it is seen through'}; {LEFT_OUT}")
+    elif not leaves:
+        notes.append("it has no surface shader and is black, as in Cycles")
+    notes += [f"node {node.name!r} {NOTED_NODES[node.bl_idname]}" for node in _noted_nodes(output.id_data)]
     for found in shaders.cuts:
         notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
-    leaves = shaders.leaves
     if all(leaf.is_transparent for leaf in leaves):
-        return notes
+        return notes + _tinted(leaves)
     if not emitter and any(is_emission(leaf.node) or emits(leaf.node) for leaf in leaves):
         notes.append("emission is not shaded and lights nothing, in the Cycles reference neither")
     notes += [note for leaf in leaves if not is_emission(leaf.node) for note in notes_of(leaf.node)]
@@ -111,6 +133,14 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
     return notes
 
 
+def _tinted(leaves) -> list[str]:
+    """Notes about transparency that is not clear."""
+    white = 1.0, 1.0, 1.0
+    nodes = [leaf.node for leaf in leaves if leaf.node.bl_idname == CLEAR]
+    nodes = [node for node in nodes if not is_constant(value_of(node.inputs["Color"]), white)]
+    return [f"node {node.name!r} is shaded as clear; its color is {LEFT_OUT}" for node in nodes]
+
+
 def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
     """The MAX_LOBES leaves with a lobe that have the largest weights, as far as constants tell, and those beyond."""
     leaves = [leaf for leaf in shaders.leaves if bsdf_of(leaf.node) is not None]
@@ -118,14 +148,14 @@ def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
     return [leaves[index] for index in sorted(order[:MAX_LOBES])], [leaves[index] for index in order[MAX_LOBES:]]
 
 
-def _tracing_nodes(tree) -> list:
-    """Nodes of TRACING_NODES in `tree` and its groups that feed something."""
+def _noted_nodes(tree) -> list:
+    """Nodes of NOTED_NODES in `tree` and its groups that feed something."""
     found = []
     for node in tree.nodes:
         if is_group(node) and node.node_tree is not None:
-            found += _tracing_nodes(node.node_tree)
-        elif node.bl_idname in TRACING_NODES and not node.mute and any(socket.is_linked for socket in node.outputs):
-            found.append(node)
+            found += _noted_nodes(node.node_tree)
+        elif node.bl_idname in NOTED_NODES and not node.mute:
+            found += [node] * any(socket.is_linked and socket.type != "SHADER" for socket in node.outputs)
     return found
 
 
@@ -171,11 +201,15 @@ class _Weights:
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
-def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list[str]:
+def inject_aovs(
+    materials: list, emitters: frozenset[str] = frozenset(), unshaded: list[str] | None = None
+) -> list[str]:
     """Make every material write its lobes into AOVs; warnings.
 
-    Materials light nothing, but for those with a full name in `emitters`.
+    Materials light nothing, but for those with a full name in `emitters`. A material that is not shaded at all writes
+    -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry.
     """
+    unshaded = [] if unshaded is None else unshaded
     found, warnings = [], []
     for material in materials:
         ensure_nodes(material)
@@ -187,6 +221,9 @@ def inject_aovs(materials: list, emitters: frozenset[str] = frozenset()) -> list
         if not lobes.is_transparent:
             found.append(lobes)
             _write_hit(material)
+            if lobes.unshaded:
+                unshaded.append(lobes.unshaded)
+                _write_aov(material.node_tree, lobe_aov("kind", 0), -len(unshaded))
     # A slot has the same AOVs in all materials.
     for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
         users = [lobes for lobes in found if len(lobes.leaves) > slot]

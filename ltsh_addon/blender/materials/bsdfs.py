@@ -13,9 +13,9 @@ import numpy as np
 from ...cycles.closures import f82_dip
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS
 from ...shading.brdf import schlick_curve
-from .graph import is_constant, is_socket, live_link, product, value_of
+from .graph import PRINCIPLED, is_constant, is_socket, live_link, product, value_of
 
-PRINCIPLED, EMISSION = "ShaderNodeBsdfPrincipled", "ShaderNodeEmission"
+EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 NOT_SUPPORTED = "is not supported, it is not shaded"
@@ -78,7 +78,9 @@ BSDFS = {
         CONDUCTOR, {**ROUGHNESS, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
     (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo"),
-    (SHEEN, "ASHIKHMIN"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
+    (SHEEN, "ASHIKHMIN"): Bsdf(
+        "velvet", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo, and in Cycles' passes it is specular"
+    ),
     # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
     (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
     ("ShaderNodeSubsurfaceScattering", ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),

@@ -14,15 +14,18 @@ from typing import Any
 
 import bpy
 
+from ..render_settings import SCRIPT
+
 MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
-TRANSPARENT_NODES = ("ShaderNodeBsdfTransparent", "ShaderNodeHoldout")
+CLEAR, HOLDOUT, PRINCIPLED = "ShaderNodeBsdfTransparent", "ShaderNodeHoldout", "ShaderNodeBsdfPrincipled"
 GROUP_SOCKET_NAME = "ltsh"
 
 
 def live_link(socket):
-    """The link that feeds the input `socket`, or None."""
+    """The link that feeds the input `socket`, or None. No values are read from Open Shading Language."""
     for link in socket.links:
-        if not link.is_muted and link.is_valid:
+        is_script = link.from_node.bl_idname == SCRIPT and not link.from_node.mute and socket.type != "SHADER"
+        if not link.is_muted and link.is_valid and not is_script:
             return link
     return None
 
@@ -137,6 +140,15 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
     return None if entry is None else source_of(entry, groups, tree_of)
 
 
+def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:
+    """The number at the input `socket` inside of `groups`; None where nodes compute it. `tree_of` as there."""
+    source = source_of(socket, groups, tree_of)
+    if source is None or (source.node is not None and source.node.bl_idname != "ShaderNodeValue"):
+        return None
+    value = getattr(source.socket, "default_value", None)
+    return float(value) if isinstance(value, (int, float)) else None
+
+
 @dataclass(frozen=True)
 class Factor:
     """What a Mix Shader node multiplies one of its shaders by: its factor, clamped to [0, 1], or 1 minus that."""
@@ -181,7 +193,10 @@ class Leaf:
     @property
     def is_transparent(self) -> bool:
         """True for nodes that only let light through."""
-        return self.node.bl_idname in TRANSPARENT_NODES
+        if self.node.bl_idname == PRINCIPLED:
+            alpha = constant_of(self.node.inputs["Alpha"], self.groups)
+            return alpha is not None and alpha <= 0.0
+        return self.node.bl_idname in (CLEAR, HOLDOUT)
 
     @property
     def lobe_terms(self) -> tuple[tuple[Factor, ...], ...]:
@@ -239,8 +254,9 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
         return SurfaceShaders([leaf], is_transparent=leaf.is_transparent)
     sockets = [socket for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == MIX:
-        share = Factor(node, groups, False, False).constant
-        if share in (0.0, 1.0):
+        share = constant_of(node.inputs[0], groups, tree_of)
+        if share is not None and not 0.0 < share < 1.0:
+            share = min(max(share, 0.0), 1.0)
             return shaders_behind(sockets[int(share)], groups, tree_of)
     else:
         sockets = [socket for socket in sockets if live_link(socket) is not None]
@@ -259,6 +275,13 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
         if not (is_cut and part.is_transparent):
             found._add(part, *factors)
     return found
+
+
+def is_seen_through(output, shaders: SurfaceShaders) -> bool:
+    """True for materials whose surface does nothing; `shaders` are those at the Surface of the material's `output`."""
+    if shaders.leaves:
+        return all(leaf.is_transparent and leaf.node.bl_idname != HOLDOUT for leaf in shaders.leaves)
+    return live_link(output.inputs["Volume"]) is not None
 
 
 def bypass(node, source) -> None:

@@ -7,11 +7,21 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...cycles.closures import sheen_albedo
+from ...cycles.closures import sheen_albedo, velvet_albedo
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
-from .graph import Factor, Leaf, Source, SurfaceShaders, shaders_behind, source_of, surface_of, tree_in_use
+from .graph import (
+    Factor,
+    Leaf,
+    Source,
+    SurfaceShaders,
+    is_seen_through,
+    shaders_behind,
+    source_of,
+    surface_of,
+    tree_in_use,
+)
 from .values import ImageUse, Value, constant, constant_inputs, input_value, value_at
 
 # Quantities that may come from an image; all others are constants.
@@ -72,8 +82,9 @@ class Look:
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
+    is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # of a node that is not shaded
-    albedo: float = 1.0  # of sheen: the mean over all views, by which its color is shown
+    albedo: float = 1.0  # of sheen and velvet: the mean over all views, by which its color is shown
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -106,10 +117,13 @@ def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
     return Look("diffuse", {"color": constant(color)}, notes=notes)
 
 
-def mean_sheen_albedo(roughness: float) -> float:
-    """Share of uniform light that sheen of `roughness` reflects."""
+ALBEDOS = {"sheen": sheen_albedo, "velvet": velvet_albedo}
+
+
+def mean_albedo(kind: str, roughness: float) -> float:
+    """Share of uniform light that sheen or velvet of `roughness` reflects."""
     cosine = (np.arange(64) + 0.5) / 64.0
-    return float(np.average(sheen_albedo(cosine, np.full(64, roughness)), weights=cosine))
+    return float(np.average(ALBEDOS[kind](cosine, np.full(64, roughness)), weights=cosine))
 
 
 def default_look() -> Look:
@@ -134,7 +148,11 @@ def look_of(material) -> Look:
     if bpy.app.version < (5, 0, 0) and not material.use_nodes:
         return plain_look(material.diffuse_color)
     surface = surface_of(material)
-    return plain_look(0.0) if surface is None else _Reader(material, shaders_behind(surface)).look()
+    if surface is None:
+        return plain_look(0.0)
+    shaders = shaders_behind(surface)
+    look = _Reader(material, shaders).look()
+    return replace(look, is_clear=True) if is_seen_through(surface.node, shaders) else look
 
 
 @dataclass(frozen=True)
@@ -283,10 +301,10 @@ class _Reader:
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
-        if bsdf.kind == "sheen":
+        if bsdf.kind in ALBEDOS:
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
             roughness = values["roughness"]
-            look = replace(look, albedo=mean_sheen_albedo(roughness.offset[0] if roughness.is_constant else 0.5))
+            look = replace(look, albedo=mean_albedo(bsdf.kind, roughness.offset[0] if roughness.is_constant else 0.5))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look

@@ -16,7 +16,8 @@ from ...cycles.horizons import end_at_horizons_of_cycles
 from ...files import replacing_by_copy, temporary_folder
 from ...imaging.color import identified
 from ...imaging.exr import read_channels
-from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples
+from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples, listed
+from ...shading.light_polygons import has_lobe, lights_that_reach_nothing
 from .blender_process import run_child
 
 
@@ -37,6 +38,8 @@ class ExtractOptions:
     emission: bool = False  # also what the surfaces themselves emit
 
 
+# Materials, or other reasons, that an error names.
+REASONS = 5
 # Fields of `Extraction` that are those of the manifest.
 UNCHANGED = ("blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter")
 
@@ -50,7 +53,7 @@ class Extraction:
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
     the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
-    exposure; None where it was not asked for.
+    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded.
     """
 
     lights: tuple[AreaLight, ...]
@@ -68,6 +71,7 @@ class Extraction:
     pixel_filter: str = "BOX"
     color_space: ColorSpace = REC709
     emission: np.ndarray | None = None
+    problems: tuple[str, ...] = ()
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -84,9 +88,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     check_readable(scene)
     with temporary_folder() as folder:
         manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
-        samples, film, warnings = _read_samples(manifest, folder)
+        samples, film, warnings, problems = _read_samples(manifest, folder)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         warnings += gbuffer.rounded_positions(samples.position, lights)
+        if not problems:
+            warnings += unlit(samples, lights, manifest["camera"])
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
@@ -95,6 +101,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             samples=end_at_horizons_of_cycles(samples, lights),
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
+            problems=tuple(problems),
             reference=read_reference(manifest, folder),
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
@@ -109,29 +116,47 @@ def build_demo(path: Path, *, progress: Progress | None = None) -> None:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
-def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str]]:
-    """Samples and film of all sample renders, and warnings about pixels that could not be sampled."""
+def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str], list[str]]:
+    """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded."""
     width, height = manifest["width"], manifest["height"]
-    renders, unusable, unnamed = [], 0, 0
-    for index, name in enumerate(manifest["samples"]):
+    materials = manifest.get("unshaded", [])
+    renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
+    for name in manifest["samples"]:
         channels = _rendered(folder / name)
         gbuffer.clear_holdouts(channels)
         samples, pixel, bad = gbuffer.surface_samples(channels, manifest["passes"]["diffuse_color"])
         renders.append((samples, pixel))
         unusable += bad
-        if index == 0:
-            unnamed = gbuffer.surfaces_without_sample(channels) if len(manifest["samples"]) == 1 else 0
+        unnamed += gbuffer.surfaces_without_sample(channels)
+        unshaded += gbuffer.unshaded_hits(channels, len(materials))
     samples, film = gbuffer.join(renders, width, height)
     warnings = []
     if unusable:
         what = "transparent surfaces in front of others, or not finite, or too far away"
         warnings.append(f"{unusable} samples are not shaded: {what}")
     if unnamed:
-        warnings.append(f"{unnamed} pixels show a surface whose material could not be read: not shaded")
+        warnings.append(f"{unnamed} samples see a surface whose material could not be read: not shaded")
     warnings += gbuffer.coarse_meshes(samples)
+    shaded = len(samples) if film.first is None else int(film.first.sum())
+    seen, lost = shaded + unusable + unnamed, unusable + unnamed + int(unshaded.sum())
+    if 2 * lost > seen:
+        share, camera = f"{100.0 * lost / seen:.3g} %", manifest["camera"]
+        reasons = [materials[number] for number in np.argsort(-unshaded, kind="stable") if unshaded[number]]
+        reasons = listed([*reasons, *warnings[: (unusable > 0) + (unnamed > 0)]], REASONS, "; ")
+        return samples, film, warnings, [f"{share} of what camera {camera!r} sees is not shaded: {reasons}"]
     if len(samples) == 0:
         warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
-    return samples, film, warnings
+    return samples, film, warnings, []
+
+
+def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -> list[str]:
+    """The warning about lights that reach nothing of what the camera sees."""
+    if not has_lobe(samples).any():
+        return [f"nothing that camera {camera!r} sees reflects light: the picture is black"] if len(samples) else []
+    unseen = lights_that_reach_nothing(samples, lights)
+    if unseen and len(unseen) == len({light.name for light in lights}):
+        return [f"no light reaches what camera {camera!r} sees: the picture is black; turn or move a light"]
+    return [f"nothing that camera {camera!r} sees is lit by {listed(map(repr, unseen))}"] if unseen else []
 
 
 def _read_emission(manifest: dict, folder: Path) -> np.ndarray:

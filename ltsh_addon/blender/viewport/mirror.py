@@ -140,8 +140,8 @@ class ShownLook:
 
     @property
     def lobes(self) -> tuple[ShownLook, ...]:
-        """This lobe and the further ones."""
-        return (self, *self.further)
+        """This lobe and the further ones; none of what is seen through."""
+        return () if self.look.is_clear else (self, *self.further)
 
 
 @dataclass(frozen=True)

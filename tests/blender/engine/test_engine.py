@@ -257,6 +257,11 @@ def test_faults_fail_the_render_with_their_reason(scene, monkeypatch):
         with pytest.raises(RuntimeError, match="LTSH: ZeroDivisionError: division by zero"):
             bpy.ops.render.render()
     assert bpy.ops.render.render() == {"FINISHED"}
+    fur, _ = parts.bsdf_material("ShaderNodeBsdfHair", "Fur")
+    parts.add_plane(fur, size=40.0, location=(0.0, 0.0, 0.5), name="Cover")
+    with pytest.raises(RuntimeError, match="LTSH: .* % of what camera 'Camera' sees is not shaded: material 'Fur'"):
+        bpy.ops.render.render()
+    bpy.data.objects.remove(bpy.data.objects["Cover"])
     bpy.data.objects.remove(bpy.data.objects["Light"])
     with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
         bpy.ops.render.render()

@@ -4,6 +4,7 @@ Seen by an orthographic camera, a surface whose UV map is its projection has the
 of the centers of pixels. So nothing is interpolated, and each texel is held against one pixel.
 """
 
+import bpy
 import numpy as np
 import pytest
 import scene_parts
@@ -13,7 +14,9 @@ from material_scenes import Build
 from scene_parts import bsdf_material, principled
 
 from ltsh_addon import imaging
+from ltsh_addon.blender import render_settings
 from ltsh_addon.cycles import closures
+from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.picture import make_picture
 
@@ -121,3 +124,28 @@ def test_the_albedos_of_sheen_are_those_of_this_cycles():
     assert len(albedo) == 96**2 and albedo.max() > 0.7 and cosine.min() < 0.01 and cosine.max() > 0.99
     # Half precision would leave 2e-4; the nodes were fitted to 512 x 512 pixels.
     assert np.abs(closures.sheen_albedo(cosine, roughness) - albedo).max() < 1e-4
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.9])
+def test_the_albedos_of_velvet_are_those_of_this_cycles(tmp_path, roughness):
+    """A ball under a sky of radiance 1 shines as bright as its albedo. 1024 samples of a lobe that Cycles samples
+    uniformly leave 1 % of noise where few of them count, at the rough end less."""
+    scene = scene_parts.empty_scene(16, 16)
+    made, node = bsdf_material("ShaderNodeBsdfSheen", Color=(1.0, 1.0, 1.0, 1.0), Roughness=roughness)
+    node.distribution = "ASHIKHMIN"
+    scene_parts.add_sphere(made, radius=1.0, segments=128)
+    scene_parts.add_top_camera(2.0)
+    scene_parts.add_white_world()
+    scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 1024, 0
+    scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
+    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 0.01
+    render_settings.enable_passes(bpy.context.view_layer, ("combined", "normal", "glossy_direct", "glossy_color"))
+    render_settings.render_exr(scene, tmp_path / "velvet.exr")
+    channels = imaging.read_channels(tmp_path / "velvet.exr")
+    names = render_settings.pass_names()
+    light, color = (read_layer(channels, names[f"specular_{part}"], "RGB")[..., 0] for part in ("light", "color"))
+    normal = read_layer(channels, "Normal", "XYZ")
+    seen = np.linalg.norm(normal, axis=-1) > 0.9
+    expected = (light * color)[seen]
+    found = closures.velvet_albedo(normal[seen][:, 2], np.full(seen.sum(), roughness))
+    assert expected.max() > 0.5 and np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)

@@ -100,6 +100,18 @@ def add_sphere(material=None, radius=0.8, name="Sphere", smooth=True, segments=3
     return ob
 
 
+def add_white_world():
+    """A sky of radiance 1."""
+    world = bpy.data.worlds.new("World")
+    if bpy.app.version < (5, 0, 0):
+        world.use_nodes = True
+    world.node_tree.nodes.clear()
+    sky = add_node(world.node_tree, "ShaderNodeBackground", Color=(1.0, 1.0, 1.0, 1.0), Strength=1.0)
+    output = world.node_tree.nodes.new("ShaderNodeOutputWorld")
+    world.node_tree.links.new(sky.outputs[0], output.inputs["Surface"])
+    bpy.context.scene.world = world
+
+
 def new_material(name="Material"):
     """A material with an empty node tree but for its output; (material, tree, output)."""
     material = bpy.data.materials.new(name)

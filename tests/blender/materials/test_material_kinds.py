@@ -7,16 +7,18 @@ import pytest
 import scene_parts
 from scene_parts import bsdf_material
 
+from ltsh_addon.cycles import gbuffer
 from ltsh_addon.pipeline import PictureOptions, compare_scene
+from ltsh_addon.shading import shade
 
 COLOR, TINT = (0.8, 0.5, 0.2, 1.0), (0.3, 0.6, 0.9, 1.0)
 GLOSSY, METALLIC, GLASS = "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 CYCLES_SAMPLES = 512
 
 
-def material(node_type="ShaderNodeBsdfPrincipled", bump=False, textured=(), settings=(), **inputs):
+def material(node_type="ShaderNodeBsdfPrincipled", bump=False, textured=(), settings=(), name="Material", **inputs):
     """A material of one BSDF; its sockets are those of `inputs`, or fed by the texture coordinates if in `textured`."""
-    made, node = bsdf_material(node_type)
+    made, node = bsdf_material(node_type, name)
     for name, value in settings:
         setattr(node, name, value)
     for name, value in {"Color": COLOR, "Base Color": COLOR, "Roughness": 0.5, **inputs}.items():
@@ -101,6 +103,27 @@ def test_an_approximated_material_is_named_and_near(tmp_path, name):
         squared = found[lobe, "reference"][0]
         assert (squared is None) == (tolerance is None)
         assert tolerance is None or percent(squared) < tolerance, (lobe, percent(squared))
+
+
+def test_velvet_is_shaded_as_diffuse_light_of_its_albedo(tmp_path):
+    """Cycles counts it as specular; beside a dielectric, whose diffuse part stays what it is in Cycles. The lobe itself
+    is not diffuse: 25 % as measured."""
+    scene_parts.empty_scene(*material_scenes.SIZE)
+    velvet = material("ShaderNodeBsdfSheen", settings=(("distribution", "ASHIKHMIN"),), Roughness=1.0)
+    material_scenes.build(velvet)
+    bpy.data.objects["Plane"].data.materials[0] = material(name="Floor")
+    prepared = scene_parts.prepare()
+    assert len(prepared[3]) == 1 and "shaded as a Diffuse BSDF of the same albedo" in prepared[3][0]
+    ((samples, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
+    halves = scene_parts.reference(tmp_path, prepared, 256)
+    samples, film = gbuffer.join([(samples, pixel)], *material_scenes.SIZE)
+    shaded = shade(samples, prepared[2].lights, "reference", workers=1)
+    ours = {name: film.image(getattr(shaded, name).sum(axis=0)) for name in halves}
+    cycles = {name: image.mean(axis=0) for name, image in halves.items()}
+    ball = (cycles["diffuse"] == 0.0).all(axis=-1) & (film.coverage() > 0.0)
+    assert ball.sum() > 10 and not ours["specular"][ball].any()
+    assert ours["diffuse"][ball].sum() == pytest.approx(cycles["specular"][ball].sum(), rel=0.25)
+    assert ours["diffuse"][~ball].sum() == pytest.approx(cycles["diffuse"][~ball].sum(), rel=0.01)
 
 
 def test_backs_of_glass_reflect_like_the_inside(tmp_path):

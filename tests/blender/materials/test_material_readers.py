@@ -28,7 +28,7 @@ KINDS = {
     ("BsdfMetallic", "F82"): "metal",
     ("BsdfMetallic", "PHYSICAL_CONDUCTOR"): CONDUCTOR,
     ("BsdfSheen", "MICROFIBER"): "sheen",
-    ("BsdfSheen", "ASHIKHMIN"): "diffuse",
+    ("BsdfSheen", "ASHIKHMIN"): "velvet",
     ("BsdfToon", "DIFFUSE"): "diffuse",
     ("SubsurfaceScattering", ""): "diffuse",
 }
@@ -91,7 +91,7 @@ def lobes_of_aovs(material):
     aovs = written_aovs(copy.node_tree)
     lobes = []
     for slot in range(MAX_LOBES):
-        if aovs.get(f"ltsh_kind_{slot}", 0.0):
+        if aovs.get(f"ltsh_kind_{slot}", 0.0) > 0.0:
             kind = KIND_NAMES[round(aovs[f"ltsh_kind_{slot}"])]
             weight, color = aovs.get(f"ltsh_weight_{slot}", 1.0), aovs[f"ltsh_color_{slot}"]
             lobes.append((kind, weight, color[0], aovs.get(f"ltsh_roughness_{slot}", 0.0)))

@@ -35,6 +35,19 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
 
 
 @edits_with_graphics
+def test_what_does_nothing_is_seen_through():
+    _, camera = patches_of([chalk] * 4)
+    ((expected, _),) = with_graphics(lambda: [viewport_picture(camera, "combined", False)])
+    for number, kind in enumerate(("BsdfTransparent", "VolumePrincipled")):
+        material, tree, output = parts.new_material("Air")
+        tree.links.new(tree.nodes.new(f"ShaderNode{kind}").outputs[0], output.inputs["Volume" if number else "Surface"])
+        parts.add_plane(material, size=8.0, location=(0.0, 0.0, 0.3 + 0.1 * number), name="Air")
+    bpy.context.view_layer.update()
+    ((picture, _),) = with_graphics(lambda: [viewport_picture(camera, "combined", False)])
+    assert expected.any() and np.array_equal(picture, expected)
+
+
+@edits_with_graphics
 def test_what_glows_is_as_bright_as_it_is_and_hidden_by_what_is_nearer():
     glow = (0.2, 0.4, 0.9)
 

@@ -11,7 +11,7 @@ from ltsh_addon import shading
 from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.materials.looks import look_of
-from ltsh_addon.cycles.closures import sheen_albedo
+from ltsh_addon.cycles.closures import sheen_albedo, velvet_albedo
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)
@@ -219,13 +219,16 @@ def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter
     assert look.weight == 1.0
 
 
-def test_microfiber_sheen_reflects_what_it_does_on_average_and_is_named():
+@pytest.mark.parametrize(
+    ("distribution", "kind", "albedo"), [("MICROFIBER", "sheen", sheen_albedo), ("ASHIKHMIN", "velvet", velvet_albedo)]
+)
+def test_sheen_reflects_what_it_does_on_average_and_is_named(distribution, kind, albedo):
     parts.empty_scene()
-    look = look_of(made("Velvet", "BsdfSheen", {"Roughness": 0.4, "distribution": "MICROFIBER"})())
+    look = look_of(made("Velvet", "BsdfSheen", {"Roughness": 0.4, "distribution": distribution})())
     # Views that are as frequent as uniform light makes them: their cosine is the root of a uniform number.
     cosine = np.sqrt(np.random.default_rng(1).random(100_000))
-    wanted = sheen_albedo(cosine, np.full(len(cosine), 0.4))
-    assert look.kind == "sheen" and look.weight == 1.0
+    wanted = albedo(cosine, np.full(len(cosine), 0.4))
+    assert look.kind == kind and look.weight == 1.0
     assert look.albedo == pytest.approx(wanted.mean(), abs=5.0 * wanted.std() / len(wanted) ** 0.5)
     assert look.notes == ("Velvet: Sheen BSDF is shown as a Diffuse BSDF of its mean albedo",)
 

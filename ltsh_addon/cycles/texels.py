@@ -16,6 +16,8 @@ from .uv import Texels
 
 # Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
 SMALLEST_BAKED_COSINE = 0.2
+# And then to this one from the face.
+SMALLEST_FACE_COSINE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class BakeView:
     vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
     bent: bool = False
 
-    def towards(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Unit vectors (P, 3) from positions (P, 3) with normals (P, 3) towards the viewer."""
+    def towards(self, position: np.ndarray, normal: np.ndarray, true_normal: np.ndarray) -> np.ndarray:
+        """Unit vectors (P, 3) from positions (P, 3) with normals (P, 3) of the shading and the face to the viewer."""
         if self.kind == "above":
             return normal
         vector = np.array(self.vector, dtype=np.float64)
@@ -60,7 +62,10 @@ class BakeView:
         bent = unit(view - normal * (cosine - SMALLEST_BAKED_COSINE))
         # Surfaces that face away are seen the more along their normal, the more they do.
         behind = np.clip(-cosine, 0.0, 1.0)
-        return np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(bent * (1.0 - behind) + normal * behind))
+        view = np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(bent * (1.0 - behind) + normal * behind))
+        cosine = np.sum(view * true_normal, axis=-1, keepdims=True)
+        above = view - true_normal * (cosine - SMALLEST_FACE_COSINE)
+        return np.where(cosine > SMALLEST_FACE_COSINE, view, unit(above))
 
 
 @dataclass(frozen=True)
@@ -113,12 +118,13 @@ def texel_samples(
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
         true_normal = facets[triangle]
         flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
+        true_normal = np.where(flipped, -true_normal, true_normal)
         number = mesh.material[triangle]
         hits = Hits(
             position=position,
-            view=view.towards(position, smooth_normal),
+            view=view.towards(position, smooth_normal, true_normal),
             smooth_normal=smooth_normal,
-            true_normal=np.where(flipped, -true_normal, true_normal),
+            true_normal=true_normal,
             corrected=corrected[number],
             receiver=np.full(len(position), receiver),
             diffuse_albedo=None,

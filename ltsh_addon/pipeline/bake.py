@@ -191,9 +191,8 @@ class ObjectBaker:
                 written += named
             texture = None
             if options.apply:
-                layer = applied_layer(options)
-                record["texture"] = f"{stem}.{layer}{self._suffix(tile)}.exr"
-                texture = options.output / record["texture"], layer
+                record["texture"] = f"{stem}.{applied_layer(options)}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], _applied_parts(options)
                 written.append(record["texture"])
             planes.write(path, options.margin, self._metadata(tile), pictures, texture)
         return record, written
@@ -376,9 +375,17 @@ class TileRecords:
 
 
 def applied_layer(options) -> str:
-    """The layer that `apply` puts to use: of the first technique all light where it was asked for."""
-    pass_name = "combined" if "combined" in options.passes else options.passes[0]
-    return f"{next(iter(picture.technique_names(options.techniques)))}.{pass_name}"
+    """The layer that `apply` shows: of the first technique all light, or the first pass where only some is baked."""
+    parts = _applied_parts(options)
+    return parts[0] if len(parts) == 1 else f"{parts[0].rpartition('.')[0]}.combined"
+
+
+def _applied_parts(options) -> list[str]:
+    """The layers of the file whose sum `apply` shows."""
+    names = [name for name in PASSES if name in options.passes]
+    if "combined" in options.passes or len(names) < len(PASSES):
+        names = ["combined"] if "combined" in options.passes else options.passes[:1]
+    return [f"{next(iter(picture.technique_names(options.techniques)))}.{name}" for name in names]
 
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:

@@ -70,8 +70,8 @@ class Planes:
         return np.memmap(self._paths[name], dtype, mode="r")[index]
 
     def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
-        """Write the EXR with the margin filled, the ErrorPictures (or None) of it, and as `texture`, (path, layer), an
-        EXR with the colors of one layer."""
+        """Write the EXR with the margin filled, the ErrorPictures (or None) of it, and as `texture`, (path, layers), an
+        EXR with the sum of some layers."""
         height, width = self.shape
         rows = max(1, WRITTEN_TEXELS // width)
         for file in self._files.values():
@@ -87,7 +87,7 @@ class Planes:
                 block = self._filled(bottom, top, margin)
                 writer.write(block)
                 if small is not None:
-                    small.write({letter: block[f"{texture[1]}.{letter}"] for letter in "RGB"})
+                    small.write({letter: sum(block[f"{layer}.{letter}"] for layer in texture[1]) for letter in "RGB"})
                 if pictures is not None:
                     pictures.add(height - top, block)
             if pictures is not None:

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 # Blender's bake moves its sampling points by this much, in texels, so that centers exactly on an edge belong to one
 # side. The same here, for the same texels.
 NUDGE = (0.001, 0.002)
+# How many points Cycles' bake tries that are not on the triangle, before it takes the center.
+ATTEMPTS = 10
+# Triangles of less than half this area, in texels, Blender bakes at the center alone.
+SMALLEST_AREA = float(np.finfo(np.float32).eps)
+# Points that stand for what Cycles takes the mean of, and what keeps the weights of others from growing: moments of
+# the unit square are about a tenth.
+LATTICE = 64
+STIFFNESS = 1e-3
+GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
 _NO_ROW = 1 << 40
 # How far a triangle may stick out of its tile, in tiles: rounding, and no texel.
 TILE_TOLERANCE = 1e-4
@@ -65,6 +75,129 @@ class UvTriangles:
         triangle = owner[found]
         center = np.stack([found % self.width + 0.5, found // self.width + first_row + 0.5], axis=-1)
         return Texels(found, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
+
+    def spread(self, texels: Texels, number: int, count: int, width: float) -> Texels:
+        """`texels` at point `number` of `count`, whose mean tends to that of Cycles' bake.
+
+        Measured with Cycles 4.5.15 and 5.2.3: samples of a texel fill the part of a square of `width` texels around
+        its center that lies on the triangle of the center. Where ATTEMPTS random points of the square in a row miss
+        the triangle, a sample is at the center.
+        """
+        if count == 1:
+            return texels
+        # A lattice of golden ratios, symmetric about (1/2, 1/2).
+        u, v = (number + 0.5) / count, ((number - 0.5 * (count - 1)) * GOLDEN_RATIO + 0.5) % 1.0
+        half = 0.5 * width
+        moved = np.full((len(texels.index), 2), ((u - 0.5) * width, (v - 0.5) * width))
+        corners = self.corners[texels.triangle] - self.places(texels)[:, None]
+        outside = ~_contains_square(corners, half)
+        moved[outside] = _covered_point(corners[outside], half, u, v)
+        return replace(texels, barycentric=barycentric_of_nearest(corners, moved))
+
+    def places(self, texels: Texels) -> np.ndarray:
+        """Where the samples of texels are (Q, 2), in texels."""
+        return np.einsum("qcx,qc->qx", self.corners[texels.triangle], texels.barycentric)
+
+    def at(self, texels: Texels, points: np.ndarray) -> Texels:
+        """`texels` at points (Q, 2), in texels, of their triangles."""
+        return replace(texels, barycentric=barycentric_of_nearest(self.corners[texels.triangle], points))
+
+
+@dataclass(frozen=True)
+class PointWeights:
+    """Weights of other points than those of `UvTriangles.spread`, with which what changes linearly or quadratically
+    over a texel has the same mean: least squares, as near to equal weights as can be."""
+
+    center: np.ndarray  # (Q, 2) in texels
+    half: float  # texels that stand for 1
+    mean: np.ndarray  # (Q, 5) of the `_moments` of the points
+    slope: np.ndarray  # (Q, 5)
+
+    @classmethod
+    def of(cls, triangles: UvTriangles, texels: Texels, points: Iterable[np.ndarray], width: float) -> PointWeights:
+        """For the `points`, each (Q, 2), in a square of `width` texels."""
+        center, half = triangles.places(texels), 0.5 * width
+        wanted = np.tile((0.0, 0.0, 1.0 / 3.0, 0.0, 1.0 / 3.0), (len(center), 1))
+        edge = np.flatnonzero(~_contains_square(triangles.corners[texels.triangle] - center[:, None], half))
+        some = replace(texels, triangle=texels.triangle[edge], barycentric=texels.barycentric[edge])
+        some = replace(some, index=texels.index[edge])
+        spread = (triangles.spread(some, number, LATTICE, width) for number in range(LATTICE))
+        wanted[edge] = sum(_moments((triangles.places(at) - center[edge]) / half) for at in spread) / LATTICE
+        count, total, products = 0, np.zeros((len(center), 5)), np.zeros((len(center), 5, 5))
+        for at in points:
+            moments = _moments((at - center) / half)
+            count, total = count + 1, total + moments
+            products += moments[:, :, None] * moments[:, None, :]
+        mean = total / count
+        spread = products / count - mean[:, :, None] * mean[:, None, :] + STIFFNESS * np.eye(5)
+        return cls(center, half, mean, np.linalg.solve(spread, (wanted - mean)[..., None])[..., 0])
+
+    def at(self, points: np.ndarray) -> np.ndarray:
+        """Of points (Q, 2), 1 on average."""
+        return 1.0 + np.sum((_moments((points - self.center) / self.half) - self.mean) * self.slope, axis=1)
+
+
+def _moments(offsets):
+    """x, y, x^2, xy, y^2 (Q, 5) of offsets (Q, 2)."""
+    x, y = offsets.T
+    return np.stack([x, y, x * x, x * y, y * y], axis=-1)
+
+
+def _contains_square(corners, half):
+    """Whether triangles (Q, 3, 2) contain the square of +-half around the origin, which is on each of them."""
+    start, side = corners, np.roll(corners, -1, axis=1) - corners
+    # Of the square the corner that is farthest beyond a side decides.
+    reach = half * np.abs(side).sum(axis=-1)
+    return (np.abs(cross(start, side)) >= reach).all(axis=1)
+
+
+def _covered_point(corners, half, u, v):
+    """The point (Q, 2) at (u, v), each from 0 to 1, of what triangles (Q, 3, 2) with the origin on them cover of the
+    square of +-half around it; equal areas for equal parts of the unit square but for what stands for the origin."""
+    ends = _borders(corners, half)
+    areas = np.abs(cross(ends[:, :, 0], ends[:, :, 1]))
+    total = areas.sum(axis=1)
+    missed = np.where(total > 2.0 * SMALLEST_AREA, 1.0 - np.minimum(total / (8.0 * half * half), 1.0), 1.0) ** ATTEMPTS
+    around = np.flatnonzero(u >= missed)
+    share = (u - missed[around]) / (1.0 - missed[around]) * total[around]
+    sums = np.cumsum(areas[around], axis=1)
+    which = np.minimum((sums <= share[:, None]).sum(axis=1), ends.shape[1] - 1)
+    rows = np.arange(len(around))
+    area = areas[around][rows, which]
+    share = np.divide(share - (sums[rows, which] - area), area, out=np.zeros(len(rows)), where=area > 0.0)
+    ends = ends[around][rows, which]
+    found = np.zeros((len(corners), 2))
+    found[around] = np.sqrt(v) * (ends[:, 0] + np.clip(share, 0.0, 1.0)[:, None] * (ends[:, 1] - ends[:, 0]))
+    return found
+
+
+def _borders(corners, half):
+    """Ends (Q, 7, 2, 2) of the borders of what triangles (Q, 3, 2) cover of the square of +-half around the origin:
+    the parts of the triangle's sides in the square, and of the square's in the triangle; equal ends where is none.
+    """
+    square = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
+    square = np.broadcast_to(square, (len(corners), 4, 2))
+    turn = np.sign(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[:, None]
+    parts = [_clipped(corners, square, np.ones_like(turn)), _clipped(square, corners, turn)]
+    return np.concatenate(parts, axis=1)
+
+
+def _clipped(polygons, clips, turn):
+    """Ends (Q, V, 2, 2) of the parts of the sides of `polygons` (Q, V, 2) inside of `clips` (Q, C, 2), of which `turn`
+    (Q, 1) is the sense of rotation."""
+    start, side = polygons, np.roll(polygons, -1, axis=1) - polygons
+    first, last = np.zeros(polygons.shape[:2]), np.ones(polygons.shape[:2])
+    for corner, following in zip(np.moveaxis(clips, 1, 0), np.moveaxis(np.roll(clips, -1, axis=1), 1, 0), strict=True):
+        edge = (following - corner)[:, None]
+        inside = turn * cross(edge, start - corner[:, None])
+        rate = turn * cross(edge, side)
+        at = np.divide(-inside, rate, out=np.where(inside < 0.0, np.inf, -np.inf), where=rate != 0.0)
+        first = np.where((rate > 0.0) | ((rate == 0.0) & (inside < 0.0)), np.maximum(first, at), first)
+        last = np.where(rate < 0.0, np.minimum(last, at), last)
+    last = np.maximum(first, last)
+    some = last > first
+    shares = np.stack([np.where(some, first, 0.0), np.where(some, last, 0.0)], axis=-1)
+    return start[:, :, None] + shares[..., None] * side[:, :, None]
 
 
 def _center_spans(corners, first_row, row_count, size):

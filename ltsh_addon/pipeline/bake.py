@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import shutil
@@ -147,8 +148,7 @@ class ObjectBaker:
         self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
         if not options.error:
             self.compared = ()
-        self._sample, self._raster = texel_samples, uv.UvTriangles
-        self._seams = uv.UvSeams.of
+        self._sample, self._seams = texel_samples, uv.UvSeams.of
 
     def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
         """Write the files of `tiles` (empty: of all) that are not finished according to `records`.
@@ -208,25 +208,30 @@ class ObjectBaker:
         options, covered, covers, overlaps, unshaded, lit = self.options, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
-        triangles = self._raster.in_tile(self.mesh.uv, *options.size, _place(tile))
+        points, spread = options.sub_samples, TilePoints(self, tile)
 
-        def shaded(first):
-            texels = triangles.texels(first, min(rows, height - first), options.conservative)
-            return first, texels, *self._block(tile, first, texels)
+        def shaded(task):
+            return *task, self._block(spread, *task)
 
-        firsts = range(0, height, rows)
-        for number, (first, texels, layers, halves) in enumerate(_in_order(shaded, firsts, self._threads())):
-            covered += len(texels.index)
-            covers += texels.covers
-            overlaps += texels.overlaps
-            unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
-            lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
-            planes.put(first, min(rows, height - first), texels, _channels(layers))
-            for pass_name, (a, b) in halves.items():
-                errors.add_halves(pass_name, a, b)
-                for name in self.tables:
-                    errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
-            share = (number + 1) / len(firsts)
+        tasks = [(first, point) for first in range(0, height, rows) for point in range(points)]
+        sums = {}
+        for number, (first, point, found) in enumerate(_in_order(shaded, tasks, self._threads())):
+            sums = {name: sums[name] + values for name, values in found.items()} if point else found
+            if point == points - 1:
+                texels = spread.texels(first)
+                layers = {name: values / points for name, values in sums.items()}
+                halves = self._add_cycles(layers, tile, first, texels)
+                covered += len(texels.index)
+                covers += texels.covers
+                overlaps += texels.overlaps
+                unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
+                planes.put(first, min(rows, height - first), texels, _channels(layers))
+                for pass_name, (a, b) in halves.items():
+                    errors.add_halves(pass_name, a, b)
+                    for name in self.tables:
+                        errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
+            share = (number + 1) / len(tasks)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
@@ -247,11 +252,9 @@ class ObjectBaker:
             layers += [f"error_{name}.{pass_name}" for name in self.tables]
         return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
 
-    def _block(self, tile, first, texels) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Layers (Q, 3) at the texels (Q) of a block, and Cycles' halves (2, Q, 3) by pass."""
-        maps = None
-        if self.record["maps"]:
-            maps = np.load(self.folder / f"maps_{tile}_{first}.npy")
+    def _block(self, spread, first, point) -> dict[str, np.ndarray]:
+        """Layers (Q, 3) at one point of each of the texels (Q) of a block."""
+        texels, maps, weights = spread.at(first, point)
 
         def read_map(number):
             return maps[number].reshape(-1, 3)[texels.index]
@@ -265,12 +268,16 @@ class ObjectBaker:
                 if len(self.groups) > 1:
                     for group, part in zip(self.groups, radiance, strict=True):
                         layers[f"{name}.{pass_name}@{group or 'ungrouped'}"] = part
+        return layers if weights is None else {name: values * weights[:, None] for name, values in layers.items()}
+
+    def _add_cycles(self, layers, tile, first, texels) -> dict[str, np.ndarray]:
+        """Add Cycles' bake of the texels and the signed errors to the layers (Q, 3); its halves as of `_halves`."""
         halves = self._halves(tile, first, texels)
         for pass_name, (a, b) in halves.items():
             mean = 0.5 * (a + b)
             layers |= {f"cycles.{pass_name}": mean, f"cycles_A.{pass_name}": a, f"cycles_B.{pass_name}": b}
             layers |= {f"error_{name}.{pass_name}": layers[f"{name}.{pass_name}"] - mean for name in self.tables}
-        return layers, halves
+        return halves
 
     def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
         """Cycles' bake of the texels by compared pass: two independent halves (2, Q, 3)."""
@@ -308,12 +315,60 @@ class ObjectBaker:
             "ltsh:object": self.record["name"],
             "ltsh:uv": self.record["uv"],
             "ltsh:tile": str(tile),
+            "ltsh:sub_samples": str(options.sub_samples),
             "ltsh:frame": str(self.manifest["frame"]),
             "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
             "ltsh:camera": self.manifest["camera"],
             "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
             "ltsh:version": picture.versions(self.manifest["blender_version"])["ltsh"],
         }
+
+
+class TilePoints:
+    """The points of the texels of a tile: of `UvTriangles.spread`, or where there are maps, those that they show."""
+
+    def __init__(self, baker: ObjectBaker, tile: int):
+        from ..cycles import uv
+
+        options = baker.options
+        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._width, self._weights = baker.manifest["sampled_texels"], uv.PointWeights.of
+        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
+        # Points of one block follow one another.
+        kept = functools.lru_cache(maxsize=cores() + 1)
+        self.texels, self._weights_of = kept(self._covered), kept(self._fitted_weights)
+
+    def at(self, first: int, point: int):
+        """The texels (Q) of the block from row `first` on at one of their points, the maps there (N, rows, W, 3), and
+        weights (Q,), 1 on average; None without maps, and where all points count the same."""
+        texels = self.texels(first)
+        if not self._mapped:
+            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+        maps = np.load(self._file(first, point))
+        if self._options.sub_samples == 1:
+            return texels, maps, None
+        places = self._places(texels, maps, first, point)
+        return self._triangles.at(texels, places), maps, self._weights_of(first).at(places)
+
+    def _covered(self, first):
+        rows = min(block_rows(self._options), self._options.size[1] - first)
+        return self._triangles.texels(first, rows, self._options.conservative)
+
+    def _file(self, first, point):
+        return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
+
+    def _places(self, texels, maps, first, point):
+        """Where the maps of a point show the texels, (Q, 2)."""
+        if point == 0:
+            return self._triangles.places(texels)
+        rows, width = maps.shape[1:3]
+        return maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
+
+    def _fitted_weights(self, first):
+        texels, points = self.texels(first), range(self._options.sub_samples)
+        maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
+        places = (self._places(texels, of_point, first, point) for of_point, point in maps)
+        return self._weights(self._triangles, texels, places, self._width)
 
 
 def _place(tile: int) -> tuple[int, int]:
@@ -428,6 +483,7 @@ def _report(options, manifest, records) -> dict:
         "scene": str(options.scene),
         "frame": manifest["frame"],
         "size": list(options.size),
+        "sub_samples": options.sub_samples,
         "view": manifest["view"],
         "objects": records,
         "problems": problems,

@@ -278,6 +278,10 @@ def _cycles_samples(what: str, default: int) -> Any:
     return option("--cycles-samples", default=default, type=cycles_samples, metavar="N", help=meaning)
 
 
+def _sub_samples(meaning: str) -> Any:
+    return option("--aa", default=1, type=positive, metavar="N", help=meaning)
+
+
 def _scripts() -> Any:
     return flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, which is not done otherwise")
 
@@ -296,9 +300,7 @@ class PictureOptions:
     resolution: tuple[int, int] | None = option(
         "--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file"
     )
-    sub_samples: int = option(
-        "--aa", default=1, type=positive, metavar="N", help="points per pixel, drawn from its filter; 1: pixel centers"
-    )
+    sub_samples: int = _sub_samples("points per pixel, drawn from its filter; 1: pixel centers")
     reference_samples: int = option(
         "--reference-samples", default=150_000, type=positive, metavar="N",
         help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
@@ -329,6 +331,7 @@ class BakeOptions:
     size: tuple[int, int] = option(
         "--size", default=(1024, 1024), type=size, metavar="N", help="N or WxH in texels (default: 1024)"
     )
+    sub_samples: int = _sub_samples("points per texel, spread as in Cycles' bake; 1: texel centers")
     margin: int = option("--margin", default=16, type=margin, metavar="PX", help="in texels (default: %(default)s)")
     margin_type: str = option(
         "--margin-type", default="extend", choices=MARGIN_TYPES,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.cycles.uv import NUDGE, UvTriangles, barycentric_of_nearest
+from ltsh_addon.cycles.uv import LATTICE, NUDGE, PointWeights, Texels, UvTriangles, barycentric_of_nearest
 
 WIDTH, HEIGHT = 61, 47
 
@@ -117,3 +117,62 @@ def test_triangles_without_area_or_number_cover_nothing():
     triangles = UvTriangles.in_tile(uv, 16, 16)
     assert len(triangles.texels(0, 16).index) == 0
     assert len(triangles.texels(0, 16, conservative=True).index) == 0
+
+
+def triangles_at_points(count):
+    """Triangles around points on them, from much smaller to much larger than a texel."""
+    generator = np.random.default_rng(5)
+    weights = generator.dirichlet((1.0, 1.0, 1.0), count)
+    corners = generator.normal(size=(count, 3, 2)) * 10.0 ** generator.uniform(-1.0, 1.0, (count, 1, 1))
+    corners += 7.0 - np.einsum("qcx,qc->qx", corners, weights)[:, None]
+    index = np.arange(count)
+    return UvTriangles(corners, 64, 64), Texels(index, index, weights, count, 0)
+
+
+@pytest.mark.parametrize("width", [0.5, 1.0])
+def test_spread_points_are_distributed_like_random_ones_that_are_tried_ten_times(width):
+    count, tried = 24, 4000
+    triangles, texels = triangles_at_points(count)
+    generator = np.random.default_rng(6)
+    spread = np.array([triangles.places(triangles.spread(texels, number, 256, width)) for number in range(256)])
+    for number in range(count):
+        random = 7.0 + width * (generator.random((tried, 10, 2)) - 0.5)
+        hit = inside(triangles.corners[[number]], random.reshape(-1, 2)).reshape(tried, 10)
+        found = np.where(hit.any(axis=1)[:, None], random[np.arange(tried), hit.argmax(axis=1)], 7.0)
+        for exponents in ((1, 0), (0, 1), (2, 0), (1, 1), (0, 2)):
+            moments = [np.prod((points - 7.0) ** exponents, axis=1) for points in (spread[:, number], found)]
+            # Five standard deviations of the random ones, and what 256 points leave: a hundredth of the range.
+            tolerance = 5.0 * moments[1].std() / tried**0.5 + 0.01 * (0.5 * width) ** sum(exponents)
+            assert abs(moments[0].mean() - moments[1].mean()) < tolerance, (number, exponents)
+
+
+def test_spread_points_lie_on_their_triangles_and_one_is_the_center():
+    triangles, texels = triangles_at_points(40)
+    assert triangles.spread(texels, 0, 1, 1.0) is texels
+    for number in range(9):
+        found = triangles.spread(texels, number, 9, 1.0)
+        assert found.barycentric.min() >= 0.0 and np.abs(triangles.places(found) - 7.0).max() <= 0.5 + 1e-9
+        assert np.abs(found.barycentric.sum(axis=1) - 1.0).max() < 1e-9
+
+
+def test_weights_of_random_points_give_the_mean_of_the_spread_ones():
+    """Of what changes quadratically over a texel."""
+    triangles, texels = triangles_at_points(60)
+    generator = np.random.default_rng(7)
+    spread = [triangles.places(triangles.spread(texels, number, LATTICE, 1.0)) for number in range(LATTICE)]
+    points = []
+    for _ in range(16):
+        numbers = generator.integers(LATTICE, size=60)
+        points.append(np.array([spread[number][q] for q, number in enumerate(numbers)]))
+    weights = PointWeights.of(triangles, texels, points, 1.0)
+
+    def curve(at):
+        x, y = (at - 7.0).T
+        return 1.0 + 2.0 * x - y + 3.0 * x * x - x * y + 0.5 * y * y
+
+    wanted = np.mean([curve(at) for at in spread], axis=0)
+    plain = np.mean([curve(at) for at in points], axis=0)
+    found = np.mean([weights.at(at) * curve(at) for at in points], axis=0)
+    assert np.abs(np.mean([weights.at(at) for at in points], axis=0) - 1.0).max() < 1e-12
+    # The stiffness leaves some of it.
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.1 * np.sqrt(np.mean((plain - wanted) ** 2))

@@ -17,8 +17,9 @@ PICTURE = {
     "reference_samples": 7, "cycles_samples": 32, "scripts": True,
 }  # fmt: skip
 BAKE = {
-    "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "margin": 3, "margin_type": "adjacent",
-    "conservative": True, "view": (-1.0, 2.5, 0.0), "techniques": ("reference",), "passes": ("diffuse_light",),
+    "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "sub_samples": 4, "margin": 3,
+    "margin_type": "adjacent", "conservative": True, "view": (-1.0, 2.5, 0.0),
+    "techniques": ("reference",), "passes": ("diffuse_light",),
     "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
 }  # fmt: skip
 OF_A_TASK = {"scene", "output", "frame", "camera", "name"}

@@ -26,7 +26,7 @@ from ..materials.aovs import (
     objects_without_material,
 )
 from ..materials.graph import ensure_nodes
-from ..materials.maps import MaterialPlan, SavedImages
+from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..render_settings import working_space
 from . import pixels
 from .origin import middle_of, move_to_origin
@@ -34,6 +34,8 @@ from .pixels import SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
 NOT_BAKED = -1e9
+# Texels that Cycles' bake spreads its samples over, from side to side: a whole one since Blender 5.2.
+SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
 
 
@@ -187,7 +189,7 @@ class ObjectBake:
         # Blender appends a number to a name in use.
         self.layer_name, self.images = layer.name, {}
         for plan in plans:
-            plan.prepare()
+            plan.prepare(self.layer_name)
 
     def close(self) -> None:
         """Take the UV map and the images out again."""
@@ -197,16 +199,22 @@ class ObjectBake:
         for image in self.images.values():
             bpy.data.images.remove(image)
 
-    def maps(self, block: Block) -> np.ndarray:
-        """(N, rows, W, 3) float32, row 0 below: map n of every material at once."""
-        found = []
-        for number in range(max((plan.count for plan in self.plans), default=0)):
-            for plan in self.plans:
-                plan.show(number)
-            # With a fixed seed the bytes do not depend on what was baked before.
-            self.scene.cycles.seed, self.scene.cycles.samples = 0, 1
-            with render_settings.without_scripts(self.scene):
-                found.append(self._bake(block, "EMIT", set()))
+    def maps(self, block: Block, point: int, points: int) -> np.ndarray:
+        """(N, rows, W, 3) float32, row 0 below: map n of every material at once, at one of the `points` of each texel
+        that Cycles samples, 0 its center; last the others' places (u, v, 0), where the block is the unit square."""
+        found, cycles = [], self.scene.cycles
+        # With a fixed seed the bytes do not depend on what was baked before.
+        cycles.seed, cycles.samples, cycles.use_sample_subset = 0, points, True
+        cycles.sample_offset, cycles.sample_subset_length = point, 1
+        try:
+            count = max((plan.count for plan in self.plans), default=0)
+            for number in range(count) if point == 0 else (*range(count), UV_MAP):
+                for plan in self.plans:
+                    plan.show(number)
+                with render_settings.without_scripts(self.scene):
+                    found.append(self._bake(block, "EMIT", set()))
+        finally:
+            cycles.use_sample_subset = False
         return np.array(found)
 
     def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
@@ -458,6 +466,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         "lights": [pixels.light_record(light) for light in opened.lights],
         "color_space": working_space(),
         "warnings": opened.warnings,
+        "sampled_texels": SAMPLED_TEXELS,
         "view": vars(opened.view),
         "camera": opened.camera,
         "objects": records,
@@ -497,8 +506,8 @@ def _bake(scene, ob, read, plans, job, with_maps, folder, progress) -> None:
             blocks = [block for block in blocks if block.tile == job["tile"]]
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
-            if with_maps:
-                save_array(folder / f"maps_{block.name}.npy", bake.maps(block))
+            for point in range(job["sub_samples"]) if with_maps else ():
+                save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, job["sub_samples"]))
             if job["cycles_samples"]:
                 for kind in job["passes"]:
                     halves = bake.radiance(block, kind, max(1, job["cycles_samples"] // 2))

@@ -17,6 +17,8 @@ from ..render_settings import working_space
 from .graph import carry_out_of_group, cut, is_socket, live_link, material_output, source_behind
 from .values import is_srgb, opaque_pixels
 
+# Number of the map of the places on the UV map that is baked into.
+UV_MAP = -1
 # Of the entries of the matrix to Rec.709.
 SAME_SPACE = 1e-4
 
@@ -123,7 +125,8 @@ class MaterialPlan:
             {name: self._recorded(name, value, groups) for name, value in lobe.items()}
             for lobe, groups in zip(lobes, paths, strict=True)
         )
-        self._output, self._surface, self._emissions, self._image_node = None, None, [], None
+        self._output, self._surface, self._image_node, self._places = None, None, None, None
+        self._emissions: dict[int, object] = {}  # nodes, by the map that they show
 
     @property
     def count(self) -> int:
@@ -171,14 +174,18 @@ class MaterialPlan:
             self.textures.append(record)
         return {"texture": self.textures.index(record), "part": "gray" if part == "color" and not is_color else part}
 
-    def prepare(self) -> None:
-        """Add the nodes."""
+    def prepare(self, uv_name: str) -> None:
+        """Add the nodes; `uv_name` is the UV map that UV_MAP shows."""
         self._output = material_output(self.tree)
         if self._output is None:
             self._output = self.tree.nodes.new("ShaderNodeOutputMaterial")
         link = live_link(self._output.inputs["Surface"])
         self._surface = link.from_socket if link else None
-        self._emissions = [self._emission(number) for number in range(self.count)]
+        self._emissions = {number: self._emission(number) for number in range(self.count)}
+        self._places = self.tree.nodes.new("ShaderNodeUVMap")
+        self._places.uv_map = uv_name
+        self._emissions[UV_MAP] = self.tree.nodes.new("ShaderNodeEmission")
+        self.tree.links.new(self._places.outputs["UV"], self._emissions[UV_MAP].inputs["Color"])
         self._image_node = self.tree.nodes.new("ShaderNodeTexImage")
 
     def _emission(self, number):
@@ -200,7 +207,7 @@ class MaterialPlan:
         if number is None:
             if self._surface is not None:
                 self.tree.links.new(self._surface, surface)
-        elif number < len(self._emissions):
+        elif number in self._emissions:
             self.tree.links.new(self._emissions[number].outputs[0], surface)
 
     def target(self, image) -> None:
@@ -211,6 +218,5 @@ class MaterialPlan:
     def remove(self) -> None:
         """Take the nodes out again."""
         self.show(None)
-        self.tree.nodes.remove(self._image_node)
-        for emission in self._emissions:
-            self.tree.nodes.remove(emission)
+        for node in (self._image_node, self._places, *self._emissions.values()):
+            self.tree.nodes.remove(node)

@@ -212,6 +212,7 @@ class BakeJob:
     following: tuple[str, ...] = ()  # objects that jobs after this one will want of the same file
     scripts: bool = False  # run those of the file
     tile: int | None = None  # the UDIM tile that is wanted, None for all
+    sub_samples: int = 1  # points of a texel that the maps are wanted for
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:

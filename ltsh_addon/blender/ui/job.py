@@ -105,6 +105,7 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         objects=tuple(ob.name for ob in preflight.bake_objects(context)[0]),
         uv=settings.bake_uv_map or None,
         size=(side, side),
+        sub_samples=settings.anti_aliasing,
         margin=settings.bake_margin,
         view=settings.bake_view,
         techniques=chosen(settings, "techniques"),
@@ -165,8 +166,8 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
 
 def _bake(options: BakeOptions) -> list[Step]:
     texels = 1e-6 * math.prod(options.size)
-    samples = options.cycles_samples * len(options.passes) if options.error else 1
-    shading = sum(_shading(name, texels) for name in options.techniques)
+    samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
+    shading = sum(_shading(name, texels) for name in options.techniques) * options.sub_samples
     found = [Step("open scene", OPEN_SECONDS)]
     for name in options.objects:
         found.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))

@@ -179,6 +179,7 @@ class _Bake:
         split_names(layout, context)
         column = layout.column()
         column.prop(settings, "bake_size")
+        column.prop(settings, "anti_aliasing")
         column.prop(settings, "bake_margin")
         column.prop(settings, "bake_view")
         ob = context.object

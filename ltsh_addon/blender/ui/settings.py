@@ -168,7 +168,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )  # fmt: skip
     anti_aliasing: IntProperty(
         name="Anti-Aliasing",
-        description="Points per pixel, drawn from the scene's pixel filter; 1 takes the centers of pixels",
+        description="Points per pixel, drawn from the scene's pixel filter, or per texel of a bake; 1 takes centers",
         min=1, max=256, soft_max=64, default=1,
     )  # fmt: skip
     cycles_samples: IntProperty(

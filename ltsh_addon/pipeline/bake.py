@@ -208,13 +208,13 @@ class ObjectBaker:
         options, covered, covers, overlaps, unshaded, lit = self.options, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
-        points, spread = options.sub_samples, TilePoints(self, tile)
+        points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
 
         def shaded(task):
             return *task, self._block(spread, *task)
 
-        tasks = [(first, point) for first in range(0, height, rows) for point in range(points)]
-        sums = {}
+        firsts, sums = range(0, height, rows), {}
+        tasks = ((first, point) for first in firsts for point in range(points))
         for number, (first, point, found) in enumerate(_in_order(shaded, tasks, self._threads())):
             sums = {name: sums[name] + values for name, values in found.items()} if point else found
             if point == points - 1:
@@ -231,7 +231,7 @@ class ObjectBaker:
                     errors.add_halves(pass_name, a, b)
                     for name in self.tables:
                         errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
-            share = (number + 1) / len(tasks)
+            share = (number + 1) / (len(firsts) * points)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
@@ -327,15 +327,16 @@ class ObjectBaker:
 class TilePoints:
     """The points of the texels of a tile: of `UvTriangles.spread`, or where there are maps, those that they show."""
 
-    def __init__(self, baker: ObjectBaker, tile: int):
+    def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         from ..cycles import uv
 
         options = baker.options
         self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
         self._width, self._weights = baker.manifest["sampled_texels"], uv.PointWeights.of
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
+        self._at_centers = bakes_centers_alone(options, baker.record)
         # Points of one block follow one another.
-        kept = functools.lru_cache(maxsize=cores() + 1)
+        kept = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = kept(self._covered), kept(self._fitted_weights)
 
     def at(self, first: int, point: int):
@@ -352,7 +353,7 @@ class TilePoints:
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
-        return self._triangles.texels(first, rows, self._options.conservative)
+        return self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -369,6 +370,11 @@ class TilePoints:
         maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
         places = (self._places(texels, of_point, first, point) for of_point, point in maps)
         return self._weights(self._triangles, texels, places, self._width)
+
+
+def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
+    """Whether Cycles has to bake texels of an object, which it does where their centers are covered."""
+    return record["maps"] or options.error
 
 
 def _place(tile: int) -> tuple[int, int]:
@@ -464,6 +470,13 @@ def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = list(dict.fromkeys([*manifest["warnings"], *lines]))
+    if options.conservative:
+        warnings += [
+            f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
+            f"of them: leave out {'--error' if options.error else '--conservative, or bake its textures to images'}"
+            for record in manifest["objects"]
+            if record["problem"] is None and bakes_centers_alone(options, record)
+        ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
         wrong, note = _darkness(record, reasons[record["name"]])

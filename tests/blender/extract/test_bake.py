@@ -180,6 +180,22 @@ def test_the_margin_repeats_the_border_and_conservative_adds_texels(tmp_path):
     assert touched[covered].all() and touched.sum() >= covered.sum()
 
 
+@pytest.mark.parametrize("kind", ["maps", "error"])
+def test_conservative_bakes_no_texel_that_cycles_leaves_out_and_says_so(tmp_path, kind):
+    start()
+    ob = add_plane(waves() if kind == "maps" else principled(Roughness=0.5)[0])
+    uv = np.array([0.3, 0.31, 0.7, 0.33, 0.73, 0.7, 0.3, 0.71], dtype=np.float32)
+    ob.data.uv_layers.active.data.foreach_set("uv", uv)
+    options = {"sub_samples": 2, "error": kind == "error", "cycles_samples": 2}
+    path = save(tmp_path)
+    report, files = baked(path, tmp_path / "safe", conservative=True, **options)
+    (warning,) = report["warnings"]
+    assert "'Plane': texels whose centers no face covers are left out" in warning
+    _, plain = baked(path, tmp_path / "plain", **options)
+    for layer, pixels in plain["Plane.exr"].items():
+        assert np.array_equal(pixels, files["Plane.exr"][layer]), layer
+
+
 def test_metadata_says_what_the_file_is(tmp_path):
     start()
     add_plane(name="Bo/den: ü")

@@ -68,8 +68,8 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
     assert bpy.ops.ltsh.bake() == {"FINISHED"}
     # Materials without textures need no maps.
     assert [job.STARTING, *reported] == [stage for stage in planned("bake") if stage != "bake Floor"]
-    command_line("bake", tmp_path / "room.blend", "-o", tmp_path / "out", "--object", "Floor", "--size", "256", "--aa", "2",
-                 "--margin", "2", "--view", "above", "--passes", "specular",
+    command_line("bake", tmp_path / "room.blend", "-o", tmp_path / "out", "--object", "Floor", "--size", "256",
+                 "--aa", "2", "--margin", "2", "--view", "above", "--passes", "specular",
                  "--techniques", "ltsh2")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "Floor.exr")["ltsh2.specular"]
     np.testing.assert_array_equal(image_pixels("LTSH Floor ltsh2.specular"), expected)

@@ -263,7 +263,7 @@ def test_points_spread_over_texels_give_the_mean_that_cycles_bakes(tmp_path, kin
     report, _ = baked(save(tmp_path), tmp_path / "out", **options)
     tiles = report["objects"][0]["tiles"]
     assert list(tiles) == (["1001"] if kind == "plain" else ["1001", "1002"])
-    # At centers alone .47 and .06, or .70 and .07. What is left, most of it in a few texels of the highlight, falls with
+    # At centers alone .47 and .06, or .70 and .07. What is left, most of it in few texels of the highlight, falls with
     # the number of points: .05, and .02 with 48 of them. Those of maps are random ones.
     specular, diffuse = (0.12, 0.01) if kind == "plain" else (0.2, 0.01)
     for tile in tiles.values():

@@ -10,6 +10,7 @@ These are the rooms of the package. A room imports only itself and rooms above i
 
     interruption  Ctrl-C and SIGTERM as exceptions
     scene         the shared vocabulary: AreaLight, SurfaceSamples, Film, errors, names of techniques and passes
+    reading       how files of others are read: what they may hold, what they must have
     files         how files are written, and how leftovers of dead processes are deleted
     shading       the paper: lookup table, polygons, integrals, `shade`, reference quadrature (numpy only)
     cycles        how Cycles shades: BSDF formulas, normals, G-buffers, UV rasters (numpy only)

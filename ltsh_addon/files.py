@@ -23,6 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .reading import check_name
 from .scene import SurfaceSamples
 
 try:
@@ -48,6 +49,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     temporary, lock = None, None
     try:
+        check_name(target)
         if target.is_dir():
             raise OSError("a folder has that name")
         # File names have at most 255 bytes.
@@ -107,6 +109,7 @@ def load_samples(path: str | os.PathLike) -> SurfaceSamples:
 
 def check_takes_files(folder: str | os.PathLike) -> None:
     """Make the folder where it is missing, then make and delete an empty file in it. Raises OSError."""
+    check_name(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
     path, lock = _locked_file(Path(folder), ".ltsh-write-test.")
     os.close(lock)
@@ -119,7 +122,13 @@ def temporary_folder() -> Iterator[Path]:
 
     Raises OSError; where the disk is full, its text names the folder and the remedy.
     """
-    path, lock = _locked_folder(Path(tempfile.gettempdir()))
+    parent = tempfile.gettempdir()
+    try:
+        check_name(parent)
+        path, lock = _locked_folder(Path(parent))
+    except OSError as error:
+        remedy = "let TMPDIR name another folder"
+        raise OSError(f"{parent}: cannot hold temporary files: {error.strerror}; {remedy}") from error
     try:
         yield path
     except OSError as error:
@@ -128,8 +137,8 @@ def temporary_folder() -> Iterator[Path]:
             raise OSError(no_room(path, error)) from error
         raise
     finally:
+        _closed(lock)  # before: deleting may need its descriptor
         shutil.rmtree(path, ignore_errors=True)
-        _closed(lock)
 
 
 def disk_is_full(error: OSError) -> bool:
@@ -194,11 +203,16 @@ def _locked_folder(folder: Path) -> tuple[Path, int | None]:
     while True:
         path = Path(folder, f"{RUN_PREFIX}{MACHINE}-{secrets.token_hex(4)}")
         path.mkdir(0o700)
-        with suppress(FileNotFoundError):  # another process took it for a leftover
+        try:
             lock = os.open(path, flags)
-            if _is_held(path, lock):
-                return path, lock
-            os.close(lock)
+        except FileNotFoundError:  # another process took it for a leftover
+            continue
+        except OSError:
+            path.rmdir()
+            raise
+        if _is_held(path, lock):
+            return path, lock
+        os.close(lock)
 
 
 def _is_held(path: Path, lock: int) -> bool:

@@ -26,8 +26,13 @@ Progress = Callable[[str, float], "bool | None"]
 
 
 def error_line(error: BaseException) -> str:
-    """The message of an error in one line; its class where it has none."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """The message of an error in one line of a readable length; its class where it has none."""
+    return shortened(" ".join(str(error).split())) or type(error).__name__
+
+
+def shortened(text: str, most: int = 1000) -> str:
+    """`text`, without its middle where it has more than so many letters."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[len(text) - most // 2 :]}"
 
 
 def listed(texts: Iterable[str], most: int = 8, separator: str = ", ") -> str:

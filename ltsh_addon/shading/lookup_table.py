@@ -18,15 +18,14 @@ sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f
 
 from __future__ import annotations
 
-import json
-import zipfile
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from ..scene import SHIPPED_TABLES, error_line
+from ..reading import Malformed, check, parse_json, read_arrays
+from ..scene import SHIPPED_TABLES
 from .edge_integrals import MAX_DEGREE, ridge_matrix
 from .spherical_harmonics import coefficient_count, degree_of, hemisphere_integrals
 
@@ -34,7 +33,18 @@ FORMAT_VERSION = 2
 WARP_REGULARIZATION = 0.5
 # Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
 MIN_ALPHA = 1e-5
-_ARRAYS = ("warp", "coefficients", "fresnel_curves", "fresnel_ior", "fresnel_weights", "average_albedo")
+# Arrays by name, and what each of their axes has at least.
+_FEWEST = {
+    "warp": (2, 2, 3),
+    "coefficients": (2, 2, 2, 1),
+    "fresnel_curves": (2, 2),
+    "fresnel_ior": (1,),
+    "fresnel_weights": (1, 2),
+    "average_albedo": (2, 2),
+}
+_METADATA = {
+    "family": str, "degree": int, "name?": str, "brdf?": str, "fresnel_curve_names?": [str],
+}  # fmt: skip
 
 
 class TableError(ValueError):
@@ -184,48 +194,47 @@ def load_table(name_or_path: str | Path) -> LookupTable:
     if not path.is_file():
         raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
     try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = {key: _member(archive, key) for key in _ARRAYS}
-            metadata = json.loads(str(_member(archive, "metadata")))
-    # A damaged file can raise almost anything: BadZipFile, zlib.error, KeyError, NotImplementedError, MemoryError ...
-    except Exception as error:
-        reason = error_line(error)
-        raise TableError(f"lookup table {path}: cannot be read ({reason}); fit it again or reinstall") from error
-    return _validated(path, arrays, metadata)
+        arrays = read_arrays(path, (*_FEWEST, "metadata"))
+        metadata = parse_json(str(arrays.pop("metadata")))
+        _check_metadata(metadata)
+        _check_arrays(arrays, metadata)
+    except OSError as error:
+        raise TableError(f"lookup table {path}: cannot be read ({error.strerror})") from error
+    except Malformed as error:
+        raise TableError(f"lookup table {path}: {error}; fit it again or reinstall") from error
+    known = {name: metadata[name] for name in ("family", "degree")}
+    return LookupTable(name=metadata.get("name", path.stem), metadata=metadata, **known, **arrays)
 
 
-def _member(archive, key):
-    with archive.open(f"{key}.npy") as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+def _check_metadata(metadata) -> None:
+    check(metadata, {"format_version": int}, "metadata")
+    if metadata["format_version"] != FORMAT_VERSION:
+        raise Malformed(f"format version is {metadata['format_version']}, expected {FORMAT_VERSION}")
+    check(metadata, _METADATA, "metadata")
+    family, degree = metadata["family"], metadata["degree"]
+    if family not in ("ltc", "ltsh") or not 1 <= degree <= MAX_DEGREE:
+        raise Malformed(f"family {family!r} of degree {degree} is unknown")
 
 
-def _validated(path, arrays, metadata) -> LookupTable:
-    if not isinstance(metadata, dict) or metadata.get("format_version") != FORMAT_VERSION:
-        found = metadata.get("format_version") if isinstance(metadata, dict) else metadata
-        raise TableError(f"lookup table {path}: format version is {found!r}, expected {FORMAT_VERSION}; fit it again")
-    family, degree = metadata.get("family"), metadata.get("degree")
-    if family not in ("ltc", "ltsh") or not isinstance(degree, int) or not 1 <= degree <= MAX_DEGREE:
-        raise TableError(f"lookup table {path}: family {family!r} of degree {degree!r} is unknown; fit it again")
-    dimensions = {"warp": 3, "coefficients": 4, "fresnel_ior": 1}
+def _check_arrays(arrays, metadata) -> None:
     for key, value in arrays.items():
-        if value.dtype.kind != "f" or value.ndim != dimensions.get(key, 2):
-            found, expected = f"{value.ndim} axes of {value.dtype}", f"{dimensions.get(key, 2)} of floats"
-            raise TableError(f"lookup table {path}: {key} has {found}, expected {expected}; fit it again")
+        least = _FEWEST[key]
+        if value.dtype.kind != "f" or value.ndim != len(least):
+            raise Malformed(f"{key} has {value.ndim} axes of {value.dtype}, expected {len(least)} of floats")
+        if any(count < limit for count, limit in zip(value.shape, least, strict=True)):
+            raise Malformed(f"{key} has shape {value.shape}, expected at least {least}")
         if not np.isfinite(value).all():
-            raise TableError(f"lookup table {path}: {key} holds NaN or infinity, expected finite numbers; fit it again")
-    rows, columns = arrays["warp"].shape[:2]
-    curves, cosines = arrays["fresnel_curves"].shape
-    indices = arrays["fresnel_ior"].shape[0]
+            raise Malformed(f"{key} holds NaN or infinity, expected finite numbers")
+    (rows, columns), curves = arrays["warp"].shape[:2], len(arrays["fresnel_curves"])
+    is_ltc = metadata["family"] == "ltc"
     shapes = {
-        "warp": (rows, columns, 4 if family == "ltc" else 3),
-        "coefficients": (rows, columns, curves, 1 if family == "ltc" else coefficient_count(degree)),
-        "fresnel_weights": (indices, curves),
+        "warp": (rows, columns, 4 if is_ltc else 3),
+        "coefficients": (rows, columns, curves, 1 if is_ltc else coefficient_count(metadata["degree"])),
+        "fresnel_weights": (len(arrays["fresnel_ior"]), curves),
         "average_albedo": (rows, curves),
     }
     for key, shape in shapes.items():
-        found = arrays[key].shape
-        if found != shape or min(rows, columns, curves, cosines) < 2 or indices < 1:
-            raise TableError(f"lookup table {path}: {key} has shape {found}, expected {shape}; fit it again")
+        if arrays[key].shape != shape:
+            raise Malformed(f"{key} has shape {arrays[key].shape}, expected {shape}")
     if (np.diff(arrays["fresnel_ior"]) <= 0.0).any():
-        raise TableError(f"lookup table {path}: fresnel_ior does not increase; fit it again")
-    return LookupTable(name=metadata.get("name", path.stem), family=family, degree=degree, metadata=metadata, **arrays)
+        raise Malformed("fresnel_ior does not increase")

@@ -132,7 +132,7 @@ def test_files_that_are_no_zip_or_were_cut_are_refused(tmp_path, content):
         whole = written(tmp_path / "whole.npz", *contents("ltc")).read_bytes()
         content = whole[: int(content * len(whole))]
     (tmp_path / "bad.npz").write_bytes(content)
-    assert_refused(tmp_path / "bad.npz", "cannot be read")
+    assert_refused(tmp_path / "bad.npz", "is no .npz")
 
 
 def test_flipped_bytes_are_refused_or_harmless(tmp_path):
@@ -162,7 +162,7 @@ ANY_LENGTH = ("fresnel_curves", np.s_[..., 1:])  # any number of cosines is allo
 SPOILED = [
     *((lambda arrays, _, key=key: arrays.pop(key), key) for key in ARRAYS),
     *((lambda _, metadata, version=version: metadata.update(format_version=version),
-       f"format version is {version!r}, expected 2") for version in (0, 1, "2", None)),
+       f"is {version!r}, expected") for version in (0, 1, "2", None)),
     *((lambda _, metadata, change=change: metadata.update(change), "")
       for change in ({"family": "ltx"}, {"degree": 12}, {"degree": "2"}, {"degree": None}, {"degree": 3})),
     *((lambda arrays, _, key=key, value=value: arrays[key].flat.__setitem__(arrays[key].size // 2, value),
@@ -197,5 +197,5 @@ def test_pickled_objects_are_refused_and_not_run(tmp_path):
     arrays, metadata = contents("ltsh2")
     path = tmp_path / "pickle.npz"
     np.savez(path, **{**arrays, "warp": np.array([Bomb()], dtype=object)}, metadata=np.array(json.dumps(metadata)))
-    assert_refused(path, "cannot be read")
+    assert_refused(path, "warp holds Python objects")
     assert not (tmp_path / "exploded").exists()

@@ -16,6 +16,7 @@ from ...cycles.horizons import end_at_horizons_of_cycles
 from ...files import replacing_by_copy, temporary_folder
 from ...imaging.color import identified
 from ...imaging.exr import read_channels
+from ...reading import check_name
 from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples, listed
 from ...shading.light_polygons import has_lobe, lights_that_reach_nothing
 from .blender_process import run_child
@@ -265,6 +266,7 @@ Version = tuple[int, int]
 def check_readable(scene: Path) -> None:
     """Raise SceneError where a look at the file says enough, so that Blender need not start."""
     try:
+        check_name(scene)
         if not scene.exists():
             raise SceneError(f"{scene}: no such file, expected a .blend")
         if scene.is_dir():

@@ -1,0 +1,249 @@
+"""How files are read that others may have written: jobs, records, reports, tables. Their limits stand here.
+
+Each reader refuses in one line, within about a second, what is no such file, whatever it claims to hold. OSError means
+that there is nothing to read, Malformed that it is not what was expected; who asked for the file names it.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+import zipfile
+from collections.abc import Callable, Iterable
+from pathlib import Path, PurePosixPath
+from types import UnionType
+from typing import Any
+
+import numpy as np
+
+from .scene import error_line, shortened
+
+# What a file may have, in bytes: a report of 5,000 comparisons has 25 MiB, a job 150 bytes of TOML, the largest shipped
+# table 1.2 MiB, and 2.5 MiB when unpacked. The TOML parser and the names in an archive take the most time per byte.
+MOST_JSON, MOST_TOML, MOST_PACKED, MOST_UNPACKED = 64 << 20, 1 << 20, 8 << 20, 64 << 20
+# In a document; a job of 100,000 tasks has 800,000.
+MOST_COMMAS = 2_000_000
+# Lists and tables within one another, also as parts of one TOML key: the parser's time grows with their square.
+MOST_LEVELS = 32
+INTEGERS = -(2**63), 2**63 - 1
+
+NUMBER = int | float
+_KEY = r"""[ \t]*+(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+"""
+_LONG_KEY = re.compile(rf"(?:^|[{{,\[]){_KEY}(?:\.{_KEY}){{{MOST_LEVELS}}}", re.MULTILINE)
+_NAMES = {dict: "a table", list: "a list", str: "text", int: "a whole number", float: "a number", bool: "true or false"}
+_NAMES |= {type(None): "nothing", NUMBER: "a number", NUMBER | None: "a number or nothing"}
+
+
+class Malformed(ValueError):
+    """A file is not what was expected; the text says what is wrong, without the file's name."""
+
+
+def read_json(path: str | os.PathLike, shape: Any = dict) -> Any:
+    """The document of a JSON file, which has the `shape` (see `check`). Raises OSError, Malformed."""
+    return parse_json(_text(path, MOST_JSON), shape)
+
+
+def parse_json(text: str, shape: Any = dict) -> Any:
+    """The document of a JSON text, which has the `shape`. Raises Malformed."""
+
+    def refuse(constant):
+        raise ValueError(f"{constant} is no number")
+
+    try:
+        document = json.loads(text, parse_constant=refuse)
+    except RecursionError:
+        raise Malformed(_too_deep()) from None
+    except ValueError as error:
+        raise Malformed(f"is no JSON: {error_line(error)}") from None
+    _check_contents(document)
+    if "\\u" in text and not is_text(json.dumps(document, ensure_ascii=False)):
+        raise Malformed("holds text that is no Unicode")
+    check(document, shape)
+    return document
+
+
+def read_toml(path: str | os.PathLike) -> dict:
+    """The document of a TOML file. Raises OSError, Malformed."""
+    text = _text(path, MOST_TOML)
+    if _LONG_KEY.search(text):
+        raise Malformed(f"is no TOML that can be read: a key has more than {MOST_LEVELS} parts")
+    try:
+        document = tomllib.loads(text)
+    except RecursionError:
+        raise Malformed(_too_deep()) from None
+    except ValueError as error:
+        raise Malformed(f"is no TOML: {error_line(error)}") from None
+    _check_contents(document)
+    return document
+
+
+def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """The arrays `names` of a .npz file. Raises OSError, Malformed.
+
+    Nothing is unpacked before the sizes of all arrays are known to fit together.
+    """
+    content = _content(path, MOST_PACKED)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = {name: _entry(archive, name) for name in names}
+            total = sum(entry.file_size for entry in entries.values())
+            if total > MOST_UNPACKED:
+                raise Malformed(f"holds {total >> 20} MiB of arrays, expected at most {MOST_UNPACKED >> 20} MiB")
+            return {name: _array(archive, entry) for name, entry in entries.items()}
+    except Malformed:
+        raise
+    # zipfile and numpy raise almost anything: BadZipFile, zlib.error, struct.error, NotImplementedError, SyntaxError ...
+    except Exception as error:
+        raise Malformed(f"is no .npz: {error_line(error)}") from None
+
+
+# -- what a document must have --------------------------------------------------------------------------------------
+
+
+def check(value: Any, shape: Any, place: str = "") -> None:
+    """Raise Malformed, naming the place, where `value` has not the `shape`, which is one of
+
+    - a type, or several (`int | None`), for values of it; True is no int,
+    - [shape], for a list of such,
+    - {"key": shape, "other?": shape, str: shape}, for a table that has the key, may have the other, and all else in
+      which has the last shape; without a shape for all else, that may be anything,
+    - a function check(value, place).
+    """
+    if isinstance(shape, dict):
+        _expect(value, dict, place)
+        missing = [key for key in shape if key is not str and not key.endswith("?") and key not in value]
+        if missing:
+            raise Malformed(f"{place or 'the document'} has no {missing[0]!r}")
+        for key, item in value.items():
+            inner = shape.get(key, shape.get(f"{key}?", shape.get(str)))
+            if inner is not None:
+                check(item, inner, f"{place}.{key}" if place else key)
+    elif isinstance(shape, list):
+        _expect(value, list, place)
+        for number, item in enumerate(value):
+            check(item, shape[0], f"{place}[{number}]")
+    elif isinstance(shape, type | UnionType):
+        _expect(value, shape, place)
+    else:
+        shape(value, place)
+
+
+def some(shape: Any) -> Callable[[Any, str], None]:
+    """The shape of a list or table that is not empty."""
+
+    def check_some(value, place):
+        check(value, shape, place)
+        if not value:
+            raise Malformed(f"{place} is empty")
+
+    return check_some
+
+
+def file_name(value: Any, place: str) -> None:
+    """The shape of the name of a file below a folder."""
+    _expect(value, str, place)
+    path = PurePosixPath(value)
+    if not path.parts or path.is_absolute() or ".." in path.parts or "\0" in value:
+        raise Malformed(f"{place} is {_shown(value)}, expected a name below the folder")
+
+
+def _expect(value, kind, place) -> None:
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        expected = _NAMES.get(kind) or " or ".join(_NAMES[one] for one in kind.__args__)
+        raise Malformed(f"{place or 'the document'} is {_shown(value)}, expected {expected}")
+
+
+def _shown(value) -> str:
+    return shortened(repr(value), 60)
+
+
+# -- what any file may hold -----------------------------------------------------------------------------------------
+
+
+def is_text(name: str | os.PathLike) -> bool:
+    """True where a name is UTF-8 on the disk: Blender, EXR files and reports take no others."""
+    try:
+        os.fsencode(name).decode("utf-8")
+    except UnicodeError:
+        return False
+    return True
+
+
+def check_name(path: str | os.PathLike) -> None:
+    """Raise OSError where the whole path of a file is no text (see `is_text`): OpenEXR would end the process."""
+    if not is_text(os.path.realpath(path)):
+        raise OSError(errno.EILSEQ, "its path has bytes that are not UTF-8; rename it")
+
+
+def _content(path, most_bytes) -> bytes:
+    mode = os.stat(path).st_mode
+    if not stat.S_ISREG(mode):  # reading a pipe or a device might never end
+        raise Malformed(f"is {'a folder' if stat.S_ISDIR(mode) else 'a device or a pipe'}, expected a file")
+    with open(path, "rb") as file:
+        content = file.read(most_bytes + 1)
+    if len(content) > most_bytes:
+        raise Malformed(f"has more than {most_bytes >> 20} MiB")
+    return content
+
+
+def _text(path, most_bytes) -> str:
+    content = _content(path, most_bytes)
+    if content.count(b",") > MOST_COMMAS:
+        raise Malformed(f"has more than {MOST_COMMAS} values")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise Malformed(f"is no text in UTF-8: {error_line(error)}") from None
+
+
+def _check_contents(document) -> None:
+    """Whatever has more levels would end in a RecursionError somewhere; JSON and TOML have numbers of 64 bits."""
+    level = [[document]]
+    for _ in range(MOST_LEVELS + 1):
+        below = []
+        for part in level:
+            for item in part.values() if isinstance(part, dict) else part:
+                if isinstance(item, dict | list):
+                    below.append(item)
+                elif isinstance(item, int) and not INTEGERS[0] <= item <= INTEGERS[1]:
+                    raise Malformed("holds a whole number that does not fit into 64 bits")
+        if not below:
+            return
+        level = below
+    raise Malformed(_too_deep())
+
+
+def _too_deep() -> str:
+    return f"has more than {MOST_LEVELS} lists or tables within one another"
+
+
+def _entry(archive, name) -> zipfile.ZipInfo:
+    try:
+        entry = archive.getinfo(f"{name}.npy")
+    except KeyError:
+        raise Malformed(f"has no {name!r}") from None
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise Malformed(f"{name} is packed in a way that is not read here")
+    return entry
+
+
+def _array(archive, entry) -> np.ndarray:
+    """The array of an entry whose size is what the shape says."""
+    name = entry.filename.removesuffix(".npy")
+    with archive.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = header(file)
+        if dtype.hasobject:
+            raise Malformed(f"{name} holds Python objects, expected numbers")
+        count, left = math.prod(shape), entry.file_size - file.tell()
+        if min(shape, default=0) < 0 or count * dtype.itemsize != left:
+            raise Malformed(f"{name} has shape {shape} of {dtype}, but {left} bytes")
+        array = np.frombuffer(file.read(), dtype, count)
+    return array.reshape(shape, order="F" if fortran else "C")

@@ -16,7 +16,7 @@ import stat
 import tomllib
 import zipfile
 from collections.abc import Callable, Iterable
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from types import UnionType
 from typing import Any
 
@@ -111,8 +111,9 @@ def check(value: Any, shape: Any, place: str = "") -> None:
 
     - a type, or several (`int | None`), for values of it; True is no int,
     - [shape], for a list of such,
-    - {"key": shape, "other?": shape, str: shape}, for a table that has the key, may have the other, and all else in
-      which has the last shape; without a shape for all else, that may be anything,
+    - {"key": shape, "other?": shape, str: shape}, for a table with the key and perhaps the other; all else in it
+      has the last shape, or any where none is given,
+    - a tuple, for one of its values,
     - a function check(value, place).
     """
     if isinstance(shape, dict):
@@ -128,6 +129,9 @@ def check(value: Any, shape: Any, place: str = "") -> None:
         _expect(value, list, place)
         for number, item in enumerate(value):
             check(item, shape[0], f"{place}[{number}]")
+    elif isinstance(shape, tuple):
+        if value not in shape:
+            raise Malformed(f"{place} is {_shown(value)}, expected {' or '.join(map(repr, shape))}")
     elif isinstance(shape, type | UnionType):
         _expect(value, shape, place)
     else:

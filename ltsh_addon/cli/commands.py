@@ -204,6 +204,7 @@ def add_run(parser) -> None:
     with_examples(parser, RUN, RUN_EXAMPLES)
     parser.add_argument("file", type=Path, metavar="JOB.toml", help="the jobs")
     add_batch(parser)
+    add_option(parser, PictureOptions, "scripts")
     add_talk(parser)
     parser.set_defaults(run=_run_jobs)
 
@@ -212,7 +213,10 @@ def _run_jobs(arguments, bar, open_file) -> int:
     def do(job, settings, baseline):
         return do_job(job, settings, bar, baseline)
 
-    return _for_each(read_jobs(arguments.file, job_parsers(), job_of), do, arguments, bar)
+    def job_with_scripts(of_job, scenes):
+        return job_of(argparse.Namespace(**{**vars(of_job), "scripts": arguments.scripts}), scenes)
+
+    return _for_each(read_jobs(arguments.file, job_parsers(), job_with_scripts), do, arguments, bar)
 
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import argparse
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..pipeline import picture
 from ..pipeline.tasks import Job
-from ..scene import SceneError
+from ..reading import Malformed, read_toml
+from ..scene import SceneError, shortened
 from ..shading import TableError
 from .arguments import Misuse
 
-# Options that name files, relative to the job file; those of the run as a whole are given to `ltsh run`.
+# Options that name files, relative to the job file.
 _PATHS = ("baseline",)
-_OF_THE_RUN = ("overwrite", "resume", "skip-existing", "shard", "json", "quiet", "log", "help")
+# Options of the run as a whole, which are given to `ltsh run`.
+# Among these is that scripts may run: a job file, like the .blend, may come from anyone.
+_OF_THE_RUN = ("overwrite", "resume", "skip-existing", "shard", "json", "quiet", "log", "help", "enable-autoexec")
 _OF_EVERY_JOB = ("command", "scene", "scenes", "output")
+
+MOST_LINES = 50  # about one file
 
 JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], Job]
 
@@ -47,18 +51,18 @@ def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: J
     Raises Mistakes with all that is wrong in the file, OSError where it cannot be read.
     """
     try:
-        document = tomllib.loads(path.read_bytes().decode("utf-8"))
+        document = read_toml(path)
     except OSError as error:
         raise OSError(f"{path}: cannot be read ({error.strerror}), expected a job file (TOML)") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise Mistakes([f"{path}: is no TOML: {error}"]) from None
-    except RecursionError:
-        raise Mistakes([f"{path}: is no TOML that can be read: too many brackets within one another"]) from None
+    except Malformed as error:
+        raise Mistakes([f"{path}: {error}"]) from None
     reader = _Reader(path, parsers, job_of)
     wanted = reader.read(document)
     if reader.mistakes:
         # Those of the defaults are found with every job.
-        raise Mistakes(list(dict.fromkeys(reader.mistakes)), reader.of_the_world)
+        lines = list(dict.fromkeys(reader.mistakes))
+        more = [f"{path}: {len(lines) - MOST_LINES} more mistakes"] if len(lines) > MOST_LINES else []
+        raise Mistakes(lines[:MOST_LINES] + more, reader.of_the_world)
     return wanted
 
 
@@ -190,7 +194,7 @@ class _Reader:
         """`where` is "job 2", "defaults", or "" for the file as a whole."""
         self.of_the_world &= of_the_world
         place = f"{self.path}, {where}" if where else str(self.path)
-        self.mistakes.append(f"{place}: {' '.join(text.split())}")
+        self.mistakes.append(f"{place}: {shortened(' '.join(text.split()), 500)}")
 
 
 def _options(parser) -> dict[str, argparse.Action]:

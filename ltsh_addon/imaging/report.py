@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..files import write_bytes
+from ..reading import NUMBER, Malformed, file_name, read_json, some
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
@@ -168,6 +169,15 @@ def _text(value) -> str:
 
 
 FILE = "index.json"
+_GROUP = {
+    "files": {str: file_name},
+    "multilayer": file_name,
+    "labels": {str: str},
+    "names": some([str]),
+    "passes": some([str]),
+    "scales": {str: NUMBER},
+}
+_INDEX = {"command": str, "partial": str, "report": dict, "groups": some({str: _GROUP})}
 
 
 def write_index(folder: Path, index: dict) -> None:
@@ -179,15 +189,9 @@ def read_index(folder: Path) -> dict:
     """The index in `folder`. Raises OSError, and ValueError, naming the file, where it is damaged."""
     path = Path(folder) / FILE
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
-        complete = isinstance(index["report"], dict) and {"command", "partial"} <= set(index)
-        needed = {"files", "multilayer", "names", "labels", "passes", "scales"}
-        complete = complete and all(needed <= set(group) for group in index["groups"].values())
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: is damaged ({error}); shade or bake again") from error
-    if not complete or not index["groups"]:
-        raise ValueError(f"{path}: is damaged (parts are missing); shade or bake again")
-    return index
+        return read_json(path, _INDEX)
+    except Malformed as error:
+        raise ValueError(f"{path}: {error}; shade or bake again") from error
 
 
 def index_stamp(folder: Path) -> tuple[int, int]:

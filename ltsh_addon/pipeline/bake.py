@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import temporary_folder
+from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples, listed
 from ..shading.parallel import cores
 from . import picture
@@ -419,7 +420,7 @@ class TileRecords:
     """
 
     def __init__(self, options: BakeOptions):
-        self._records = Records(options.output, "tiles")
+        self._records = Records(options.output, "tiles", _TILE_RECORD)
         self._key = options_digest("bake", options, contents_digest(options))
         names = None if options.name is None else [options.name]
         whole = self._records.all_whole(self._key, names) if options.resume else []
@@ -517,6 +518,30 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
     return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []
 
 
+_ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
+_TILE = {
+    **dict.fromkeys(("texels", "covered_times", "overlapping_texels"), int),
+    "texture?": file_name,
+    "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
+}
+_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": _TILE}
+
+
+def _tiles(value, place) -> None:
+    check(value, {str: {**_TILE, "file": file_name}}, place)
+    if wrong := [number for number in value if not number.isdecimal()]:
+        raise Malformed(f"{place} has {wrong[0]!r}, expected the number of a tile")
+
+
+# What `merge` and a summary need of a report and of its seconds (see `reading.check`).
+REPORT = {
+    "objects": [{"name": str, "uv": str, "tiles": _tiles}],
+    **dict.fromkeys(("problems", "warnings"), [str]),
+    "versions": dict,
+}
+SECONDS = {"blender?": {str: NUMBER}, str: NUMBER}
+
+
 def summary(report: dict, seconds: dict) -> list[str]:
     """Of one scene, camera and frame: a line per file, and errors where there are any."""
     found = []
@@ -526,8 +551,9 @@ def summary(report: dict, seconds: dict) -> list[str]:
             found.append(f"{tile['file']:<40}{tile['texels']:>10} texels" + (f"{took:>8.2f} s" if took else ""))
             for pass_name, figures in tile.get("errors", {}).items():
                 for name, error in figures["techniques"].items():
-                    beside = "in noise" if error["unbiased_squared_error"] < 0.0 else percent(error["unbiased_error"])
-                    noise = f"(noise {percent(figures['noise'])})"
+                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
+                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
+                    noise = f"(noise {percent(figures.get('noise'))})"
                     found.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
     return found
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from .picture import percent
+from ..reading import Malformed, check, read_json
+from .picture import REPORT, percent
 
 # What two comparisons must have in common for their errors to mean the same.
 _SAME = ("resolution", "sub_samples", "cycles_samples", "surface_samples", "reference")
@@ -40,14 +40,14 @@ class Baseline:
     def read(cls, path: Path) -> Baseline:
         """Raises OSError where the file is missing, ValueError where it is no report of a comparison."""
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-            pictures = _pictures(document)
+            document = read_json(path)
+            check(document, {"reports": [REPORT]} if "reports" in document else REPORT)
         except OSError as error:
             raise OSError(f"baseline {path}: cannot be read ({error.strerror})") from error
-        except (ValueError, KeyError, TypeError, AttributeError):
-            raise ValueError(
-                f"baseline {path}: is not the report of a comparison, expected report.json of `ltsh compare`"
-            ) from None
+        except Malformed as error:
+            reason = f"is not the report of a comparison ({error})"
+            raise ValueError(f"baseline {path}: {reason}, expected report.json of `ltsh compare`") from None
+        pictures = _pictures(document)
         if not pictures:
             raise ValueError(f"baseline {path}: has no errors against Cycles, expected report.json of `ltsh compare`")
         return cls(path, pictures)

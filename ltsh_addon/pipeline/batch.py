@@ -5,15 +5,28 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
 
 from ..files import temporary_folder
 from ..imaging import write_json, write_overview
+from ..reading import Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture
-from .tasks import FOLDER, FORMAT, Job, Records, Task, shard_of, tasks_of, write_record
+from .tasks import (
+    FOLDER,
+    FORMAT,
+    JOB,
+    TASK_RECORD,
+    Job,
+    Records,
+    Task,
+    read_document,
+    shard_of,
+    tasks_of,
+    write_record,
+)
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 
@@ -61,7 +74,7 @@ def run_tasks(
     with temporary_folder() as folder, kept_blender(folder):
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)
-        records = Records(job.options.output, "tasks")
+        records = _task_records(job.options.output, job.command)
         wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
         problems = []
         told = len(wanted) < len(mine)
@@ -104,7 +117,7 @@ def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dic
 def _is_done(records, task, existing) -> bool:
     record = records.whole(task.name, task.key if existing == RESUME else None)
     # What was wrong may be put right by now.
-    return record is not None and "problem" not in record and not record["report"].get("problems")
+    return record is not None and "report" in record and not record["report"].get("problems")
 
 
 def _perform(job: Job, task: Task, following: tuple, existing: str, progress) -> picture.TaskResult:
@@ -150,8 +163,8 @@ def merge(output: Path, progress=None) -> Merged:
     """
     output = Path(output)
     job = _read_job(output)
-    tasks = [Task(**task) for task in job["tasks"]]
-    records = Records(output, "tasks")
+    tasks = [Task(**{item.name: task[item.name] for item in fields(Task)}) for task in job["tasks"]]
+    records = _task_records(output, job["command"])
     found = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
     missing = tuple(task.name for task in tasks if found[task.name] is None)
     if len(missing) == len(tasks):
@@ -169,7 +182,7 @@ def merge(output: Path, progress=None) -> Merged:
     ]
     problems += [record["problem"] for record in found.values() if record and "problem" in record]
     problems += _different_versions(found)
-    seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}
+    seconds = {task.name: _read_seconds(output, task, job["command"]) for task in tasks if found[task.name] is not None}
     if job["single"] and units:
         report, seconds = units[0][1], _sum_of(seconds.values())
     else:
@@ -187,16 +200,21 @@ def merge(output: Path, progress=None) -> Merged:
 def _read_job(output: Path) -> dict:
     path = output / FOLDER / "job.json"
     try:
-        job = json.loads(path.read_text(encoding="utf-8"))
+        return read_document(path, JOB)
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
             f"{output}: no task has finished there; expected the folder that was given to -o of shade, compare or bake"
         ) from None
-    except ValueError as error:
-        raise ValueError(f"{path}: is damaged ({error}); run the job again with --resume") from None
-    if not isinstance(job, dict) or job.get("format") != FORMAT:
-        raise ValueError(f"{path}: was written by another version of LTSH, expected format {FORMAT}; run the job again")
-    return job
+    except OSError as error:
+        raise OSError(f"{path}: cannot be read ({error.strerror})") from error
+    except Malformed as error:
+        raise ValueError(f"{path}: {error}; run the job again with --resume") from None
+
+
+def _task_records(output, command) -> Records:
+    """Those of shade and compare hold the report of a picture; what failed has a problem instead."""
+    report = bake.REPORT if command == "bake" else picture.REPORT
+    return Records(output, "tasks", {**TASK_RECORD, "report?": report})
 
 
 def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
@@ -247,9 +265,9 @@ def _timing_path(output, task) -> Path:
     return Path(output) / FOLDER / "timing" / f"{task.name}.json"
 
 
-def _read_seconds(output, task) -> dict:
+def _read_seconds(output, task, command) -> dict:
     try:
-        return json.loads(_timing_path(output, task).read_text(encoding="utf-8"))
+        return read_json(_timing_path(output, task), bake.SECONDS if command == "bake" else picture.SECONDS)
     except (OSError, ValueError):
         return {}
 

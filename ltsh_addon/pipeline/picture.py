@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import check_takes_files
+from ..reading import NUMBER, some
 from ..scene import (
     CYCLES,
     PASSES,
@@ -472,6 +473,25 @@ def _title(name: str) -> str:
     return TECHNIQUES[name].title if name in TECHNIQUES else name
 
 
+_ERRORS = {"relative_l2?": NUMBER | None}
+_ROW = {
+    "against_cycles?": {"unbiased_relative_error?": NUMBER | None, "unbiased_squared_error?": NUMBER | None},
+    "against_reference?": {**_ERRORS, "metals?": _ERRORS, "dielectrics?": _ERRORS},
+}
+# What `merge`, a baseline and a summary need of a report and of its seconds (see `reading.check`).
+REPORT = {
+    "scene": str,
+    "camera": str | None,
+    "frame": int,
+    "reference": dict | None,
+    **dict.fromkeys(("resolution", "warnings"), list),
+    **dict.fromkeys(("sub_samples", "cycles_samples", "surface_samples"), int),
+    "versions": dict,
+    "passes": some({str: {"noise?": NUMBER | None, "techniques": {str: _ROW}}}),
+}
+SECONDS = {"techniques?": {str: {str: NUMBER}}, str: NUMBER}
+
+
 def percent(value) -> str:
     """A share as text."""
     return "-" if value is None else f"{100.0 * value:.2f} %"
@@ -510,5 +530,5 @@ def brief(report: dict) -> list[str]:
         if "against_cycles" in row:
             errors.append(f"{name} {unbiased(row['against_cycles'])}")
         elif "against_reference" in row:
-            errors.append(f"{name} {percent(row['against_reference']['relative_l2'])}")
+            errors.append(f"{name} {percent(row['against_reference'].get('relative_l2'))}")
     return [f"{report['name']:<32}" + (f" {pass_name}: " + ", ".join(errors) if errors else "")]

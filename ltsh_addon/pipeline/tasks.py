@@ -13,12 +13,36 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ..imaging import write_json
+from ..reading import Malformed, check, file_name, read_json, some
 from ..scene import VERSION
 from .options import what_matters
 
 FOLDER = ".ltsh"
 FORMAT = 1
 LONGEST_STEM = 100
+# What documents must have (see `reading.check`).
+_TASK = {
+    **dict.fromkeys(("scene", "key"), str),
+    **dict.fromkeys(("camera", "object"), str | None),
+    **dict.fromkeys(("frame", "tile"), int | None),
+    "name": file_name,
+}
+JOB = {
+    "command": ("shade", "compare", "bake"),
+    **dict.fromkeys(("single", "any_key"), bool),
+    "applied_layer": str | None,
+    "tasks": some([_TASK]),
+}
+
+
+def _check_files(files, place) -> None:
+    check(files, {str: {"bytes": int, "sha256": str}}, place)
+    for name in files:
+        file_name(name, place)
+
+
+_RECORD = {"key": str, "files": _check_files, "problem?": str}
+TASK_RECORD = {"task": _TASK}
 _digests: dict[tuple, str] = {}
 
 
@@ -186,10 +210,11 @@ def default_pattern(first: str, varying: Iterable[str]) -> str:
 
 
 class Records:
-    """Records of one kind ("tasks", "tiles") in the folder `output`."""
+    """Records of one kind ("tasks", "tiles") in the folder `output`; `shape` is that of their "task" and "report"."""
 
-    def __init__(self, output: Path, kind: str):
+    def __init__(self, output: Path, kind: str, shape: dict):
         self.output, self._folder = Path(output), Path(output) / FOLDER / kind
+        self._shape = {**_RECORD, **shape}
 
     def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
         """Write the record `name`: the task's `files`, by names below the folder, are there; returns it.
@@ -207,7 +232,7 @@ class Records:
 
     def whole(self, name: str, key: str | None) -> dict | None:
         """The record `name` if its key is `key` (None: any) and all of its files are as they were written."""
-        record = _read(self._path(name))
+        record = self._read(self._path(name))
         if record is None or (key is not None and record["key"] != key) or not self.has_files(record):
             return None
         return record
@@ -215,9 +240,11 @@ class Records:
     def has_files(self, record: dict) -> bool:
         """True where the files are there, with the sizes and digests of the record."""
         try:
+            # A pipe or a device may be as large as it likes, and endless.
             return all(
-                (self.output / file).stat().st_size == facts["bytes"]
-                and file_digest(self.output / file) == facts["sha256"]
+                (path := self.output / file).is_file()
+                and path.stat().st_size == facts["bytes"]
+                and file_digest(path) == facts["sha256"]
                 for file, facts in record["files"].items()
             )
         except OSError:
@@ -231,11 +258,17 @@ class Records:
             # A name may hold anything that a pattern would take for more.
             found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
             paths = sorted(path for group in found for path in group)
-        records = map(_read, paths)
+        records = map(self._read, paths)
         return [record for record in records if record and record["key"] == key and self.has_files(record)]
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"
+
+    def _read(self, path: Path) -> dict | None:
+        try:
+            return read_document(path, self._shape)
+        except (OSError, ValueError):
+            return None  # absent, or not ours: the task is done again
 
 
 def write_record(path: Path, document: dict) -> None:
@@ -244,13 +277,13 @@ def write_record(path: Path, document: dict) -> None:
     write_json(path, document)
 
 
-def _read(path: Path) -> dict | None:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None  # absent, or not ours: the task is done again
-    known = isinstance(record, dict) and record.get("format") == FORMAT
-    return record if known and isinstance(record.get("files"), dict) and "key" in record else None
+def read_document(path: Path, shape: dict) -> dict:
+    """The record or job in a file, of this version. Raises OSError, Malformed."""
+    document = read_json(path, {"format": int})
+    if document["format"] != FORMAT:
+        raise Malformed(f"was written by another version of LTSH, expected format {FORMAT}")
+    check(document, shape)
+    return document
 
 
 def options_digest(command: str, options, contents: str) -> str:

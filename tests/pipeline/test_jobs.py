@@ -65,7 +65,7 @@ def test_merging_names_what_is_missing(capsys, child, room, tmp_path):
     assert run(capsys, "merge", out, "--quiet")[2] == "missing: shade_0003\n"
     (out / ".ltsh" / "job.json").write_text("{")
     code, _, stderr = run(capsys, "merge", out, "--quiet")
-    assert code == 1 and "job.json: is damaged" in stderr
+    assert code == 1 and "job.json: is no JSON" in stderr
 
 
 def test_shards_of_other_options_or_scenes_are_missing(capsys, child, room, tmp_path):

@@ -47,7 +47,7 @@ def test_the_command_line_gives_every_option_back(command, kind, values):
 @KINDS
 def test_job_files_have_the_options_of_the_command_line(command, kind, values):
     declared = {flag.lstrip("-") for _, arguments in arguments_of(kind).values() for item in arguments
-                for flag in item.flags} - {"scenes", "o"}  # fmt: skip
+                for flag in item.flags} - {"scenes", "o", "enable-autoexec"}  # fmt: skip
     baseline = {"baseline", "tolerance"} if command == "compare" else set()
     assert set(job_file._options(commands.job_parsers()[command])) == declared | baseline
 

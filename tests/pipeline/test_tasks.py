@@ -97,13 +97,13 @@ def test_shards_are_disjoint_and_together_everything(room, tmp_path):
 
 
 def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
-    records = tasks.Records(tmp_path, "tiles")
+    records = tasks.Records(tmp_path, "tiles", {"task": {"name": str}})
     names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
     for name in names:
         records.write(name, "key", {"name": name}, ())
     read = []
-    read_one = tasks._read
-    monkeypatch.setattr(tasks, "_read", lambda path: read.append(path) or read_one(path))
+    read_one = tasks.read_document
+    monkeypatch.setattr(tasks, "read_document", lambda path, shape: read.append(path) or read_one(path, shape))
 
     def found(*stems):
         return {record["task"]["name"] for record in records.all_whole("key", stems or None)}

@@ -30,6 +30,7 @@ NAME_FIELDS = ("scene", "camera", "frame", "object")
 LONGEST_NAME = 200
 # Letters that some file system refuses or takes for something else: separators, wildcards, quotes.
 _REFUSED = '\\:*?"<>|'
+_FRAME_DIGITS = re.compile(r"0?(?:[1-9]\d?)?d?", re.ASCII)
 _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 
 
@@ -184,9 +185,11 @@ def _name(pattern: str, known: tuple[str, ...]) -> str:
     if not pattern or len(pattern) > LONGEST_NAME:
         raise ValueError(f"name has {len(pattern)} letters, expected 1 to {LONGEST_NAME}")
     try:
-        for _, name, _, conversion in string.Formatter().parse(pattern):
+        for _, name, digits, conversion in string.Formatter().parse(pattern):
             if name is not None and (name not in known or conversion):
                 raise ValueError(f"name {pattern!r}: {{{name}}} is unknown, {expected}")
+            if digits and not (name == "frame" and _FRAME_DIGITS.fullmatch(digits)):
+                raise ValueError(f"name {pattern!r}: {{{name}:{digits}}} is no way to write it, {expected}")
         example = pattern.format(**{name: 1 if name == "frame" else "x" for name in known})
     except (KeyError, IndexError, ValueError) as error:
         text = str(error)

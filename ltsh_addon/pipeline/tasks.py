@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import string
 from collections import Counter
 from collections.abc import Iterable
@@ -14,12 +15,13 @@ from typing import Any
 
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
-from ..scene import VERSION
+from ..scene import VERSION, shortened
 from .options import what_matters
 
 FOLDER = ".ltsh"
 FORMAT = 1
-LONGEST_STEM = 100
+# In bytes: file names have at most 255, with what is added to them.
+LONGEST_STEM, LONGEST_NAME = 100, 200
 # What documents must have (see `reading.check`).
 _TASK = {
     **dict.fromkeys(("scene", "key"), str),
@@ -109,13 +111,13 @@ class Task:
 
 
 class NameClash(ValueError):
-    """Two tasks would write the same file."""
+    """Tasks cannot have the names that they would get."""
 
 
 def tasks_of(job: Job, progress=None) -> list[Task]:
     """All tasks of `job`. Opens the files in Blender where tasks or names depend on what is in them.
 
-    Raises NameClash where two tasks would write the same file, SceneError, OSError.
+    Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
     from ..blender.process.client import check_readable
 
@@ -175,6 +177,9 @@ def _tasks(job, unit, fields, facts, contents) -> list[Task]:
 def _check_names(job, tasks) -> None:
     counts = Counter(task.name.casefold() for task in tasks)
     for task in tasks:
+        if too_long := [part for part in task.name.split("/") if len(os.fsencode(part)) > LONGEST_NAME]:
+            found = f"{shortened(too_long[0], 60)!r}, {len(os.fsencode(too_long[0]))} bytes long"
+            raise NameClash(f"name {job.pattern!r} gives {found}, expected at most {LONGEST_NAME}: use a shorter one")
         if counts[task.name.casefold()] > 1:
             counts = {"scene": job.scenes, "camera": job.cameras, "frame": job.frames}
             missing = [name for name, values in counts.items() if len(values) > 1]
@@ -189,10 +194,11 @@ def file_stems(names: Iterable[str]) -> list[str]:
     stems, taken = [], set()
     for name in names:
         stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
-        candidate, number = stem[:LONGEST_STEM], 1
+        stem = os.fsencode(stem)[:LONGEST_STEM].decode("utf-8", "ignore")
+        candidate, number = stem, 1
         while candidate.casefold() in taken:
             number += 1
-            candidate = f"{stem[:LONGEST_STEM]}_{number}"
+            candidate = f"{stem}_{number}"
         taken.add(candidate.casefold())
         stems.append(candidate)
     return stems

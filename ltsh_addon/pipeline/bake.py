@@ -65,8 +65,8 @@ def bake_objects(
 
     start = time.perf_counter()
     _check(options)
-    tables = picture.prepare(options)
     client.check_readable(options.scene)
+    tables = picture.prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:
         manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)

@@ -69,7 +69,10 @@ def run_tasks(
     record can be written.
     """
     from ..blender.process.blender_process import kept_blender
+    from ..blender.process.client import check_readable
 
+    for scene in job.scenes:
+        check_readable(Path(scene))
     picture.prepare(job.options)
     with temporary_folder() as folder, kept_blender(folder):
         tasks = tasks_of(job, progress)

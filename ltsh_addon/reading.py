@@ -96,9 +96,9 @@ def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.n
             if total > MOST_UNPACKED:
                 raise Malformed(f"holds {total >> 20} MiB of arrays, expected at most {MOST_UNPACKED >> 20} MiB")
             return {name: _array(archive, entry) for name, entry in entries.items()}
-    except Malformed:
+    except (Malformed, OSError):
         raise
-    # zipfile and numpy raise almost anything: BadZipFile, zlib.error, struct.error, NotImplementedError, SyntaxError ...
+    # zipfile and numpy raise almost anything: BadZipFile, zlib.error, struct.error, NotImplementedError ...
     except Exception as error:
         raise Malformed(f"is no .npz: {error_line(error)}") from None
 

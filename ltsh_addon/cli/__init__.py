@@ -7,6 +7,8 @@ Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the argu
 from __future__ import annotations
 
 import argparse
+import contextlib
+import errno
 import logging
 import re
 import shlex
@@ -14,13 +16,14 @@ import sys
 
 from .. import interruption
 from ..pipeline.tasks import NameClash
+from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Misuse
 from .commands import add_bake, add_compare, add_demo, add_merge, add_run, add_shade, add_tables
 from .job_file import Mistakes
 from .output import print_json
-from .progress import ProgressBar, RunLog
+from .progress import ProgressBar, RunLog, print_out
 
 EXAMPLES = """examples:
   %(prog)s demo -o out/demo
@@ -49,7 +52,10 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with arguments in one line."""
+    """Says what is wrong with arguments in one line, and help as results are said."""
+
+    def _print_message(self, message, file=None):
+        print_out(message.rstrip("\n"))
 
     def error(self, message):
         raise Misuse(f"{self.prog}: {message}; see {self.prog} --help")
@@ -61,17 +67,19 @@ def _main(arguments, program, open_file, bar) -> int:
     except SystemExit as stop:  # argparse has printed help
         return int(stop.code or 0)
     except Misuse as error:
-        return _fail("--json" in arguments, bar or ProgressBar(sys.stderr), [str(error)], 2)
-    try:
-        log = RunLog(options.log)
-    except OSError as error:
-        return _fail(getattr(options, "json", False), bar or ProgressBar(sys.stderr), [f"{program}: {error}"], 1)
-    with log:
+        return _fail("--json" in arguments, bar or ProgressBar(sys.stderr), [error_line(error)], 2)
+    except OSError as error:  # printing help
+        return _fail(False, ProgressBar(sys.stderr), [f"{program}: {error}"], 1)
+    with RunLog(options.log) as log:
         log.line(f"{program} {shlex.join(arguments)}")
         bar = bar or ProgressBar(sys.stderr, quiet=options.quiet, log=log)
+        if log.problem:
+            return _fail(getattr(options, "json", False), bar, [f"{program}: {log.problem}"], 1)
         code = _run(options, program, bar, open_file)
         log.line(f"exit code {code}")
-    return code
+        if log.problem:
+            bar.note(f"{program}: {log.problem}")
+    return code or (1 if log.problem else 0)
 
 
 def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
@@ -85,6 +93,8 @@ def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
 def _explained(error) -> tuple[list[str], int]:
     """What is to be said about an error, and the exit code."""
     text = error_line(error)
+    if isinstance(error, OSError) and error.errno == errno.EMFILE:
+        text = "this process may not open as many files as it needs; raise the limit (ulimit -n)"
     if isinstance(error, Mistakes):
         return error.lines, 1 if error.of_the_world else 2
     if isinstance(error, Misuse | NameClash):
@@ -102,12 +112,15 @@ def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
     for line in lines:
         bar.note(line)
     if as_json:
-        print_json({"errors": lines})
+        with contextlib.suppress(OSError):
+            print_json({"errors": lines})
     return code
 
 
 def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
     """What the arguments mean. Raises Misuse."""
+    if wrong := [word for word in arguments if not is_text(word)]:
+        raise Misuse(f"{program}: argument {wrong[0]!r} has bytes that are not UTF-8; rename what it names")
     parser, commands = _parser(program)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
         known = f"expected one of {', '.join(commands)}"

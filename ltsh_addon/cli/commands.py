@@ -30,7 +30,7 @@ from .arguments import (
 )
 from .job_file import FileJob, read_jobs
 from .output import baseline_of, do_job, merge_job, print_json
-from .progress import say
+from .progress import print_out
 
 DEMO_RESOLUTION = (480, 270)
 DEMO = "Build the example scene, OUT/demo.blend, and do with it what compare does."
@@ -312,5 +312,5 @@ def _export_tables(arguments, bar, open_file) -> int:
     if arguments.json:
         print_json({"tables": paths})
     else:
-        say("\n".join(path for written in paths.values() for path in written), sys.stdout)
+        print_out("\n".join(path for written in paths.values() for path in written))
     return 0

@@ -11,7 +11,7 @@ from ..imaging.report import json_text
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.tasks import Job
-from .progress import say
+from .progress import print_out
 
 
 def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
@@ -57,7 +57,7 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
 
 def print_json(document) -> None:
     """One document on stdout, in ASCII: a redirected stdout may lack the letters of a light's name."""
-    say(json.dumps(json.loads(json_text(document)), indent=2), sys.stdout)
+    print_out(json.dumps(json.loads(json_text(document)), indent=2))
 
 
 def baseline_of(arguments) -> Baseline | None:
@@ -69,7 +69,7 @@ def baseline_of(arguments) -> Baseline | None:
 def _print(text, arguments, bar) -> None:
     bar.log.line(text.splitlines()[-1])
     if not arguments.json:
-        say(text, sys.stdout)
+        print_out(text)
 
 
 def _complain(bar, what: str, lines) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -9,14 +12,18 @@ from pathlib import Path
 
 
 class RunLog:
-    """Lines for the file `path`; without one they go nowhere. A context, which closes it. Raises OSError."""
+    """Lines for the file `path`; without one they go nowhere. A context, which closes it.
+
+    A log that cannot be written does not end what it is about: `problem` then says why, and no more is written.
+    """
 
     def __init__(self, path: Path | None):
+        self._path, self._file, self.problem = path, None, None
         try:
             # Unbuffered, so that a line is one write, however long: several shards may write to one log.
             self._file = None if path is None else open(path, "ab", buffering=0)
         except OSError as error:
-            raise OSError(f"log {path}: cannot be written ({error.strerror}); choose another with --log") from error
+            self._fail(error)
 
     def __enter__(self) -> RunLog:
         return self
@@ -27,10 +34,16 @@ class RunLog:
 
     def line(self, text: str) -> None:
         """Append a line, with the time."""
-        if self._file is not None:
+        if self._file is not None and self.problem is None:
             stamp = datetime.now().astimezone().isoformat(timespec="seconds")
-            # Names of files may hold bytes that are no UTF-8.
-            self._file.write(f"{stamp} {' '.join(text.split())}\n".encode(errors="backslashreplace"))
+            try:
+                # Names of files may hold bytes that are no UTF-8.
+                self._file.write(f"{stamp} {' '.join(text.split())}\n".encode(errors="backslashreplace"))
+            except OSError as error:
+                self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self.problem = f"log {self._path}: cannot be written ({error.strerror}); choose another with --log"
 
 
 BAR_WIDTH = 28
@@ -77,7 +90,7 @@ class ProgressBar:
             if self._terminal:
                 self._draw(stage, fraction, now)
             else:
-                print(f"{stage}: {100.0 * fraction:.0f} % {self._remaining(fraction, now)}".rstrip(), file=self._stream)
+                self._say(f"{stage}: {100.0 * fraction:.0f} % {self._remaining(fraction, now)}".rstrip())
         return True
 
     def begin_job(self, label: str) -> None:
@@ -86,7 +99,7 @@ class ProgressBar:
         self._tasks, self._stage = 1, None
         self.log.line(label)
         if not self._quiet:
-            say(label, self._stream)
+            self._say(label)
 
     def begin_task(self, number: int, tasks: int) -> None:
         """Task `number`, from 1, of so many begins."""
@@ -106,9 +119,7 @@ class ProgressBar:
             self._draw(f"{self._task} of {self._tasks} {name}", share, now)
         else:
             left = "" if self._task == self._tasks else self._remaining(share, now)
-            text = f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s {left}".rstrip()
-            say(text, self._stream)
-            self._stream.flush()
+            self._say(f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s {left}".rstrip())
         if self._task == self._tasks:
             self.finish()
             self._tasks = 1
@@ -118,20 +129,19 @@ class ProgressBar:
         self.finish()
         self.log.line(text)
         if not self._quiet:
-            say(text, self._stream)
+            self._say(text)
 
     def note(self, text: str) -> None:
         """Print a line that is no progress, also when quiet, and log it."""
         self.finish()
-        say(text, self._stream)
+        self._say(text)
         self.log.line(text)
 
     def _draw(self, stage, fraction, now):
         filled = round(min(max(fraction, 0.0), 1.0) * BAR_WIDTH)
         bar = "#" * filled + "-" * (BAR_WIDTH - filled)
         text = f"{stage:<24.24} [{bar}] {100.0 * fraction:3.0f} % {self._remaining(fraction, now)}"
-        self._stream.write(f"\r{text:<79}")
-        self._stream.flush()
+        self._write(f"\r{text:<79}")
         self._line_open = True
 
     def _remaining(self, fraction, now) -> str:
@@ -145,9 +155,20 @@ class ProgressBar:
     def finish(self) -> None:
         """End the current line, so that what follows starts on its own."""
         if self._line_open:
-            self._stream.write("\n")
-            self._stream.flush()
+            self._write("\n")
             self._line_open = False
+
+    def _say(self, text: str) -> None:
+        self._write(f"{text}\n")
+
+    def _write(self, text: str) -> None:
+        """Nobody is left to be told where the stream takes no more: its terminal is closed, its disk is full."""
+        if self._stream is not None:
+            try:
+                self._stream.write(_in_letters_of(self._stream, text))
+                self._stream.flush()
+            except OSError:
+                self._stream, self._quiet = None, True
 
 
 def duration(seconds: float) -> str:
@@ -157,11 +178,25 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def say(text: str, stream) -> None:
-    """Print to `stream`, which is None when it was closed; letters that its encoding lacks are spelled out."""
-    if stream is not None:
-        encoding = stream.encoding or "ascii"
-        print(text.encode(encoding, "backslashreplace").decode(encoding), file=stream)
+def print_out(text: str) -> None:
+    """Print on stdout, if there is one, at once. Raises OSError where it takes no more, and nothing goes there then."""
+    stdout = sys.stdout
+    if stdout is None:
+        return
+    try:
+        stdout.write(_in_letters_of(stdout, f"{text}\n"))
+        stdout.flush()
+    except OSError as error:
+        # What is left in its buffer would raise again at the end of the process.
+        with contextlib.suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stdout.fileno())
+        raise OSError(f"stdout: cannot be written ({error.strerror})") from error
+
+
+def _in_letters_of(stream, text: str) -> str:
+    """Letters that the encoding of the stream lacks are spelled out."""
+    encoding = stream.encoding or "ascii"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
 REPORT_SECONDS = 0.1

@@ -117,6 +117,20 @@ def check_takes_files(folder: str | os.PathLike) -> None:
 
 
 @contextmanager
+def no_empty_folder(folder: str | os.PathLike) -> Iterator[None]:
+    """Meanwhile `folder` may be made; where the block raises and has left it empty, it is deleted again."""
+    path = Path(folder).absolute()
+    missing = [part for part in (path, *path.parents) if not os.path.exists(part)]
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for part in missing:
+                part.rmdir()
+        raise
+
+
+@contextmanager
 def temporary_folder() -> Iterator[Path]:
     """A temporary folder that only this user may open, deleted at the end.
 

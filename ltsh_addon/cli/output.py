@@ -49,6 +49,8 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
     _complain(bar, "missing", merged.missing)
     worse = []
     if baseline is not None:
+        if merged.command != "compare":
+            raise ValueError(f"{output}: holds what {merged.command} has made, expected comparisons beside a baseline")
         worse = baseline.worse(merged.report, arguments.tolerance)
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}

@@ -456,6 +456,8 @@ def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, p
 
     textures = []
     for record in records:
+        if any("texture" not in tile for tile in record["tiles"].values()):
+            raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
         files = [
             {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
             for number, tile in record["tiles"].items()

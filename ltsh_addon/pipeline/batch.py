@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
 
-from ..files import temporary_folder
+from ..files import no_empty_folder, temporary_folder
 from ..imaging import write_json, write_overview
 from ..reading import Malformed, read_json
 from ..scene import Progress, SceneError, error_line
@@ -69,15 +69,13 @@ def run_tasks(
     record can be written.
     """
     from ..blender.process.blender_process import kept_blender
-    from ..blender.process.client import check_readable
 
-    for scene in job.scenes:
-        check_readable(Path(scene))
-    picture.prepare(job.options)
-    with temporary_folder() as folder, kept_blender(folder):
+    output = job.options.output
+    with no_empty_folder(output), temporary_folder() as folder, kept_blender(folder):
+        picture.prepare(job.options)
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)
-        records = _task_records(job.options.output, job.command)
+        records = _task_records(output, job.command)
         wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
         problems = []
         told = len(wanted) < len(mine)
@@ -93,7 +91,7 @@ def run_tasks(
                 if not told:
                     _write_job(job, tasks, existing)
                     told = True
-                write_record(_timing_path(job.options.output, task), seconds)
+                write_record(_timing_path(output, task), seconds)
                 records.write(task.name, task.key, asdict(task), files, **found)
             except OSError as error:
                 raise OSError(found.get("problem", str(error))) from error

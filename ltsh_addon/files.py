@@ -50,8 +50,8 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     temporary, lock = None, None
     try:
         check_name(target)
-        if target.is_dir():
-            raise OSError("a folder has that name")
+        if os.path.exists(target) and not target.is_file():
+            raise OSError(f"{'a folder' if target.is_dir() else 'a device or a pipe'} has that name")
         # File names have at most 255 bytes.
         start = os.fsencode(target.name)[:100].decode(errors="ignore")
         temporary, lock = _locked_file(target.parent, f".{start}.")

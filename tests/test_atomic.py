@@ -1,5 +1,6 @@
 """Files that appear complete or not at all, and what killed processes leave of them."""
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -33,6 +34,19 @@ def half_written(path):
     process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "half\n"
     return process
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no such names there")
+def test_devices_and_names_that_are_no_utf8_are_left_alone(tmp_path):
+    """A link to /dev/null is such a device; OpenEXR ends the process when it gets such a name."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    for name, reason in (("link", "a device or a pipe has that name"), ("a\udcff", "not UTF-8")):
+        with pytest.raises(OSError, match=reason):
+            write_bytes(tmp_path / name, b"new")
+    with pytest.raises(OSError, match="not UTF-8"):
+        check_takes_files(tmp_path / "d\udcff")
+    assert names(tmp_path) == ["link", "pipe"] and (tmp_path / "pipe").is_fifo()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are not killed by signals there")

@@ -115,3 +115,17 @@ def test_an_exception_removes_the_folder(folder):
         (made / "file").write_bytes(b"x")
         raise KeyError
     assert everything(folder) == []
+
+
+def test_a_process_that_may_open_no_more_files_leaves_no_folder(folder, monkeypatch):
+    opened = os.open
+
+    def refuse(path, *arguments, **options):
+        if Path(path).parent == folder:
+            raise OSError(24, "Too many open files", str(path))
+        return opened(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(OSError, match="cannot hold temporary files: Too many open files"), files.temporary_folder():
+        pass
+    assert everything(folder) == []

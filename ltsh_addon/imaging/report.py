@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..files import write_bytes
-from ..reading import NUMBER, Malformed, file_name, read_json, some
+from ..reading import NUMBER, Malformed, check, file_name, read_json, some
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
@@ -176,8 +176,20 @@ _GROUP = {
     "names": some([str]),
     "passes": some([str]),
     "scales": {str: NUMBER},
+    "figures?": {str: {"noise?": NUMBER | None, "techniques": {str: {str: NUMBER | None}}}},
 }
-_INDEX = {"command": str, "partial": str, "report": dict, "groups": some({str: _GROUP})}
+
+
+def _check_group(group, place) -> None:
+    check(group, _GROUP, place)
+    rows = [name for figures in group.get("figures", {}).values() for name in figures["techniques"]]
+    for names, known in (((*group["names"], *rows), "labels"), (group["passes"], "scales")):
+        if missing := [name for name in names if name not in group[known]]:
+            raise Malformed(f"{place}.{known} has no {missing[0]!r}")
+
+
+_REPORT = {"warnings?": [str], "problems?": [str]}
+_INDEX = {"command": str, "partial": str, "report": _REPORT, "groups": some({str: _check_group})}
 
 
 def write_index(folder: Path, index: dict) -> None:

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
+from ..scene import shortened
+
 
 class RunLog:
     """Lines for the file `path`; without one they go nowhere. A context, which closes it.
@@ -47,6 +49,7 @@ class RunLog:
 
 
 BAR_WIDTH = 28
+LONGEST_LINE = 1000
 # Seconds between two drawings of the bar, and between two lines of a log that tell that a long stage goes on.
 BAR_INTERVAL, LOG_INTERVAL = 0.1, 10.0
 
@@ -132,8 +135,13 @@ class ProgressBar:
             self._say(text)
 
     def note(self, text: str) -> None:
-        """Print a line that is no progress, also when quiet, and log it."""
+        """Print a line that is no progress, also when quiet, and log it.
+
+        It may hold names from files of others: those do not speak to the terminal.
+        """
         self.finish()
+        text = shortened(" ".join(text.split()), LONGEST_LINE)
+        text = "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
         self._say(text)
         self.log.line(text)
 

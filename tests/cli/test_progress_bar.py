@@ -161,3 +161,10 @@ def test_names_that_are_no_utf8_can_be_logged(tmp_path):
     with RunLog(path) as log:
         log.line(f"shade {os.fsdecode(b'caf')}{chr(0xDCE9)}.blend\nBücher")
     assert lines_of(path) == ["shade caf\\udce9.blend Bücher"]
+
+
+def test_a_note_is_one_line_that_cannot_speak_to_the_terminal():
+    stream = io.StringIO()
+    ProgressBar(stream).note("warning: light 'a\x1b[2J\nb'" + "x" * 5000 + " is not shaded")
+    (line,) = stream.getvalue().splitlines()
+    assert line.startswith("warning: light 'a\\x1b[2J b'xx") and line.endswith("x is not shaded") and len(line) < 1100

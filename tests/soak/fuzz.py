@@ -408,9 +408,7 @@ def limits(generator, folder):
         size = int(generator.integers(0, 3000))
         return Case(command, (DONE, WORLD), lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))
     if kind == 2:
-        return Case(
-            command, (DONE, WORLD), environment={"TMPDIR": choose(generator, ["/proc", "/none", "room.blend"])}
-        )
+        return Case(command, (DONE, WORLD), environment={"TMPDIR": choose(generator, ["/proc", "/none", "room.blend"])})
     return Case(command, (DONE, WORLD, MISUSE), lambda: (os.mkdir("gone"), os.chdir("gone"), os.rmdir("../gone")))
 
 

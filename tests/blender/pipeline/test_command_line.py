@@ -40,7 +40,7 @@ def test_compare_as_a_program(room, out, temporary_root):
 
 def test_an_unknown_camera_is_one_line(capsys, room, out):
     code, _, stderr = run(capsys, "shade", room, "-o", out, "--camera", "Nobody", "--quiet")
-    assert code == 1 and "'Nobody'" in stderr and "'Camera'" in stderr and list(out.iterdir()) == []
+    assert code == 1 and "'Nobody'" in stderr and "'Camera'" in stderr and not out.exists()
 
 
 def test_the_demo_end_to_end(capsys, out):

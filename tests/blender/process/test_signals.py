@@ -59,7 +59,7 @@ def ends(process: int, seconds: float) -> bool:
 
 
 def left_over(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if not is_blenders_own(path)]
+    return [path for path in folder.glob("*") if not is_blenders_own(path)]
 
 
 def compare(room, out):

@@ -97,6 +97,8 @@ def _summary(merged: Merged, output) -> str:
 
 def reserve_stdout() -> None:
     """Keep stdout for what sys.stdout prints: from now on, Blender's own lines (from C) go to stderr."""
+    if sys.stdout is None:
+        return
     sys.stdout.flush()
     ours = os.dup(1)
     os.dup2(2, 1)

@@ -522,7 +522,7 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
 
 _ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
 _TILE = {
-    **dict.fromkeys(("texels", "covered_times", "overlapping_texels"), int),
+    **dict.fromkeys(("texels", "covered_times", "overlapping_texels"), NUMBER),
     "texture?": file_name,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
 }
@@ -535,13 +535,12 @@ def _tiles(value, place) -> None:
         raise Malformed(f"{place} has {wrong[0]!r}, expected the number of a tile")
 
 
-# What `merge` and a summary need of a report and of its seconds (see `reading.check`).
+# What `merge` and a summary need of a report (see `reading.check`).
 REPORT = {
     "objects": [{"name": str, "uv": str, "tiles": _tiles}],
     **dict.fromkeys(("problems", "warnings"), [str]),
     "versions": dict,
 }
-SECONDS = {"blender?": {str: NUMBER}, str: NUMBER}
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
@@ -550,7 +549,8 @@ def summary(report: dict, seconds: dict) -> list[str]:
     for record in report["objects"]:
         for tile in record["tiles"].values():
             took = seconds.get(tile["file"])
-            found.append(f"{tile['file']:<40}{tile['texels']:>10} texels" + (f"{took:>8.2f} s" if took else ""))
+            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
+            found.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
             for pass_name, figures in tile.get("errors", {}).items():
                 for name, error in figures["techniques"].items():
                     in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..files import no_empty_folder, temporary_folder
 from ..imaging import write_json, write_overview
-from ..reading import Malformed, read_json
+from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture
 from .tasks import (
@@ -183,7 +183,7 @@ def merge(output: Path, progress=None) -> Merged:
     ]
     problems += [record["problem"] for record in found.values() if record and "problem" in record]
     problems += _different_versions(found)
-    seconds = {task.name: _read_seconds(output, task, job["command"]) for task in tasks if found[task.name] is not None}
+    seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}
     if job["single"] and units:
         report, seconds = units[0][1], _sum_of(seconds.values())
     else:
@@ -266,9 +266,9 @@ def _timing_path(output, task) -> Path:
     return Path(output) / FOLDER / "timing" / f"{task.name}.json"
 
 
-def _read_seconds(output, task, command) -> dict:
+def _read_seconds(output, task) -> dict:
     try:
-        return read_json(_timing_path(output, task), bake.SECONDS if command == "bake" else picture.SECONDS)
+        return read_json(_timing_path(output, task), picture.SECONDS)
     except (OSError, ValueError):
         return {}
 
@@ -280,7 +280,7 @@ def _sum_of(seconds) -> dict:
         for name, value in part.items():
             before = total.get(name)
             if isinstance(value, dict):
-                total[name] = _sum_of([before or {}, value])
+                total[name] = _sum_of([before if isinstance(before, dict) else {}, value])
             else:
-                total[name] = value + (before or 0.0)
+                total[name] = value + (before if isinstance(before, NUMBER) else 0.0)
     return total

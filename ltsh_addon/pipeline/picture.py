@@ -15,6 +15,7 @@ import numpy as np
 
 from .. import imaging, shading
 from ..files import check_takes_files
+from ..reading import NUMBER, check, some
 from ..reading import NUMBER, some
 from ..scene import (
     CYCLES,
@@ -478,18 +479,27 @@ _ROW = {
     "against_cycles?": {"unbiased_relative_error?": NUMBER | None, "unbiased_squared_error?": NUMBER | None},
     "against_reference?": {**_ERRORS, "metals?": _ERRORS, "dielectrics?": _ERRORS},
 }
-# What `merge`, a baseline and a summary need of a report and of its seconds (see `reading.check`).
+# What `merge`, a baseline and a summary need of a report (see `reading.check`).
 REPORT = {
     "scene": str,
     "camera": str | None,
     "frame": int,
     "reference": dict | None,
-    **dict.fromkeys(("resolution", "warnings"), list),
+    "resolution": list,
+    **dict.fromkeys(("warnings", "problems?"), [str]),
     **dict.fromkeys(("sub_samples", "cycles_samples", "surface_samples"), int),
     "versions": dict,
     "passes": some({str: {"noise?": NUMBER | None, "techniques": {str: _ROW}}}),
 }
-SECONDS = {"techniques?": {str: {str: NUMBER}}, str: NUMBER}
+
+
+def _seconds(value, place) -> None:
+    """A number, or a table of them."""
+    check(value, {str: _seconds} if isinstance(value, dict) else NUMBER, place)
+
+
+# What a picture or a bake took.
+SECONDS = {"techniques?": {str: {str: NUMBER}}, str: _seconds}
 
 
 def percent(value) -> str:

@@ -671,6 +671,8 @@ def main() -> int:
                 )
             shutil.rmtree(folder)
             shutil.rmtree(temporary)
+            if (number + 1) % 500 == 0:
+                print(f"  {number + 1} cases, {time.monotonic() - start:.0f} s", flush=True)
     for kind in dict.fromkeys(kind for kind, _ in counts):
         codes = ", ".join(
             f"{count} ended with {code}" for (name, code), count in sorted(counts.items()) if name == kind

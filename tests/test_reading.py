@@ -69,8 +69,8 @@ LEVELS = reading.MOST_LEVELS
     [
         *((kind, b"[" * 100_000, "more than 32 lists or tables|is no TOML") for kind in ("json", "toml")),
         ("json", b'{"a":' * LEVELS + b"{}" + b"}" * LEVELS, "more than 32 lists"),
-        ("json", b"[0," + b"0," * reading.MOST_COMMAS + b"0]", "more than 2000000 values"),
-        ("json", b" " * (reading.MOST_JSON + 1), "more than 64 MiB"),
+        ("json", b"[0," + b"0," * reading.MOST_COMMAS + b"0]", "more than 4000000 values"),
+        ("json", b" " * (reading.MOST_JSON + 1), "more than 128 MiB"),
         ("json", b'{"a": 9223372036854775808}', "does not fit into 64 bits"),
         ("json", b"9" * 5000, "is no JSON: Exceeds the limit"),
         ("json", b'{"a": NaN}', "is no JSON: NaN is no number"),

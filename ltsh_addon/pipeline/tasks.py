@@ -272,9 +272,10 @@ class Records:
 
     def _read(self, path: Path) -> dict | None:
         try:
-            return read_document(path, self._shape)
+            record = read_document(path, self._shape)
         except (OSError, ValueError):
             return None  # absent, or not ours: the task is done again
+        return record if {"report", "problem"} & record.keys() else None
 
 
 def write_record(path: Path, document: dict) -> None:

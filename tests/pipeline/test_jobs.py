@@ -94,7 +94,7 @@ def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
     assert batch.run_tasks(wanted).kept == 0
 
 
-@pytest.mark.parametrize("damage", ["cut", "changed", "{", '{"format": 99}', ""])
+@pytest.mark.parametrize("damage", ["cut", "changed", "report", "key", "files", "{", '{"format": 99}', ""])
 def test_what_is_not_whole_is_done_again(child, room, tmp_path, damage):
     wanted = job(room, tmp_path / "out", frames=(1, 2))
     batch.run_tasks(wanted)
@@ -103,6 +103,9 @@ def test_what_is_not_whole_is_done_again(child, room, tmp_path, damage):
     record = tmp_path / "out" / tasks.FOLDER / "tasks" / "shade_0001.json"
     if damage in ("cut", "changed"):
         image.write_bytes(image.read_bytes()[:-1] + (b"" if damage == "cut" else b"x"))
+    elif damage.isalpha():
+        whole = json.loads(record.read_text())
+        record.write_text(json.dumps({name: value for name, value in whole.items() if name != damage}))
     else:
         record.write_text(damage)
     done = batch.run_tasks(wanted, existing=batch.SKIP if damage == "cut" else batch.RESUME)

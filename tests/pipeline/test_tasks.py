@@ -100,7 +100,7 @@ def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path
     records = tasks.Records(tmp_path, "tiles", {"task": {"name": str}})
     names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
     for name in names:
-        records.write(name, "key", {"name": name}, ())
+        records.write(name, "key", {"name": name}, (), report={})
     read = []
     read_one = tasks.read_document
     monkeypatch.setattr(tasks, "read_document", lambda path, shape: read.append(path) or read_one(path, shape))

@@ -611,7 +611,8 @@ def complaints(case: Case, ended: Ended, before: dict, after: dict, left: list) 
         found.append("says nothing")
     if len(lines) > MOST_LINES or max(map(len, lines), default=0) > MOST_LETTERS:
         found.append(f"{len(lines)} lines of up to {max(map(len, lines))} letters")
-    if "--json" in case.arguments and ended.code in (DONE, WORLD) and ended.stdout:
+    is_json = "--json" in case.arguments and not {"--help", "-h", "--version"} & set(case.arguments)
+    if is_json and ended.code in (DONE, WORLD) and ended.stdout:
         try:
             json.loads(ended.stdout)
         except ValueError:

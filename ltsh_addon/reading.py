@@ -62,8 +62,11 @@ def parse_json(text: str, shape: Any = dict) -> Any:
     except ValueError as error:
         raise Malformed(f"is no JSON: {error_line(error)}") from None
     _check_contents(document)
-    if "\\u" in text and not is_text(json.dumps(document, ensure_ascii=False)):
-        raise Malformed("holds text that is no Unicode")
+    if "\\u" in text:
+        try:
+            json.dumps(document, ensure_ascii=False).encode()
+        except UnicodeEncodeError:
+            raise Malformed("holds text that is no Unicode") from None
     check(document, shape)
     return document
 
@@ -173,10 +176,9 @@ def _shown(value) -> str:
 def is_text(name: str | os.PathLike) -> bool:
     """True where a name is UTF-8 on the disk: Blender, EXR files and reports take no others."""
     try:
-        os.fsencode(name).decode("utf-8")
+        return os.fsencode(name) == os.fspath(name).encode()
     except UnicodeError:
         return False
-    return True
 
 
 def check_name(path: str | os.PathLike) -> None:

@@ -75,6 +75,7 @@ LEVELS = reading.MOST_LEVELS
         ("json", b"9" * 5000, "is no JSON: Exceeds the limit"),
         ("json", b'{"a": NaN}', "is no JSON: NaN is no number"),
         ("json", b'{"a": "\\udc00"}', "no Unicode"),
+        ("json", b'{"a": "\\udcc3\\udca9"}', "no Unicode"),  # as file names have them that are not decoded
         ("json", b'{"a": "\xff"}', "is no text in UTF-8"),
         ("json", b"", "is no JSON"),
         ("json", b"[]", r"the document is \[\], expected a table"),

@@ -593,9 +593,10 @@ def real_process(case, folder, environment) -> Ended:
             process.kill()
             texts = process.communicate()
     stdout, stderr = (text.decode(errors="backslashreplace") for text in texts)
-    started = "ltsh_addon" in stderr or not any(word in stderr for word in ("Traceback", "Fatal Python"))
-    if not started and process.returncode in (1, -case.signal_after[0]):
-        return Ended(-case.signal_after[0], stdout, "", time.monotonic() - start, 0)
+    if "ltsh_addon" not in stderr and any(word in stderr for word in WRONG):
+        stderr = ""  # Python's own, before our first line has run
+        if process.returncode == 1:
+            return Ended(-case.signal_after[0], stdout, stderr, time.monotonic() - start, 0)
     return Ended(process.returncode, stdout, stderr, time.monotonic() - start, 0)
 
 

@@ -223,8 +223,8 @@ def _check_arrays(arrays, metadata) -> None:
             raise Malformed(f"{key} has {value.ndim} axes of {value.dtype}, expected {len(least)} of floats")
         if any(count < limit for count, limit in zip(value.shape, least, strict=True)):
             raise Malformed(f"{key} has shape {value.shape}, expected at least {least}")
-        if not np.isfinite(value).all():
-            raise Malformed(f"{key} holds NaN or infinity, expected finite numbers")
+        if not (np.abs(value) <= np.finfo(np.float32).max).all():
+            raise Malformed(f"{key} holds NaN or infinity in single precision, expected finite numbers")
     (rows, columns), curves = arrays["warp"].shape[:2], len(arrays["fresnel_curves"])
     is_ltc = metadata["family"] == "ltc"
     shapes = {

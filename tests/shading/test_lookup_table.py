@@ -167,6 +167,7 @@ SPOILED = [
       for change in ({"family": "ltx"}, {"degree": 12}, {"degree": "2"}, {"degree": None}, {"degree": 3})),
     *((lambda arrays, _, key=key, value=value: arrays[key].flat.__setitem__(arrays[key].size // 2, value),
        "NaN or infinity") for key in ARRAYS for value in (np.nan, np.inf)),
+    (lambda arrays, _: arrays.update(warp=arrays["warp"].astype(float) * 1e300), "infinity in single precision"),
     *((lambda arrays, _, key=key, index=index: arrays.update({key: arrays[key][index]}), "")
       for key in ARRAYS for index in INDICES if (key, index) != ANY_LENGTH),
     *((lambda arrays, _, kind=kind: arrays.update(warp=arrays["warp"].astype(kind)), "warp")

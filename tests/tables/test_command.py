@@ -94,4 +94,4 @@ def test_a_table_that_cannot_be_read_ends_with_1(tmp_path, capsys):
     (tmp_path / "broken.npz").write_text("")
     assert __main__.main(["validate", str(tmp_path / "broken.npz")]) == 1
     streams = capsys.readouterr()
-    assert streams.out == "" and f"{tmp_path / 'broken.npz'}: cannot be read" in streams.err
+    assert streams.out == "" and f"{tmp_path / 'broken.npz'}: is no .npz" in streams.err

@@ -522,7 +522,8 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
 
 _ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
 _TILE = {
-    **dict.fromkeys(("texels", "covered_times", "overlapping_texels"), NUMBER),
+    **dict.fromkeys(("texels", "unshaded_texels", "covered_times", "overlapping_texels"), NUMBER),
+    "is_lit": bool,
     "texture?": file_name,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
 }

@@ -16,7 +16,6 @@ import numpy as np
 from .. import imaging, shading
 from ..files import check_takes_files
 from ..reading import NUMBER, check, some
-from ..reading import NUMBER, some
 from ..scene import (
     CYCLES,
     PASSES,

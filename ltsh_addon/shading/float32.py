@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from . import float64, light_cone, moments32
+from .brdf import head_on_reflectance
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, NARROWEST
 from .polygon import convex_pieces, dot
@@ -67,7 +68,10 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
-            integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
+            least = None
+            if vectors[-1] not in (0, 1, 2):
+                least = head_on_reflectance(samples.ior[index]).astype(np.float32)
+            integrate, width = LobeIntegral(ridges, weights, least, scratch), float64.lobe_width(samples, index)
             lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width))
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
@@ -248,17 +252,21 @@ def fresnel_kinds(samples, members):
         return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
 
     def coat(index):
-        return _columns(samples.dielectric, index)[None]
+        color = _columns(samples.dielectric, index)
+        return np.stack([np.zeros_like(color), color])
+
+    def metal_and_coat(index, first):
+        return np.concatenate([first(index), _columns(samples.dielectric, index)[None]])
 
     yield (0,), members[~dielectric & flat], white
     yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
     yield (0, 1, 2), members[~dielectric & dipped], f82
     for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
-        yield (vector,), with_ior, coat
+        yield (0, vector), with_ior, coat
     for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
         first = f82 if 2 in own else schlick
         for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
-            yield (*own, vector), with_ior, lambda index, first=first: np.concatenate([first(index), coat(index)])
+            yield (*own, vector), with_ior, partial(metal_and_coat, first=first)
 
 
 def _by_ior(ior, members):
@@ -369,16 +377,22 @@ class ShadowedFormFactor:
 
 
 class LobeIntegral:
-    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`."""
+    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`.
 
-    def __init__(self, ridges, weights, scratch):
-        self.ridges, self.weights, self.scratch = ridges, weights, scratch
+    With `least` (Q,) the last one is that of a dielectric, at least `least` times the first, for F = 1.
+    """
+
+    def __init__(self, ridges, weights, least, scratch):
+        self.ridges, self.weights, self.least, self.scratch = ridges, weights, least, scratch
 
     def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
         weights = _selected(self.weights, part, index)
         values, _, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
         np.negative(values, out=values)
-        return np.maximum(values, np.float32(0.0), out=values), needs_float64
+        np.maximum(values, np.float32(0.0), out=values)
+        if self.least is not None:
+            np.maximum(values[-1], _selected(self.least, part, index) * values[0], out=values[-1])
+        return values, needs_float64
 
 
 class ProfiledIntegral:

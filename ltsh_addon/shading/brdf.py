@@ -71,8 +71,3 @@ def dielectric_reflectance(cosine, ior):
     perpendicular = (g - cosine) / np.maximum(g + cosine, 1e-30)
     plus, minus = cosine * (g + cosine) - 1.0, cosine * (g - cosine) + 1.0
     return 0.5 * perpendicular * perpendicular * (1.0 + (plus / minus) ** 2)
-
-
-def head_on_reflectance(ior):
-    """Reflectance at normal incidence of a dielectric of relative index of refraction `ior`, the least of any angle."""
-    return ((ior - 1.0) / (ior + 1.0)) ** 2

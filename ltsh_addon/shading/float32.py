@@ -15,7 +15,6 @@ from functools import partial
 import numpy as np
 
 from . import float64, light_cone, moments32
-from .brdf import head_on_reflectance
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, NARROWEST
 from .polygon import convex_pieces, dot
@@ -69,8 +68,8 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
             least = None
-            if vectors[-1] not in (0, 1, 2):
-                least = head_on_reflectance(samples.ior[index]).astype(np.float32)
+            if not isinstance(vectors[-1], int):
+                least = table.head_on_reflectance(samples.ior[index]).astype(np.float32)
             integrate, width = LobeIntegral(ridges, weights, least, scratch), float64.lobe_width(samples, index)
             lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width))
     lighting.add_in_float64(np.nonzero(sharp)[0])

@@ -11,7 +11,6 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import light_cone
-from .brdf import head_on_reflectance
 from .edge_integrals import vector_irradiance
 from .light_polygons import light_view, local_frames, seen_parts, to_local
 from .lobes import form_factor, integrals_on_sphere, polygon_integrals, tilted
@@ -141,12 +140,10 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon):
     """Integrals (4, Q), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
 
-    head_on = head_on_reflectance(samples.ior)
-
     def integral(polygon, index):
         part = lobe.take(index)
         values = np.maximum(-polygon_integrals(table, part, polygon, part.coefficients), 0.0)
-        values[3] = np.maximum(values[3], head_on[index] * values[0])
+        values[3] = np.maximum(values[3], table.head_on_reflectance(samples.ior[index]) * values[0])
         return values
 
     if not light.is_profiled:

@@ -1,10 +1,10 @@
 @SUM@
 /* Axes of the warped local frame, and the normals of the horizons. */
 struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; };
-/* Weights of the moments by Fresnel term, and how wide the lobe is in radians. */
+/* Weights of the moments by Fresnel term, how wide the lobe is in radians, and the least reflectance of the dielectric. */
 struct specular_weights {
     float plain[LTSH_COEFFICIENTS]; float schlick[LTSH_COEFFICIENTS]; float dip[LTSH_COEFFICIENTS];
-    float dielectric[LTSH_COEFFICIENTS]; float width;
+    float dielectric[LTSH_COEFFICIENTS]; float width; float least;
 };
 
 vec3 specular_warped(specular_lobe lobe, vec3 v)
@@ -76,7 +76,7 @@ specular_weights ltsh_weights(ltsh_cell cell, ltsh_point point)
     vec4 first_shares = ltsh_dielectric_texel(position, 0);
     vec4 last_shares = ltsh_dielectric_texel(position, 1);
     bool summed = coated && !known;
-    int count = summed ? LTSH_CURVES : (metal ? (dipped ? 3 : 2) : 0);
+    int count = summed ? LTSH_CURVES : (metal ? (dipped ? 3 : 2) : (coated ? 1 : 0));
     int end = coated && known ? count + 1 : count;
     for (int i = 0; i < end; ++i) {
         bool is_own = i == count;
@@ -89,6 +89,8 @@ specular_weights ltsh_weights(ltsh_cell cell, ltsh_point point)
         specular_sum values = ltsh_curve_at(cell, curve);
 @TERMS@
     }
+    float ior = 1.0 + position / LTSH_IOR_STEPS;
+    w.least = (ior - 1.0) / (ior + 1.0) * ((ior - 1.0) / (ior + 1.0));
     w.width = max(point.roughness, LTSH_LEAST_ROUGHNESS) * max(point.roughness, LTSH_LEAST_ROUGHNESS);
     return w;
 }
@@ -149,12 +151,10 @@ float ltsh_product(float weights[LTSH_COEFFICIENTS], specular_sum sum)
 vec4 specular_values(specular_weights weights, specular_sum sum)
 {
     sum = specular_finished(sum);
-    return vec4(
-        ltsh_product(weights.plain, sum),
-        ltsh_product(weights.schlick, sum),
-        ltsh_product(weights.dip, sum),
-        ltsh_product(weights.dielectric, sum)
-    );
+    float plain = ltsh_product(weights.plain, sum);
+    /* As in `LookupTable.head_on_reflectance`. */
+    float dielectric = max(ltsh_product(weights.dielectric, sum), weights.least * plain);
+    return vec4(plain, ltsh_product(weights.schlick, sum), ltsh_product(weights.dip, sum), dielectric);
 }
 
 vec3 ltsh_reflected(ltsh_point point, vec4 values)

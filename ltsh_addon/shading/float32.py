@@ -16,7 +16,7 @@ import numpy as np
 
 from . import float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
-from .lobes import FLOAT64_CHUNK, NARROWEST
+from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
@@ -378,7 +378,8 @@ class ShadowedFormFactor:
 class LobeIntegral:
     """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`.
 
-    With `least` (Q,) the last one is that of a dielectric, at least `least` times the first, for F = 1.
+    The first one is that for F = 1. With `least` (Q,) the last one is that of a dielectric, at least `least` times
+    the first.
     """
 
     def __init__(self, ridges, weights, least, scratch):
@@ -386,9 +387,10 @@ class LobeIntegral:
 
     def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
         weights = _selected(self.weights, part, index)
-        values, _, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
+        values, _, cosine, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
         np.negative(values, out=values)
         np.maximum(values, np.float32(0.0), out=values)
+        np.maximum(values[0], np.float32(-LEAST_SHARE) * cosine, out=values[0])
         if self.least is not None:
             np.maximum(values[-1], _selected(self.least, part, index) * values[0], out=values[-1])
         return values, needs_float64

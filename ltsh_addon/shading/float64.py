@@ -13,12 +13,15 @@ from ..scene import REFERENCE
 from . import light_cone
 from .edge_integrals import vector_irradiance
 from .light_polygons import light_view, local_frames, seen_parts, to_local
-from .lobes import form_factor, integrals_on_sphere, polygon_integrals, tilted
+from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
 from .reference import reference_integrals
+from .spherical_harmonics import coefficient_index
 
 # Of the roughness by which the effort for a lobe is chosen.
 LEAST_ROUGHNESS = 1e-3
+# Coefficient of Y_10 that makes it z / pi
+_COSINE = 2.0 / np.sqrt(3.0 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -140,11 +143,17 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon):
     """Integrals (4, Q), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
 
+    # z / pi, of which the clamped cosine of mass 1 consists
+    cosine = np.zeros((1, lobe.coefficients.shape[1], 1))
+    cosine[0, 0 if table.family == "ltc" else coefficient_index(1, 0)] = 1.0 if table.family == "ltc" else _COSINE
+
     def integral(polygon, index):
         part = lobe.take(index)
-        values = np.maximum(-polygon_integrals(table, part, polygon, part.coefficients), 0.0)
+        vectors = np.concatenate([part.coefficients, np.broadcast_to(cosine, part.coefficients[:1].shape)])
+        *values, plain = np.maximum(-polygon_integrals(table, part, polygon, vectors), 0.0)
+        values[0] = np.maximum(values[0], LEAST_SHARE * plain)
         values[3] = np.maximum(values[3], table.head_on_reflectance(samples.ior[index]) * values[0])
-        return values
+        return np.stack(values)
 
     if not light.is_profiled:
         return integral(polygon, index)

@@ -32,6 +32,9 @@ NARROWEST = 1e-3
 FLOAT64_CHUNK = 4096
 # Corners per chunk in float32: a compromise between calls of numpy and arrays that stay in the cache.
 _FLOAT32_CORNERS = 49216
+# Shading takes the integral for F = 1 to be at least this share of that of a clamped cosine under the same warp: the
+# true lobe is not darker but where both are, while the tail of a fitted one may fall below zero.
+LEAST_SHARE = 0.02
 
 
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
@@ -163,7 +166,7 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
 
     def integrate(corners, index):
         chosen = weights if index is None else np.take(weights, index, axis=2)
-        values, angle, needs_float64 = ridges.integrals(corners, chosen, scratch)
+        values, angle, _, needs_float64 = ridges.integrals(corners, chosen, scratch)
         if vertices.shape[1] > 4 and tilt is None:
             # Only here do polygons wind several times around a point, beyond the range of one arc tangent.
             angle = solid_angle(project_to_sphere(corners[:3]))

@@ -304,19 +304,20 @@ def _solid_angle(shifted, total_z, normal_z, scratch):
 
 def weighted_moments(
     corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
-    in sr, and the mask (P,) of points that need float64. `degree` 1 to 4."""
+    in sr, the signed integrals (P,) of z / pi, and the mask (P,) of points that need float64. `degree` 1 to 4."""
     vectors, _, points = weights.shape
     sums = np.empty((vectors, points), np.float32)
-    angle, needs_float64 = np.empty(points, np.float32), np.empty(points, bool)
+    angle, cosine, needs_float64 = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, bool)
     for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
         found, needs_float64[part] = moments(corners[:, :, part], degree, scratch, smallest)
         weight = weights[:, :, part]
         products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
         np.add.reduce(products, axis=1, out=sums[:, part])
         angle[part] = found[0]
-    return sums, angle, needs_float64
+        np.multiply(found[2], np.float32(0.5 / np.pi), out=cosine[part])
+    return sums, angle, cosine, needs_float64
 
 
 @dataclass(frozen=True)
@@ -380,16 +381,18 @@ class RidgeTable:
             weights = np.concatenate([weights[:first], combined[None]])
         return warp, weights, values[3] if count == 4 else None
 
-    def integrals(self, corners, weights, scratch, smallest=SMALLEST_SAFE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def integrals(
+        self, corners, weights, scratch, smallest=SMALLEST_SAFE
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Signed integrals (F, P) of lobes with weights (F, K, P) over polygons (>= 3 rows, V, P), numbers (P,) with
-        the sign of the solid angle, and the mask (P,) of points that need float64."""
+        the sign of the solid angle, signed integrals (P,) of a clamped cosine of mass 1 under the same warp, and the
+        mask (P,) of points that need float64."""
         if self.source.family == "ltsh":
             return weighted_moments(corners, weights, self.degree, scratch, smallest)
         # The clamped cosine is not negative: its integral has the sign of the solid angle.
         integral, needs_float64 = cosine_integral(corners, scratch, smallest)
-        values = weights[:, 0] * integral
-        values *= np.float32(1.0 / np.pi)
-        return values, integral, needs_float64
+        integral *= np.float32(1.0 / np.pi)
+        return weights[:, 0] * integral, integral, integral, needs_float64
 
 
 def prepare(table: LookupTable) -> RidgeTable:

@@ -20,6 +20,7 @@ from ...shading import light_cone, moments32
 from ...shading.float64 import LEAST_ROUGHNESS
 from ...shading.header import core_text, definitions, filled, float_literal, moment_lines, source_text, table_sizes
 from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
+from ...shading.lobes import LEAST_SHARE
 from ...shading.lookup_table import LookupTable
 from . import textures
 
@@ -122,6 +123,7 @@ def _lighting_constants(table) -> dict:
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "PI": float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
+        "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
         "TINY": float_literal(TINY_LIGHT**2),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,

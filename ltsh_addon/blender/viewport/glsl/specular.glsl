@@ -152,6 +152,10 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
 {
     sum = specular_finished(sum);
     float plain = ltsh_product(weights.plain, sum);
+#ifndef LTSH_COSINE
+    /* As in `lobes.LEAST_SHARE`: the third moment is twice the integral of z. */
+    plain = max(plain, -LTSH_LEAST_OF_COSINE * sum.values[2]);
+#endif
     /* As in `LookupTable.head_on_reflectance`. */
     float dielectric = max(ltsh_product(weights.dielectric, sum), weights.least * plain);
     return vec4(plain, ltsh_product(weights.schlick, sum), ltsh_product(weights.dip, sum), dielectric);

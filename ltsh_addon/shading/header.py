@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from . import edge_integrals, lookup_table
+from .lobes import LEAST_SHARE
 from .lookup_table import LookupTable
 from .spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
 
@@ -77,6 +78,7 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
             "MOMENT_LINES": "\n".join(f"        {line}" for line in moment_lines(table.degree)),
             "EXPANSION_LINES": "\n".join(_expansion_lines(table.degree)),
             "ALBEDO": _sum(hemisphere_integrals(table.degree), 1e-12),
+            "LEAST_OF_COSINE": float_literal(0.5 * LEAST_SHARE / np.pi),
         }
     return filled(_of_family(_text("table.h"), table.family), values)
 

@@ -105,6 +105,21 @@ void integral(int n, const float *cosine, const float *roughness, int curve, int
     }
 }
 
+void shaded(int n, const float *cosine, const float *roughness, const float *ior, int corners, const float *vertices,
+    float *out)
+{
+    for (int i = 0; i < n; ++i) {
+        ltsh_polygon visible = ltsh_clip_to_horizon(polygon(corners, vertices + 3 * corners * i));
+        float sign = ltsh_orientation(visible);
+        ltsh_cell cell = NAME_cell(cosine[i], roughness[i]);
+        NAME_moments moments = NAME_polygon_moments(NAME_lookup_warp(cell), visible);
+        float plain = NAME_plain_integral(NAME_moment_weights(NAME_lookup_curve(cell, 0)), moments, sign);
+        NAME_weights weights = NAME_moment_weights(NAME_lookup_dielectric(cell, ior[i]));
+        out[2 * i] = plain;
+        out[2 * i + 1] = NAME_dielectric_integral(weights, moments, sign, ior[i], plain);
+    }
+}
+
 void clip(int n, int corners, const float *vertices, int *count, float *out)
 {
     for (int i = 0; i < n; ++i) {

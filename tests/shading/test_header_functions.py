@@ -7,6 +7,7 @@ from polygon_quadrature import above_horizon
 from test_lobe_integrals import lobe_quadrature
 
 from ltsh_addon import shading
+from ltsh_addon.scene import AreaLight, SurfaceSamples
 from ltsh_addon.shading.header import data_blocks
 from ltsh_addon.shading.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
 
@@ -142,6 +143,38 @@ def test_lobes_agree(compiled):
     tolerance = 500.0 * EPS / roughness**2 * (np.abs(expected) + 0.01 * size)
     assert (np.abs(found - expected) <= tolerance).all()
     assert (found[directions[:, 2] <= 0.0] == 0.0).all() and np.abs(expected).max() > 0.1
+
+
+def test_what_shading_takes_of_an_integral_agrees(compiled):
+    """With `shade` in double precision, for F = 1 and for dielectrics: small and large lights in all directions, with
+    the tails where the integral alone would be negative. The header has errors of a few eps / alpha of a lobe's size.
+    """
+    table, header = compiled
+    cosine, roughness = points(1500, seed=8, lowest_roughness=0.3)
+    generator = np.random.default_rng(9)
+    ior = generator.uniform(1.05, 2.5, len(cosine)).astype(np.float32)
+    normal = np.broadcast_to([0.0, 0.0, 1.0], (len(cosine), 3))
+    view = np.stack([np.sqrt(1.0 - cosine.astype(float) ** 2), 0.0 * cosine, cosine], axis=1)
+    fields = dict.fromkeys(("position", "diffuse_albedo", "specular_f0", "specular_f90"), 0.0 * normal)
+    fields |= {"view": view, "normal": normal, "diffuse_normal": normal, "roughness": roughness, "ior": ior}
+    white = SurfaceSamples(**{**fields, "specular_f0": 0.0 * normal + 1.0, "specular_f90": 0.0 * normal + 1.0},
+                           dielectric=0.0 * cosine)  # fmt: skip
+    coat = SurfaceSamples(**fields, dielectric=0.0 * cosine + 1.0)
+    raised = 0
+    for center, size in (((-1.5, 0.2, 0.5), 0.3), ((1.0, -0.8, 1.0), 0.5), ((1.5, 0.3, 0.15), 0.1)):
+        center = np.array(center)
+        half_u = size * np.cross(center, [0.0, 0.0, 1.0]) / np.linalg.norm(center[:2])
+        half_v = 0.5 * size * np.cross(half_u, center) / np.linalg.norm(np.cross(half_u, center))
+        light = AreaLight("", "RECTANGLE", center, half_u, half_v, -center / np.linalg.norm(center), np.ones(3))
+        vertices = np.broadcast_to(light.polygon(), (len(cosine), 4, 3)).astype(np.float32)
+        found = header.call("shaded", cosine, roughness, ior, 4, vertices, shape=(2,))
+        signed = header.call("integral", cosine, roughness, 0, 4, vertices)
+        raised += np.count_nonzero(np.abs(signed) < 0.99 * found[:, 0])
+        for column, samples in enumerate((white, coat)):
+            expected = shading.shade(samples, [light], table, passes=("specular",), dtype=np.float64).specular[0, :, 0]
+            lit = cosine > 0.0
+            assert np.abs(found[:, column] - expected)[lit].max() < 2e-4 * max(1.0, expected.max()), column
+    assert table.family == "ltc" or raised > 0
 
 
 def test_clipped_polygons_agree(compiled):

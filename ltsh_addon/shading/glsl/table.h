@@ -218,6 +218,30 @@ LTSH_FUNCTION float @prefix@_integrate_polygon(float cos_theta_o, float roughnes
     return ltsh_larger(ltsh_orientation(visible) * @prefix@_integral(weights, moments), 0.0f);
 }
 
+/* Integral for F = 1 as shading takes it, from the weights of curve 0; `orientation` is ltsh_orientation of the polygon.
+   In the tail of a lobe, where the fit may be off by more than the lobe, it stays above a share of a clamped cosine. */
+LTSH_FUNCTION float @prefix@_plain_integral(@prefix@_weights plain, @prefix@_moments moments, float orientation)
+{
+    float integral = ltsh_larger(orientation * @prefix@_integral(plain, moments), 0.0f);
+@if ltsh
+    integral = ltsh_larger(orientation * @LEAST_OF_COSINE@ * moments.values[2], integral);
+@else
+@end
+    return integral;
+}
+
+/* The same for a dielectric of index of refraction `ior`, from the weights of its coefficients and the integral for
+   F = 1: no dielectric reflects less than head on. */
+LTSH_FUNCTION float @prefix@_dielectric_integral(
+    @prefix@_weights dielectric, @prefix@_moments moments, float orientation, float ior, float plain_integral)
+{
+    float least = @PREFIX@_DATA(@PREFIX@_IOR_OFFSET);
+    float most = @PREFIX@_DATA(@PREFIX@_IOR_OFFSET + @PREFIX@_IOR_COUNT - 1);
+    float index = least + ltsh_clamped(ior - least, most - least);
+    float root = (index - 1.0f) / (index + 1.0f);
+    return ltsh_larger(orientation * @prefix@_integral(dielectric, moments), root * root * plain_integral);
+}
+
 /* A GLSL source may end here, with the #endif of the last line: what follows is for C and C++ only. */
 #ifdef @PREFIX@_DATA_FOLLOWS
 static const float @prefix@_data[@PREFIX@_DATA_COUNT] = {

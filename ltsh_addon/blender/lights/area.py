@@ -171,9 +171,9 @@ def _note_overlaps(lights: list[AreaLight], inventory: LightInventory) -> None:
     brightness = [[np.abs(light.radiance).sum() for light in pair[:2]] for pair in pairs]
     lost = max(max(pair) / sum(pair) for pair in brightness)
     inventory.warn(
-        f"lights {listed(names, NAMED_PAIRS)}: they overlap in one plane by so much of the smaller; there Cycles loses "
-        f"up to {100.0 * lost:.0f} % of their light in sharp reflections and some 1 % elsewhere, the techniques lose "
-        "nothing; move one of them forward by 0.1 mm"
+        f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
+        f"there Cycles loses up to {100.0 * lost:.0f} % of their light in sharp reflections and some 1 % elsewhere, the "
+        "techniques lose nothing; move one of each pair forward by 0.1 mm"
     )
 
 

@@ -64,8 +64,9 @@ def one_pixel():
 
 
 def places_of_lights(count):
-    """Where `many_lights` puts them, (count, 2), at a height of 1.5 m."""
-    return np.random.default_rng(1).uniform(-2.0, 2.0, (count, 2))
+    """Where `many_lights` puts them, (count, 3) m: about 1.5 m high, no two in one plane."""
+    across = np.random.default_rng(1).uniform(-2.0, 2.0, (count, 2))
+    return np.column_stack([across, 1.5 + 1e-5 * np.arange(count)])
 
 
 def many_lights(count):
@@ -77,8 +78,8 @@ def many_lights(count):
     principled.inputs["Base Color"].default_value = 1.0, 1.0, 1.0, 1.0
     data = bpy.data.lights.new("Many", "AREA")
     data.shape, data.size, data.energy = "SQUARE", 0.02, 0.01
-    for number, (x, y) in enumerate(places_of_lights(count)):
-        scene_parts.link(bpy.data.objects.new(f"Many {number}", data), (x, y, 1.5))
+    for number, place in enumerate(places_of_lights(count)):
+        scene_parts.link(bpy.data.objects.new(f"Many {number}", data), place)
 
 
 def path_as_name():
@@ -102,7 +103,7 @@ def long_names():
     bpy.data.materials[0].name = "x" * 63
     light = bpy.data.objects["Key"]
     light.name, light.lightgroup = LONGEST, "x" * 63
-    scene_parts.add_area_light("Other").lightgroup = "a.b/../@\\"
+    scene_parts.add_area_light("Other", (-0.9, 0.2, 1.5)).lightgroup = "a.b/../@\\"
 
 
 def no_uv_map():

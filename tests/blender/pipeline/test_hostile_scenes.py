@@ -142,8 +142,9 @@ def test_many_lights_add_up(capsys, tmp_path):
     layers = imaging.read_layers(out / "shade.exr")
     position, albedo = layers["samples.position"], layers["samples.diffuse_albedo"]
     places = hostile_scenes.places_of_lights(MANY)
-    across = ((position[..., None, :2] - places) ** 2).sum(axis=-1)
-    irradiance = (0.01 / np.pi * 1.5**2 / (across + 1.5**2) ** 2).sum(axis=-1)
+    across = ((position[..., None, :2] - places[:, :2]) ** 2).sum(axis=-1)
+    height = places[:, 2]
+    irradiance = (0.01 / np.pi * height**2 / (across + height**2) ** 2).sum(axis=-1)
     assert np.allclose(layers["ltsh4.diffuse"], irradiance[..., None] * albedo / np.pi, rtol=0.01)
 
 

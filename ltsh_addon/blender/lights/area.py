@@ -172,7 +172,7 @@ def _note_overlaps(lights: list[AreaLight], inventory: LightInventory) -> None:
     lost = max(max(pair) / sum(pair) for pair in brightness)
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
-        f"there Cycles loses up to {100.0 * lost:.0f} % of their light in sharp reflections and some 1 % elsewhere, the "
+        f"there Cycles loses up to {100.0 * lost:.0f} % of their light in sharp reflections, some 1 % elsewhere, the "
         "techniques lose nothing; move one of each pair forward by 0.1 mm"
     )
 

@@ -153,6 +153,13 @@ class AreaLight:
         return replace(self, center=self.center + offset, corners=corners, detail=detail)
 
     @property
+    def radius(self) -> float:
+        """A distance from the center in m that no point of the light exceeds."""
+        if self.corners is not None:
+            return float(np.linalg.norm(self.corners - self.center, axis=1).max())
+        return float(np.linalg.norm(self.half_u) + np.linalg.norm(self.half_v))
+
+    @property
     def is_round(self) -> bool:
         """True for DISK and ELLIPSE."""
         return self.shape in ("DISK", "ELLIPSE")

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from . import float64, light_cone, moments32
+from . import brdf, float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
@@ -71,7 +71,8 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
             if not isinstance(vectors[-1], int):
                 least = table.head_on_reflectance(samples.ior[index]).astype(np.float32)
             integrate, width = LobeIntegral(ridges, weights, least, scratch), float64.lobe_width(samples, index)
-            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width))
+            limit = FresnelLimit.of(samples, index, vectors) if table.family == "ltsh" and len(vectors) > 1 else None
+            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width, limit))
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
 
@@ -90,6 +91,30 @@ def _chunks(members):
 
 
 @dataclass(frozen=True)
+class FresnelLimit:
+    """The limits of `float64.limit_fresnel` for Q samples."""
+
+    view: np.ndarray  # (3, Q)
+    ior: np.ndarray | None  # (Q,), where the last integral is that of a dielectric
+    schlick: bool  # whether the second integral is that of Schlick's curve
+
+    @classmethod
+    def of(cls, samples, index, vectors) -> FresnelLimit:
+        has_dielectric = not isinstance(vectors[-1], int)
+        ior = samples.ior[index].astype(np.float32) if has_dielectric else None
+        return cls(_columns(samples.view, index), ior, vectors[1] == 1)
+
+    def apply(self, integrals, part, offset, radius) -> None:
+        """Limit integrals (F, Q') of a light's `offset` (3, Q') and `radius` from the samples `part`."""
+        cosine = brdf.least_half_angle_cosine(self.view[:, part], offset, np.float32(radius))
+        if self.schlick:
+            np.minimum(integrals[1], brdf.schlick_curve(cosine) * integrals[0], out=integrals[1])
+        if self.ior is not None:
+            most = brdf.dielectric_reflectance(cosine, self.ior[part])
+            np.minimum(integrals[-1], most * integrals[0], out=integrals[-1])
+
+
+@dataclass(frozen=True)
 class Lobes:
     """The lobes of Q samples; integrate(columns, corners, index, smallest) gives (F, Q') integrals and a mask."""
 
@@ -99,6 +124,7 @@ class Lobes:
     integrate: Callable
     colors: np.ndarray  # (F, 3, Q) reflectances of the integrals
     width: np.ndarray | float  # as for `light_levels`
+    limit: FresnelLimit | None = None
 
 
 class _Lighting:
@@ -134,6 +160,8 @@ class _Lighting:
                     axes = integrate.rows
                 polygons = local_corners(light, outline, offset, axes, self.scratch)
                 found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
+                if lobes.limit is not None:
+                    lobes.limit.apply(found, part, offset, light.radius)
                 if redo.any():
                     found[:, redo] = 0.0
                     needs_float64.append(index[part][redo])
@@ -203,7 +231,7 @@ def _light_of_each(items, number):
     """One (light, group, corners) in place of several with equally many corners, of which each sample has its own."""
     fields = {
         name: np.stack([getattr(light, name) for light, _, _ in items])[number]
-        for name in ("center", "direction", "radiance")
+        for name in ("center", "direction", "radiance", "radius")
     }
     corners = np.stack([corners for _, _, corners in items])
     return float64.LightOfEachSample(**fields), 0, corners[number].transpose(1, 0, 2)

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import light_cone
+from .brdf import dielectric_reflectance, least_half_angle_cosine, schlick_curve
 from .edge_integrals import vector_irradiance
 from .light_polygons import light_view, local_frames, seen_parts, to_local
 from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
@@ -31,6 +32,7 @@ class LightOfEachSample:
     center: np.ndarray  # (P, 3)
     direction: np.ndarray  # (P, 3)
     radiance: np.ndarray  # (P, 3)
+    radius: np.ndarray  # (P,)
     affects_diffuse: bool = True
     affects_specular: bool = True
     is_focused: bool = False
@@ -122,11 +124,26 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 for index, polygon, effort in visible
             )
         for index, integrals in parts:
+            if table != REFERENCE and table.family == "ltsh":
+                offset = _of(light.center, index) - samples.position[index]
+                radius = light.radius if np.ndim(light.radius) == 0 else light.radius[index]
+                limit_fresnel(integrals, samples.view[index].T, offset.T, radius, samples.ior[index])
             plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
             reflected -= samples.specular_dip[index] * dip
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
+
+
+def limit_fresnel(integrals, view, offset, radius, ior) -> None:
+    """Limit integrals (4, Q) of F = 1, Schlick's curve, the dip and a dielectric of a light `offset` (3, Q) away.
+
+    No curve integrates to more than its largest value over the light times the integral for F = 1. In the tail of a
+    lobe, where the curves are small, the fit of their coefficients may be off by more than that.
+    """
+    cosine = least_half_angle_cosine(view, offset, radius)
+    np.minimum(integrals[1], schlick_curve(cosine) * integrals[0], out=integrals[1])
+    np.minimum(integrals[3], dielectric_reflectance(cosine, np.maximum(ior, 1.0)) * integrals[0], out=integrals[3])
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:

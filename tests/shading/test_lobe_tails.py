@@ -12,8 +12,8 @@ from ltsh_addon import shading
 from ltsh_addon.scene import SurfaceSamples
 
 PIXELS, DISTANCE, RINGS = 32, 6.0, 10
-# In units of the sphere's mean radiance: found are 3.3 and 0.44, in one light's tail on water of roughness 0.3
-BRIGHTEST, SEEN = 3.7, 0.5
+# In units of the sphere's mean radiance: found are 0.78 and 0.20, under one small light at roughness 0.2
+BRIGHTEST, SEEN = 0.9, 0.25
 SURFACES = {"dielectric": 1.5, "water": 1.33, "metal": None}
 ROUGHNESS = (0.2, 0.3, 0.5, 0.7, 1.0)
 

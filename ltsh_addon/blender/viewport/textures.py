@@ -217,7 +217,7 @@ def _header(light, first, count, half_v, first_receiver):
         [*light.direction, first_receiver],
         [*light.radiance, receivers],
         [tangent, 1.0 / share, reach, _bound(light)],
-        [light.falloff, light.smooth, 0.0, 0.0],
+        [light.falloff, light.smooth, light.radius, 0.0],
     ])  # fmt: skip
 
 

@@ -51,6 +51,9 @@ void main()
         shining = ltsh_seen_light(header, point.position, weights.width);
         values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
 #endif
+#ifndef LTSH_COSINE
+        values = specular_limited(values, point, shining.offset, ltsh_light_texel(header + 6).z);
+#endif
         reflected += ltsh_reflected(point, values);
 #endif
 #ifdef LTSH_DIFFUSE

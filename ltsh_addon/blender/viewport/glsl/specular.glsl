@@ -161,6 +161,30 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
     return vec4(plain, ltsh_product(weights.schlick, sum), ltsh_product(weights.dip, sum), dielectric);
 }
 
+#ifndef LTSH_COSINE
+/* As `brdf.least_half_angle_cosine` and `float64.limit_fresnel`. */
+vec4 specular_limited(vec4 values, ltsh_point point, vec3 offset, float radius)
+{
+    float far = max(sqrt(dot(offset, offset)), 1e-30);
+    float toward = clamp(dot(offset, point.view) / far, -1.0, 1.0);
+    float aside = sqrt(1.0 - toward * toward);
+    float sine = min(radius / far, 1.0);
+    float cosine = sqrt(1.0 - sine * sine);
+    bool is_short = aside * cosine + toward * sine > 0.0 && sine < 1.0;
+    float c = is_short ? sqrt(max(0.5 * (1.0 + toward * cosine - aside * sine), 0.0)) : 0.0;
+    float ior = max(point.ior, 1.0);
+    float g = sqrt(max(ior * ior - 1.0 + c * c, 0.0));
+    float perpendicular = (g - c) / max(g + c, 1e-30);
+    float quotient = (c * (g + c) - 1.0) / (c * (g - c) + 1.0);
+    float dielectric = 0.5 * perpendicular * perpendicular * (1.0 + quotient * quotient);
+    float complement = 1.0 - c;
+    float squared = complement * complement;
+    values.y = min(values.y, squared * squared * complement * values.x);
+    values.w = min(values.w, dielectric * values.x);
+    return values;
+}
+#endif
+
 vec3 ltsh_reflected(ltsh_point point, vec4 values)
 {
     vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;

@@ -155,9 +155,9 @@ class AreaLight:
     @property
     def radius(self) -> float:
         """A distance from the center in m that no point of the light exceeds."""
-        if self.corners is not None:
-            return float(np.linalg.norm(self.corners - self.center, axis=1).max())
-        return float(np.linalg.norm(self.half_u) + np.linalg.norm(self.half_v))
+        if self.is_round:
+            return float(np.hypot(np.linalg.norm(self.half_u), np.linalg.norm(self.half_v)))
+        return float(np.linalg.norm(self.polygon() - self.center, axis=1).max())
 
     @property
     def is_round(self) -> bool:

@@ -14,7 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from . import brdf, float64, light_cone, moments32
+from . import float64, light_cone, moments32
+from .brdf import least_half_angle_cosine
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
@@ -106,12 +107,8 @@ class FresnelLimit:
 
     def apply(self, integrals, part, offset, radius) -> None:
         """Limit integrals (F, Q') of a light's `offset` (3, Q') and `radius` from the samples `part`."""
-        cosine = brdf.least_half_angle_cosine(self.view[:, part], offset, np.float32(radius))
-        if self.schlick:
-            np.minimum(integrals[1], brdf.schlick_curve(cosine) * integrals[0], out=integrals[1])
-        if self.ior is not None:
-            most = brdf.dielectric_reflectance(cosine, self.ior[part])
-            np.minimum(integrals[-1], most * integrals[0], out=integrals[-1])
+        cosine = least_half_angle_cosine(self.view[:, part], offset, np.float32(radius))
+        float64.limit_fresnel(integrals, cosine, self.schlick, None if self.ior is None else self.ior[part])
 
 
 @dataclass(frozen=True)

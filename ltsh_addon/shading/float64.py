@@ -13,7 +13,7 @@ from ..scene import REFERENCE
 from . import light_cone
 from .brdf import dielectric_reflectance, least_half_angle_cosine, schlick_curve
 from .edge_integrals import vector_irradiance
-from .light_polygons import light_view, local_frames, seen_parts, to_local
+from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
 from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
 from .reference import reference_integrals
@@ -104,9 +104,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
     """As `shade_diffuse` for the specular lobes; `table` or REFERENCE, which adds its estimates to error (P,)."""
     cosine = (samples.normal * samples.view).sum(axis=1)
     frame = local_frames(samples.normal, samples.view)
-    terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip, samples.dielectric)
-    reflective = np.any([term.any(axis=1) for term in terms], axis=0)
-    lit = np.nonzero((cosine > 0.0) & reflective)[0]
+    lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
     cosine = np.clip(cosine, 0.0, 1.0)
     lobe = None
     if table != REFERENCE and len(lit):
@@ -127,7 +125,8 @@ def shade_specular(samples, lights, table, radiance, error=None):
             if table != REFERENCE and table.family == "ltsh":
                 offset = _of(light.center, index) - samples.position[index]
                 radius = light.radius if np.ndim(light.radius) == 0 else light.radius[index]
-                limit_fresnel(integrals, samples.view[index].T, offset.T, radius, samples.ior[index])
+                least = least_half_angle_cosine(samples.view[index].T, offset.T, radius)
+                limit_fresnel(integrals, least, True, np.maximum(samples.ior[index], 1.0))
             plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
@@ -135,15 +134,18 @@ def shade_specular(samples, lights, table, radiance, error=None):
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
-def limit_fresnel(integrals, view, offset, radius, ior) -> None:
-    """Limit integrals (4, Q) of F = 1, Schlick's curve, the dip and a dielectric of a light `offset` (3, Q) away.
+def limit_fresnel(integrals, cosine, has_schlick: bool, ior) -> None:
+    """Limit integrals (F, Q) over a light to which the half angle has at least the cosine (Q,).
+
+    The first is for F = 1, with `has_schlick` the second for Schlick's curve, with `ior` (Q,) the last for dielectrics.
 
     No curve integrates to more than its largest value over the light times the integral for F = 1. In the tail of a
     lobe, where the curves are small, the fit of their coefficients may be off by more than that.
     """
-    cosine = least_half_angle_cosine(view, offset, radius)
-    np.minimum(integrals[1], schlick_curve(cosine) * integrals[0], out=integrals[1])
-    np.minimum(integrals[3], dielectric_reflectance(cosine, np.maximum(ior, 1.0)) * integrals[0], out=integrals[3])
+    if has_schlick:
+        np.minimum(integrals[1], schlick_curve(cosine) * integrals[0], out=integrals[1])
+    if ior is not None:
+        np.minimum(integrals[-1], dielectric_reflectance(cosine, ior) * integrals[0], out=integrals[-1])
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:

@@ -165,7 +165,7 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         3   direction; texel of the first receiver
         4   radiance; number of receivers, -1: all
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
-        6   power of the falloff; its smoothing
+        6   power of the falloff; its smoothing; `AreaLight.radius`
 
     No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
     """

@@ -348,6 +348,10 @@ class Tracer:
                     self._attenuate(shares[part], *rays)
         return shares
 
+    def mask_of(self, name: str) -> int:
+        """The mask of the rays to the light `name`."""
+        return ALL_RAYS
+
     def starts(self, samples: SurfaceSamples) -> Starts:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
 

@@ -26,6 +26,17 @@ PROBES = 8
 MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
+# Of PROBES rays, how many are chosen evenly for pairs with both lobes, a diffuse and a specular one: at first, and later
+# where the specular lobe, or the diffuse one, counts more.
+EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
+# Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
+# stratified rays falls with their number to the power -0.8.
+WORTH_POWER = 0.75
+# Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
+TYPICAL_SHARE = 0.25
+LEVELS = (16, 32, 64, 128, 256, 512)
+# Samples that tell what is typical, and pairs of them and a light.
+TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20
 # How often neighbors of mixed pairs that turn out mixed pass that on.
 ROUNDS = 4
 # Rays end this share of their length before the light.
@@ -80,11 +91,12 @@ def visible_shares(
     radiance, variance = ({name: np.zeros(count) for name in passes} for _ in range(2))
     mixed = np.zeros((len(lights), count), bool)
     surface, neighbors, traced = Surface(samples, passes, tracer), Neighbors.of(film, count), 0
+    typical = typical_radiance(samples, lights, passes)
     for number, light in enumerate(lights):
         if progress is not None and progress("shadows", number / len(lights)) is False:
             raise Cancelled("shadows were stopped")
         pairs = Pairs(surface, light)
-        pairs.trace(rays, neighbors)
+        pairs.trace(rays, neighbors, typical)
         traced += pairs.traced
         index = pairs.index
         mixed[number, index] = pairs.visible & pairs.blocked
@@ -94,6 +106,19 @@ def visible_shares(
             variance[name][index] += deviation * deviation
     deviation = {name: np.sqrt(values) for name, values in variance.items()}
     return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect of all `lights` without shadows, from some of them."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(lights), 1)), 1)
+    surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
+    radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
+    for light in lights:
+        pairs = Pairs(surface, light)
+        pairs.weigh()
+        for name in passes:
+            radiance[name][pairs.index] += pairs.unshadowed(name)
+    return {name: float(np.sqrt(np.square(values).mean())) if len(values) else 0.0 for name, values in radiance.items()}
 
 
 @dataclass(frozen=True)
@@ -128,7 +153,7 @@ class Surface:
     """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
 
     def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
-        self.tracer, self.starts = tracer, tracer.starts(samples)
+        self.tracer, self.starts = tracer, tracer and tracer.starts(samples)
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)
@@ -169,7 +194,7 @@ class Pairs:
 
     def __init__(self, surface: Surface, light: AreaLight):
         self.surface, self.light = surface, light
-        self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
         self.emitter = Emitter(light)
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
@@ -193,21 +218,38 @@ class Pairs:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
 
-    def trace(self, rays: int, neighbors: Neighbors) -> None:
-        """Probes for all pairs, and up to `rays` for those that need them."""
+    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float]) -> None:
+        """Probes for all pairs, and up to `rays` for those that need them; `typical` as from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
-        self._add_rays(np.arange(len(self.index)), 0, PROBES)
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
         self._leave_out_unlit()
-        if rays > PROBES:
-            for _ in range(ROUNDS):
-                chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
-                chosen |= self._unmet()
-                chosen &= self.count < rays
-                if not chosen.any():
-                    break
-                self._add_rays(np.flatnonzero(chosen), PROBES, rays)
+        number, choice = self._plan(rays, typical)
+        for _ in range(ROUNDS):
+            chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
+            chosen |= self._unmet()
+            chosen &= self.count < number
+            if not chosen.any():
+                break
+            for last, split in np.unique(np.stack([number[chosen], choice[chosen]]), axis=1).T:
+                members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                self._add_rays(members, PROBES, int(last), int(split))
         self._aim_at_corners()
+
+    def weigh(self) -> None:
+        """Weights alone, without a ray."""
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
+
+    def _plan(self, rays, typical):
+        """How many rays (Q,) the pairs are worth, and which of SPLITS (Q,), by what they reflect without shadows."""
+        worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
+        most = np.maximum(worth["specular"], worth["diffuse"])
+        wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
+        levels = [level for level in LEVELS if level < rays] + [rays]
+        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
+        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
+        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
+        return number, choice
 
     def _unmet(self):
         """Mask (Q,) of the pairs with a lobe that no ray met so far."""
@@ -250,52 +292,95 @@ class Pairs:
         masks = np.broadcast_to(self.mask, index.shape)
         return self.surface.tracer.transmittance(origins, directions.T, distances * END, masks)
 
-    def _add_rays(self, members, first, last):
-        """Rays `first` to `last` for the pairs `members` (M,)."""
+    def _add_rays(self, members, first, last, split, trace=True):
+        """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
-        for chosen in (diffuse & specular, diffuse & ~specular, ~diffuse & specular):
+        for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
             chosen = members[chosen]
             for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
                 block = chosen[start : start + BLOCK_RAYS // PROBES]
-                view = View(self.surface, self.index[block], self.emitter, self._lobes_of(block))
-                for number in range(first, last, PROBES):
-                    self._add_block(block, view, number)
+                lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
+                view = View(self.surface, self.index[block], self.emitter, lobes)
+                step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
+                for number in range(first, last, step):
+                    rays = Rays(number, min(number + step, last), EVENLY[kind, 0], EVENLY[kind, split])
+                    self._add_block(block, view, rays, trace)
         self.count[members] = last
 
-    def _lobes_of(self, block):
-        return tuple(name for name in PASSES if self.wanted[name][block[0]])
-
-    def _add_block(self, block, view, first):
-        """PROBES rays each for the pairs `block` (B,) of a view."""
-        directions, distance, weights = view.rays(first)
-        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
-        arriving = np.zeros(met.shape, np.float32)
-        flat = np.flatnonzero(met)
-        towards = np.stack([np.take(row, flat) for row in directions])
-        index = np.take(np.broadcast_to(view.index, met.shape), flat)
-        arriving.ravel()[flat] = self._transmittance(index, towards, np.take(distance, flat))
-        sums = arriving.sum(axis=0)
-        self.visible[block] |= sums > 0.0
-        self.blocked[block] |= sums < met.sum(axis=0)
+    def _add_block(self, block, view, rays, trace):
+        """Some rays for the pairs `block` (B,) of a view."""
+        directions, distance, weights = view.rays(rays)
+        arriving = np.zeros(distance.shape, np.float32)
+        if trace:
+            met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+            flat = np.flatnonzero(met)
+            towards = np.stack([np.take(row, flat) for row in directions])
+            index = np.take(np.broadcast_to(view.index, met.shape), flat)
+            arriving.ravel()[flat] = self._transmittance(index, towards, np.take(distance, flat))
+            sums = arriving.sum(axis=0)
+            self.visible[block] |= sums > 0.0
+            self.blocked[block] |= sums < met.sum(axis=0)
         for name, weight in weights.items():
             number = PASSES.index(name)
-            for half in range(2):
-                self.weights[number, half, block] += weight[half::2].sum(axis=0)
-            weight *= arriving
-            for half in range(2):
-                self.arriving[number, half, block] += weight[half::2].sum(axis=0)
+            for sums in (self.weights[number], self.arriving[number]):
+                halves = sums[:, block]
+                rays.add_to(halves, weight)
+                sums[:, block] = halves
+                weight *= arriving
+
+    def unshadowed(self, name: str) -> np.ndarray:
+        """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""
+        scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
+        scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
+        return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
 
     def found(self, name: str):
         """Shares (Q,) of a pass, the radiance (Q,) that it reflects, about, and its standard deviation."""
-        number = PASSES.index(name)
-        weights, arriving = self.weights[number], self.arriving[number]
-        halves = np.divide(arriving, weights, out=np.ones_like(weights), where=weights > 0.0)
+        weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
         share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
-        scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
-        scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
-        unshadowed = whole * scale * self.wanted[name]
+        # Pairs with one eighth of rays have no second half: all of it agrees.
+        halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
+        unshadowed = self.unshadowed(name)
         return share, unshadowed * share, unshadowed * 0.5 * np.abs(halves[0] - halves[1])
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays `first` to `last` of each pair, PROBES and again PROBES; of each of these some are chosen by the lobe.
+
+    `probes` and `later` say how many of the first PROBES, and of all later ones, are chosen evenly.
+    """
+
+    first: int
+    last: int
+    probes: int
+    later: int
+
+    @property
+    def looks(self) -> int:
+        """How many times PROBES rays these are."""
+        return (self.last - self.first) // PROBES
+
+    @property
+    def evenly(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions evenly."""
+        return tuple(self.probes + self.later * (n // PROBES - 1) if n else 0 for n in (self.first, self.last))
+
+    @property
+    def by_lobe(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions by the lobe."""
+        return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
+
+    def add_to(self, halves, weight):
+        """Add weights (S, Q) to the sums (2, Q) of every other PROBES rays and of those between, one after another."""
+        start, stop = self.evenly
+        parts = np.zeros((self.looks, weight.shape[1]), np.float32)
+        for rows in (weight[: stop - start], weight[stop - start :]):
+            if len(rows):
+                parts += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
+        for number, part in enumerate(parts, self.first // PROBES):
+            halves[number % 2] += part
 
 
 class View:
@@ -326,24 +411,23 @@ class View:
             self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
-    def rays(self, first: int):
-        """Unit directions (3, S, Q) of the PROBES rays from `first` on, distances (S, Q), weights (S, Q) by lobe."""
-        shares = {("specular", "diffuse"): (4, 4), ("specular",): (6, 2), ("diffuse",): (0, 8)}[self.lobes]
-        by_lobe, evenly = shares
-        shape = (PROBES, len(self.index))
+    def rays(self, rays: Rays):
+        """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
+        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
+        shape = (evenly + by_lobe, len(self.index))
         directions = np.empty((3, *shape), np.float32)
         if evenly:
-            points = unit_points(self.seeds, 0, first * evenly // PROBES, evenly)
+            points = unit_points(self.seeds, 0, *rays.evenly)
             self.quads.directions(*points, out=directions[:, :evenly])
-        density = np.float32(evenly / PROBES) / self.quads.solid_angle
+        density = np.float32(evenly / shape[0]) / self.quads.solid_angle
         if by_lobe:
             local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
-            points = unit_points(self.seeds, 1, first * by_lobe // PROBES, by_lobe)
+            points = unit_points(self.seeds, 1, *rays.by_lobe)
             length[evenly:] = self.warps.unwarped(self.warped_quads.directions(*points, out=local[:, evenly:]))
             self.warps.world(local[:, evenly:], out=directions[:, evenly:])
             self.warps.local(directions[:, :evenly], out=local[:, :evenly])
             length[:evenly] = self.warps.lengths(local[:, :evenly])
-            scale = np.float32(by_lobe / PROBES) * self.warps.determinant / self.warped_quads.solid_angle
+            scale = np.float32(by_lobe / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
             scale *= self.is_seen
             np.clip(length, *_LENGTHS, out=length)
             density = density + scale / (length * length * length)

@@ -231,9 +231,10 @@ class Pairs:
             chosen &= self.count < number
             if not chosen.any():
                 break
-            for last, split in np.unique(np.stack([number[chosen], choice[chosen]]), axis=1).T:
-                members = np.flatnonzero(chosen & (number == last) & (choice == split))
-                self._add_rays(members, PROBES, int(last), int(split))
+            for last in np.unique(number[chosen]):
+                for split in range(3):
+                    members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                    self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
 
     def weigh(self) -> None:
@@ -281,16 +282,17 @@ class Pairs:
             heights, offset = self._corner_heights(name, unmet)
             toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
             distance = np.sqrt(dot(toward, toward))
-            found = self._transmittance(self.index[unmet], toward / np.maximum(distance, _TINY), distance)
+            toward /= np.maximum(distance, _TINY)
+            origins = self.surface.starts.origins(self.index[unmet], toward.T).T
+            found = self._transmittance(origins, toward, distance)
             self.weights[number][:, unmet] = 1.0
             self.arriving[number][:, unmet] = found
 
-    def _transmittance(self, index, directions, distances):
-        """Of one ray for each of the samples `index` (R,): directions (3, R), distances (R,)."""
-        origins = self.surface.starts.origins(index, directions.T)
-        self.traced += len(index)
-        masks = np.broadcast_to(self.mask, index.shape)
-        return self.surface.tracer.transmittance(origins, directions.T, distances * END, masks)
+    def _transmittance(self, origins, directions, distances):
+        """Of rays: origins and directions (3, R), distances (R,)."""
+        self.traced += len(distances)
+        masks = np.broadcast_to(self.mask, distances.shape)
+        return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last, split, trace=True):
         """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
@@ -314,9 +316,8 @@ class Pairs:
         if trace:
             met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
             flat = np.flatnonzero(met)
-            towards = np.stack([np.take(row, flat) for row in directions])
-            index = np.take(np.broadcast_to(view.index, met.shape), flat)
-            arriving.ravel()[flat] = self._transmittance(index, towards, np.take(distance, flat))
+            origins = self.surface.starts.origins_of_rows(view.index, directions)
+            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in (origins, directions, distance)))
             sums = arriving.sum(axis=0)
             self.visible[block] |= sums > 0.0
             self.blocked[block] |= sums < met.sum(axis=0)
@@ -343,6 +344,11 @@ class Pairs:
         halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
         unshadowed = self.unshadowed(name)
         return share, unshadowed * share, unshadowed * 0.5 * np.abs(halves[0] - halves[1])
+
+
+def _taken(rows, flat):
+    """Values (3, R) or (R,) of rows (3, S, Q) or (S, Q) at places in the flat (S, Q)."""
+    return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
 
 
 @dataclass(frozen=True)

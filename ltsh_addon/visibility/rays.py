@@ -467,30 +467,43 @@ class Starts:
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
-        facing = _dot(self.geometric_normal[index], directions)
+        return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
+
+    def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, S, Q) of S rays each from the samples `index` (Q,), along unit `directions` (3, S, Q)."""
+        normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
+        facing = _dot_rows(normal, directions)
         side = np.copysign(self.clearance[index], facing)
-        terminator = self.terminator[index]
         smooth = np.flatnonzero(terminator)
         lift = None
         if len(smooth):
-            lift, own = self._lifts(index[smooth], directions[smooth], facing[smooth], terminator[smooth])
-            side[smooth] = np.where(own, np.abs(side[smooth]) * own, side[smooth])
-        found = self.position[index] + side[:, None] * self.geometric_normal[index]
+            part = slice(None) if len(smooth) == len(index) else smooth
+            rays = directions[:, :, part], facing[:, part], terminator[part]
+            lift, own = self._lifts(index[part], *rays)
+            side[:, part] = np.where(own, np.abs(side[:, part]) * own, side[:, part])
+        found = side * normal
+        found += self.position[index].T[:, None]
         if lift is not None:
-            found[smooth] += lift
+            found[:, :, part] += lift
         return found
 
     def _lifts(self, index, directions, facing, terminator):
-        """How far (S, 3) rays of smooth samples start from the sample, and where they start not to pass their own
-        triangle (S,): above it (1), below (-1) or where the direction tells (0)."""
-        smooth_facing = _dot(self.smooth_normal[index], directions)
-        flipped = np.where(smooth_facing < 0.0, np.float32(-1.0), np.float32(1.0))
+        """How far (3, S, Q) rays of smooth samples start from the sample, and where they start not to pass their own
+        triangle (S, Q): above it (1), below (-1) or where the direction tells (0)."""
+        smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
+        is_inside = smooth_facing < 0.0
+        flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
         facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
         grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
         amount = np.clip(grazing, 0.0, 1.0)
-        lift = amount[:, None] * self.lift[(flipped < 0.0).astype(np.intp), index]
+        outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
         # As in Cycles, light from behind the own triangle meets it.
-        return lift, np.where((amount > 0.0) & (facing <= 0.0), flipped, 0.0)
+        own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
+        return amount * np.where(is_inside, inside, outside), own
+
+
+def _dot_rows(first, second):
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _dot(first, second):

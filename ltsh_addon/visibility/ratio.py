@@ -5,7 +5,8 @@ doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w
 light, w what the pass makes of the light along them, over the density of the rays. The same rays serve both passes.
 
 A few probes go to every pair of a sample and a light. Those that all arrive, or are all blocked, settle it, unless a
-neighbor in the picture found otherwise; the pairs that are left take all rays.
+neighbor in the picture found otherwise. The pairs that are left take as many rays as they are worth by their light.
+Nothing hangs on where a sample stands in a picture or a block but which samples are its neighbors there.
 """
 
 from __future__ import annotations
@@ -15,17 +16,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import FARTHEST, PASSES, AreaLight, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples
 from ..shading import light_cone
 from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.light_polygons import has_lobe
+from . import crew
 from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .filter import ShareFilter
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
 MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
+# Samples of a block that one process takes at a time, and pairs of samples and lights that take it longer than to start.
+BLOCK_SAMPLES = 1 << 14
+PAIRS_WORTH_A_CHILD = 300_000
 # Of PROBES rays, how many are chosen evenly for pairs with both lobes, a diffuse and a specular one: at first, and later
 # where the specular lobe, or the diffuse one, counts more.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
@@ -63,10 +69,14 @@ class Visibility:
     rays: int  # that were traced
     mixed: np.ndarray  # (L, P) bool: pairs of which some rays arrived and some did not
 
-    def noise(self, name: str) -> float:
-        """Estimated relative L2 error of a pass, by the two halves of the rays."""
-        power = np.square(self.radiance[name], dtype=np.float64).sum()
-        return float(np.sqrt(np.square(self.deviation[name], dtype=np.float64).sum() / max(power, 1e-30)))
+    def noise(self, name: str, film: Film | None = None) -> float:
+        """Estimated relative L2 error of a pass, by the two halves of the rays: of samples, or of pixels of a film."""
+        light, variance = self.radiance[name], np.square(self.deviation[name])
+        if film is not None:
+            # The errors of the samples of a pixel do not depend on each other.
+            light, variance = film.image(light), film.image(variance) / film.sub_samples
+        power = np.square(light, dtype=np.float64).sum()
+        return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
 
 
 def visible_shares(
@@ -75,37 +85,76 @@ def visible_shares(
     tracer,
     *,
     passes: Sequence[str] = PASSES,
-    rays: int = 32,
+    rays: int = 128,
     film: Film | None = None,
+    smooth: bool = False,
+    workers: int | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
-    returns it. `progress` may return False to stop: Cancelled is raised.
+    `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
+    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
+    process. `progress` may return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    rays, count = rays // PROBES * PROBES, len(samples)
-    shares = {name: np.ones((len(lights), count), np.float32) for name in passes}
-    radiance, variance = ({name: np.zeros(count) for name in passes} for _ in range(2))
-    mixed = np.zeros((len(lights), count), bool)
-    surface, neighbors, traced = Surface(samples, passes, tracer), Neighbors.of(film, count), 0
+    lights, passes = tuple(lights), tuple(passes)
     typical = typical_radiance(samples, lights, passes)
-    for number, light in enumerate(lights):
-        if progress is not None and progress("shadows", number / len(lights)) is False:
-            raise Cancelled("shadows were stopped")
-        pairs = Pairs(surface, light)
-        pairs.trace(rays, neighbors, typical)
-        traced += pairs.traced
-        index = pairs.index
-        mixed[number, index] = pairs.visible & pairs.blocked
+    task = ShadowTask(lights, passes, rays // PROBES * PROBES, smooth, typical)
+    shape = len(lights), len(samples)
+    shares = {name: np.ones(shape, np.float32) for name in passes}
+    radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
+    mixed, traced = np.zeros(shape, bool), 0
+    blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
+    parts = ((samples.take(block), None if film is None else film.take(block)) for block in blocks)
+    wanted = 1 if shape[0] * shape[1] < PAIRS_WORTH_A_CHILD else workers
+    for number, found in crew.run(task, tracer, list(parts), wanted, progress):
+        block = blocks[number]
         for name in passes:
-            shares[name][number, index], mean, deviation = pairs.found(name)
-            radiance[name][index] += mean
-            variance[name][index] += deviation * deviation
-    deviation = {name: np.sqrt(values) for name, values in variance.items()}
+            shares[name][:, block] = getattr(found, name)
+            radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
+        mixed[:, block] = found.mixed
+        traced += found.rays
     return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+@dataclass(frozen=True)
+class ShadowTask:
+    """What to do with every block of samples."""
+
+    lights: tuple[AreaLight, ...]
+    passes: tuple[str, ...]
+    rays: int
+    smooth: bool
+    typical: dict[str, float]
+
+    def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
+        """Those of a block, all in this thread."""
+        shape = len(self.lights), len(samples)
+        shares = {name: np.ones(shape, np.float32) for name in self.passes}
+        radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
+        mixed, traced = np.zeros(shape, bool), 0
+        surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
+        share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
+        for number, light in enumerate(self.lights):
+            pairs = Pairs(surface, light)
+            pairs.trace(self.rays, neighbors, self.typical)
+            traced += pairs.traced
+            index = pairs.index
+            mixed[number, index] = pairs.visible & pairs.blocked
+            for name in self.passes:
+                share, noise = pairs.found(name)
+                if share_filter is not None:
+                    chosen = mixed[number, index] & pairs.wanted[name]
+                    share, factor = share_filter.filtered(name, index, share, pairs.count, chosen, noise)
+                    noise *= factor
+                unshadowed = pairs.unshadowed(name)
+                shares[name][number, index] = share
+                radiance[name][index] += unshadowed * share
+                variance[name][index] += np.square(unshadowed * noise)
+        deviation = {name: np.sqrt(values) for name, values in variance.items()}
+        return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
 def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
@@ -305,7 +354,9 @@ class Pairs:
                 view = View(self.surface, self.index[block], self.emitter, lobes)
                 step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
                 for number in range(first, last, step):
-                    rays = Rays(number, min(number + step, last), EVENLY[kind, 0], EVENLY[kind, split])
+                    rays = Rays(
+                        number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
+                    )
                     self._add_block(block, view, rays, trace)
         self.count[members] = last
 
@@ -317,7 +368,9 @@ class Pairs:
             met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
             flat = np.flatnonzero(met)
             origins = self.surface.starts.origins_of_rows(view.index, directions)
-            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in (origins, directions, distance)))
+            arriving.ravel()[flat] = self._transmittance(
+                *(_taken(rows, flat) for rows in (origins, directions, distance))
+            )
             sums = arriving.sum(axis=0)
             self.visible[block] |= sums > 0.0
             self.blocked[block] |= sums < met.sum(axis=0)
@@ -336,14 +389,13 @@ class Pairs:
         return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
 
     def found(self, name: str):
-        """Shares (Q,) of a pass, the radiance (Q,) that it reflects, about, and its standard deviation."""
+        """Shares (Q,) of a pass, and their standard deviations, about."""
         weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
         share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
-        # Pairs with one eighth of rays have no second half: all of it agrees.
+        # Probes alone have no second half.
         halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
-        unshadowed = self.unshadowed(name)
-        return share, unshadowed * share, unshadowed * 0.5 * np.abs(halves[0] - halves[1])
+        return share, 0.5 * np.abs(halves[0] - halves[1])
 
 
 def _taken(rows, flat):
@@ -360,6 +412,7 @@ class Rays:
 
     first: int
     last: int
+    total: int
     probes: int
     later: int
 
@@ -379,14 +432,14 @@ class Rays:
         return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
 
     def add_to(self, halves, weight):
-        """Add weights (S, Q) to the sums (2, Q) of every other PROBES rays and of those between, one after another."""
+        """Add weights (S, Q) to the sums (2, Q) of the first and the second half of the total, one after another."""
         start, stop = self.evenly
         parts = np.zeros((self.looks, weight.shape[1]), np.float32)
         for rows in (weight[: stop - start], weight[stop - start :]):
             if len(rows):
                 parts += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
         for number, part in enumerate(parts, self.first // PROBES):
-            halves[number % 2] += part
+            halves[int(2 * number * PROBES >= self.total)] += part
 
 
 class View:

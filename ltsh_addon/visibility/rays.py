@@ -74,6 +74,7 @@ class _Embree:
     """The functions of one library, and a device of it."""
 
     def __init__(self, library: str):
+        self.path = library
         try:
             self._library = ctypes.CDLL(library)
             # Keeps Python's lock during a call, which is too short to hand it over.
@@ -302,7 +303,7 @@ class Tracer:
     """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`."""
 
     def __init__(self, occluders: Occluders, embree: _Embree):
-        self.occluders, self.description = occluders, f"Embree {embree.version}"
+        self.occluders, self.description, self.library = occluders, f"Embree {embree.version}", embree.path
         self._embree, self._lock = embree, threading.Lock()
         clear = np.array([mesh.transparency is not None for mesh in occluders.meshes], bool)
         is_clear = clear[occluders.mesh] if len(occluders.mesh) else np.zeros(0, bool)

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from .occluders import OccluderMesh, Occluders, Transparency
-from .rays import Starts, Tracer, open_tracer
+from .rays import Hits, Starts, Tracer, open_tracer
 
-__all__ = ["OccluderMesh", "Occluders", "Starts", "Tracer", "Transparency", "open_tracer"]
+__all__ = ["Hits", "OccluderMesh", "Occluders", "Starts", "Tracer", "Transparency", "open_tracer"]

@@ -151,6 +151,12 @@ class Occluders:
             raise ValueError(f"occluders: an instance names mesh {mesh.max()}, expected 0 to {len(self.meshes) - 1}")
         object.__setattr__(self, "meshes", tuple(self.meshes))
 
+    def split(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the instances that block, and of those that let light through; without triangles: neither."""
+        is_clear = np.array([mesh.transparency is not None for mesh in self.meshes], bool)[self.mesh]
+        is_there = np.array([len(mesh.triangles) > 0 for mesh in self.meshes], bool)[self.mesh]
+        return np.flatnonzero(is_there & ~is_clear), np.flatnonzero(is_there & is_clear)
+
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name; 0: nothing is in its way."""
         return self.light_masks.get(light, 1)

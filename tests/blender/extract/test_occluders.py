@@ -9,8 +9,6 @@ import pytest
 import scene_parts
 from material_scenes import Build
 
-from ltsh_addon.blender.evaluated import with_render_depsgraph
-from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.blender.render_settings import enable_passes, pass_names, pinned_pixel_filter, render_exr
 from ltsh_addon.imaging.exr import read_channels
@@ -71,15 +69,6 @@ def seen_by_cycles(folder, light=LIGHT):
     return found / (power * (to_light[:, 2] / distance) ** 2 / distance**2 / math.pi)
 
 
-def collected():
-    """The occluders of the open scene and the warnings about them."""
-    warnings = []
-    scene = bpy.context.scene
-    override = bpy.context.view_layer.material_override
-    occluders = with_render_depsgraph(scene, lambda depsgraph: collect_occluders(depsgraph, override, warnings.append))
-    return occluders, warnings
-
-
 def seen_by_rays(occluders, light=LIGHT, name="Key"):
     """Share (N,) of light that reaches the floor, and a mask of the points where the size of the light, the place in
     the pixel or single precision does not matter."""
@@ -99,7 +88,7 @@ def seen_by_rays(occluders, light=LIGHT, name="Key"):
 def assert_as_cycles(folder, note="", least=0.03, most_doubtful=0.35):
     """The occluders, whose shadow is that of Cycles; `note` is all that is warned of."""
     expected = seen_by_cycles(folder)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     found, is_sure = seen_by_rays(occluders)
     assert is_sure.mean() > 1.0 - most_doubtful
     blocked = (1.0 - found)[is_sure]
@@ -236,7 +225,7 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
     parent.instance_type, parent.visible_shadow = "VERTS", False
     cube((0.0, 0.0, 0.0), 0.5).parent = parent
     assert seen_by_cycles(tmp_path) == pytest.approx(1.0, abs=2e-3)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert warnings == [] and len(occluders.mesh) == 1  # the floor
 
 
@@ -349,7 +338,7 @@ def test_an_image_is_interpolated_as_in_cycles(tmp_path):
     start()
     pane(shown(lambda made: alpha_image(made, interpolation="Linear")))
     expected = seen_by_cycles(tmp_path)
-    found, _ = seen_by_rays(collected()[0])
+    found, _ = seen_by_rays(scene_parts.collected_occluders()[0])
     # The light is 2 mm wide, and alpha changes by at most 1 from one pixel of the image, of 0.5 m, to the next.
     assert np.abs(found - expected).max() < 0.02
 
@@ -421,7 +410,7 @@ def test_what_is_not_as_in_cycles_is_named(name):
         node = made.tree.nodes.new("ShaderNodeDisplacement")
         made.tree.links.new(node.outputs[0], made.output.inputs["Displacement"])
         pane(made.material)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
     share = {"colored": 0.5, "volume": 1.0}.get(name, 0.0)
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
@@ -463,7 +452,7 @@ def point_cloud(count):
 def assert_mean_shadow(folder, note, tolerance):
     """The shadow is that of Cycles but at silhouettes, which facets move both ways."""
     expected = seen_by_cycles(folder)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     found, _ = seen_by_rays(occluders)
     assert len(warnings) == 1 and note in warnings[0], warnings
     assert 0.03 < 1.0 - expected.mean() < 0.6
@@ -545,7 +534,7 @@ def test_blockers_of_lights_are_those_of_cycles(tmp_path, name):
         bpy.data.objects[other].hide_render = True
         expected = seen_by_cycles(tmp_path, places[light])
         bpy.data.objects[other].hide_render = False
-        occluders, warnings = collected()
+        occluders, warnings = scene_parts.collected_occluders()
         found, is_sure = seen_by_rays(occluders, places[light], light)
         assert warnings == [] and found.min() == 0.0
         assert (np.abs(found - expected)[is_sure] > 0.01).sum() <= 2
@@ -555,7 +544,7 @@ def test_a_light_without_shadows_is_not_blocked(tmp_path):
     start()
     cube()
     bpy.data.objects["Key"].data.use_shadow = False
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert seen_by_rays(occluders)[0].min() == 1.0
     assert np.abs(seen_by_cycles(tmp_path) - 1.0).max() < 2e-3
     assert len(warnings) == 1 and "'Key'" in warnings[0] and "sharp reflections" in warnings[0]
@@ -566,7 +555,7 @@ def test_the_scene_is_left_as_it_was(tmp_path):
     pane(shown(alpha_image))
     text()
     before = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
-    occluders, _ = collected()
+    occluders, _ = scene_parts.collected_occluders()
     occluders.save(tmp_path / "occluders.npz")
     after = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
     assert before == after

@@ -489,54 +489,68 @@ class Starts:
     lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
     terminator: np.ndarray  # (P,) as Occluders.terminators, 0 for all that is flat
 
-    def take(self, index) -> Starts:
-        """Those of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        own = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Starts(**{name: values[:, index] if name == "lift" else values[index] for name, values in own.items()})
-
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
-        rows = (self.position, self.geometric_normal, self.smooth_normal, self.clearance, self.terminator)
-        return self._along(directions.T, *(values[index].T for values in rows), index).T
+        return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
 
-    def along(self, directions: np.ndarray) -> np.ndarray:
-        """Origins (3, S, P) of rays along unit `directions` (3, S, P), S from each sample."""
-        rows = (self.position, self.geometric_normal, self.smooth_normal, self.clearance, self.terminator)
-        samples = np.broadcast_to(np.arange(len(self.position)), directions.shape[1:])
-        return self._along(directions, *(values.T for values in rows), samples)
-
-    def _along(self, directions, position, normal, smooth_normal, clearance, terminator, samples):
-        """Origins (3, ...) of rays along `directions` (3, ...) from `samples` (...), whose values broadcast."""
-        facing = _scalar(normal, directions)
-        side = np.copysign(clearance, facing)
-        place = (slice(None), *(None,) * (side.ndim - 1))
-        if not terminator.any():
-            return position[place] + side * normal[place]
-        smooth_facing = _scalar(smooth_normal, directions)
-        flipped = np.copysign(np.float32(1.0), smooth_facing)
-        facing *= flipped
-        smooth_facing *= flipped
-        with np.errstate(divide="ignore", invalid="ignore"):
-            amount = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
-        lifted = np.flatnonzero((amount > 0.0) & (terminator > 0.0))
-        amount, behind = np.minimum(amount.ravel()[lifted], 1.0), facing.ravel()[lifted] <= 0.0
-        # As in Cycles, light from behind the own triangle meets it.
-        way, sides = flipped.ravel()[lifted], side.ravel()
-        sides[lifted] = np.where(behind, np.copysign(sides[lifted], way), sides[lifted])
-        found = position[place] + side * normal[place]
-        lift = self.lift[(way < 0.0).astype(np.intp), samples.ravel()[lifted]]
-        found.reshape(3, -1)[:, lifted] += amount * lift.T
+    def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, S, Q) of S rays each from the samples `index` (Q,), along unit `directions` (3, S, Q)."""
+        normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
+        facing = _dot_rows(normal, directions)
+        side = np.copysign(self.clearance[index], facing)
+        smooth = np.flatnonzero(terminator)
+        lift = None
+        if len(smooth):
+            part = slice(None) if len(smooth) == len(index) else smooth
+            rays = directions[:, :, part], facing[:, part], terminator[part]
+            lift, own = self._lifts(index[part], *rays)
+            side[:, part] = np.where(own, np.abs(side[:, part]) * own, side[:, part])
+        found = side * normal
+        found += self.position[index].T[:, None]
+        if lift is not None:
+            found[:, :, part] += lift
         return found
+
+    def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
+
+        They end at `distances`, finite, along `directions` from the sample, wherever they start.
+        """
+        origins = self.origins_of_rows(index, directions)
+        moved = origins - self.position[index].T[:, None]
+        lifted = np.flatnonzero(_dot_rows(moved, moved) > 4.0 * self.clearance[index] ** 2)
+        if len(lifted):
+            directions, distances = directions.copy(), distances.copy()
+            rows = directions.reshape(3, -1)
+            toward = rows[:, lifted] * distances.ravel()[lifted] - moved.reshape(3, -1)[:, lifted]
+            length = np.sqrt(_dot_rows(toward, toward))
+            rows[:, lifted] = toward / np.maximum(length, np.float32(1e-30))
+            distances.ravel()[lifted] = length
+        return origins, directions, distances
+
+    def _lifts(self, index, directions, facing, terminator):
+        """How far (3, S, Q) rays of smooth samples start from the sample, and where they start not to pass their own
+        triangle (S, Q): above it (1), below (-1) or where the direction tells (0)."""
+        smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
+        is_inside = smooth_facing < 0.0
+        flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
+        facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
+        grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
+        amount = np.clip(grazing, 0.0, 1.0)
+        outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
+        # As in Cycles, light from behind the own triangle meets it.
+        own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
+        return amount * np.where(is_inside, inside, outside), own
+
+
+def _dot_rows(first, second):
+    """Scalar products (S, Q) of vectors (3, S, Q)."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _dot(first, second):
     """Scalar products (R,) of vectors (R, 3)."""
     return np.einsum("rk,rk->r", first, second)
-
-
-def _scalar(first, second):
-    """Scalar products (...) of vectors (3, ...)."""
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 # -- which library --------------------------------------------------------------------------------------------------

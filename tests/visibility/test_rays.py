@@ -223,22 +223,27 @@ def test_a_smooth_sphere_is_lit_up_to_its_horizon_as_cycles_lifts_it(libraries):
     assert blocked[0.0] == 1.0 and blocked[0.1] < 0.01 and blocked[1.0] < 0.01, blocked
 
 
-def test_both_forms_of_origins_are_the_same(libraries):
+def test_lifted_rays_go_to_the_same_points(libraries):
     rng = np.random.default_rng(9)
     vertices, triangles = sphere(6)
-    for normals in (vertices, None):
-        mesh = OccluderMesh(vertices, triangles, normals=normals)
-        with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
-            samples = samples_on(mesh, np.eye(3, 4), rng, 50)
-            starts = tracer.starts(samples)
-            directions = rng.normal(size=(3, 7, 50)).astype(np.float32)
-            directions /= np.linalg.norm(directions, axis=0)
-            found = starts.along(directions)
-            for ray in range(7):
-                one_by_one = starts.origins(np.arange(50), directions[:, ray].T)
-                assert np.array_equal(found[:, ray].T, one_by_one)
-            some = np.array([3, 40, 3])
-            assert np.array_equal(starts.take(some).along(directions[:, :, some]), found[:, :, some])
+    mesh = OccluderMesh(vertices, triangles, normals=vertices)
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
+        samples = samples_on(mesh, np.eye(3, 4), rng, 50)
+        starts = tracer.starts(samples)
+    index = rng.integers(0, 50, 40)
+    directions = rng.normal(size=(3, 7, 40)).astype(np.float32)
+    directions /= np.linalg.norm(directions, axis=0)
+    distances = rng.uniform(0.5, 5.0, (7, 40)).astype(np.float32)
+    origins, aimed, lengths = starts.aimed(index, directions, distances)
+    for ray in range(7):
+        np.testing.assert_array_equal(origins[:, ray].T, starts.origins(index, directions[:, ray].T))
+    position = samples.position[index].T[:, None]
+    off = np.linalg.norm(origins + aimed * lengths - position - directions * distances, axis=0)
+    lifted = np.linalg.norm(origins - position, axis=0) > 1e-3
+    assert 0.05 < lifted.mean() < 0.9
+    # By rounding of coordinates up to 6, and for rays that are not lifted by the clearance.
+    assert off[lifted].max() < 2e-6 and off.max() < 2e-6 + starts.clearance.max()
+    np.testing.assert_allclose(np.linalg.norm(aimed, axis=0), 1.0, rtol=1e-6)
 
 
 def test_a_sample_off_all_triangles_starts_beside_its_surface(libraries):

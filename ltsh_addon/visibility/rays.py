@@ -25,10 +25,10 @@ from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
 # Rays in a chunk: its packets stay in the second-level cache.
 CHUNK = 4096
-# Rows of a packet of rays, and of one of rays with what they hit. Two more are room for what some builds of Embree add.
+# Rows of a packet of rays, and of one of rays with what they hit; the last two are room for what some builds add.
 ORIGIN, NEAR, DIRECTION, FAR, MASK = slice(0, 3), 3, slice(4, 7), 8, 9
 RAY_ROWS, U, V, TRIANGLE, GEOMETRY, INSTANCE, HIT_ROWS = 12, 15, 16, 17, 18, 19, 22
-NONE = 0xFFFFFFFF
+NONE, MOST_LEVELS = 0xFFFFFFFF, 32
 # Of the size of coordinates: 8 times their rounding in single precision; 2 times are too few, 4 seem to suffice.
 CLEARANCE = 2.0**-21
 # A sample is looked for so far from its place, in m for one near the origin, in so many surfaces, until it is as near
@@ -128,7 +128,9 @@ class _Packets:
 
     def __init__(self, width: int, rows: int):
         count = CHUNK // width
-        self.values = _aligned(count * rows * width).reshape(count, rows, width)
+        # A build of Embree with more levels of instances would write beyond the last packet, before it is found unfit.
+        values = _aligned((count * rows + 2 * MOST_LEVELS) * width)
+        self.values = values[: count * rows * width].reshape(count, rows, width)
         self.numbers = self.values.view(np.uint32)
         self.values[:, DIRECTION] = 1.0
         start, size = self.values.ctypes.data, rows * width * 4

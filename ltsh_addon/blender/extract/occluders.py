@@ -43,7 +43,10 @@ def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occlud
 class _Collector:
     def __init__(self, depsgraph, override, left_out):
         self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
-        self._blockers = Blockers([instance.object.original for instance in depsgraph.object_instances])
+        objects = {
+            instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
+        }
+        self._blockers = Blockers(list(objects.values()))
         self._meshes: list[OccluderMesh] = []
         # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
         self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
@@ -56,8 +59,6 @@ class _Collector:
     def collect(self, warn) -> Occluders:
         for instance in self._depsgraph.object_instances:
             ob = instance.object
-            if ob.type == "VOLUME" and instance.show_self:
-                self._note("volumes cast no shadows here", ob)
             if ob.type not in SURFACE_TYPES or ob.original.name_full in self._left_out:
                 continue
             if not (ob.visible_shadow and owner_of(instance).visible_shadow):
@@ -68,7 +69,7 @@ class _Collector:
                 continue
             if instance.show_self and is_rendered(ob):
                 self._add(instance, matrix)
-            if instance.show_particles and not instance.is_instance and ob.particle_systems:
+            if instance.show_particles and ob.particle_systems:
                 self._add_hair(instance)
         for kind, names in self._notes.items():
             warn(f"shadows: {kind}: {listed(map(repr, names), NAMED)}")
@@ -159,10 +160,8 @@ class _Collector:
             return None
         output = surface.node
         if live_link(surface) is None:
-            if live_link(output.inputs["Volume"]) is None:
-                return None
-            self._note("volumes cast no shadows here", material)
-            return _Clear(constant(1.0))
+            # Volumes are not shaded, which is said elsewhere.
+            return None if live_link(output.inputs["Volume"]) is None else _Clear(constant(1.0))
         value = _share_at(surface)
         if value is None:
             self._note("it is transparent in a way that is not read here, and blocks as if it were opaque", material)
@@ -197,6 +196,9 @@ class _Collector:
                 continue
             settings = system.settings
             if settings.type != "HAIR" or settings.render_type != "PATH":
+                continue
+            if instance.is_instance:
+                self._note("hair on instances blocks nothing", ob)
                 continue
             count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
             if count * steps > MOST_PIECES:

@@ -221,6 +221,9 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
     bpy.data.objects["A"].visible_shadow = False
     bpy.data.objects["B"].hide_render = True
     bpy.data.objects["C"].data.materials.append(scene_parts.bsdf_material("ShaderNodeBsdfTransparent", "Clear")[0])
+    volume = Build("Mist")
+    volume.link(volume.shader("VolumePrincipled", Density=0.0), volume.output.inputs["Volume"])
+    cube((0, 0, 2), material=volume.material)
     parent = hidden(scene_parts.add_plane(size=1.0, name="Parent", location=(0.0, 0.0, 1.0)))
     parent.instance_type, parent.visible_shadow = "VERTS", False
     cube((0.0, 0.0, 0.0), 0.5).parent = parent
@@ -381,7 +384,6 @@ NAMED = {
     "colored": "by its mean",
     "color under alpha": "only Cycles knows",
     "displaced": "displacement",
-    "volume": "volumes cast no shadows",
 }
 
 
@@ -399,10 +401,6 @@ def test_what_is_not_as_in_cycles_is_named(name):
     elif name == "color under alpha":
         pane(shown(mixed_by_image))
         bpy.data.images["Mask"].alpha_mode = "STRAIGHT"
-    elif name == "volume":
-        made = Build("Pane")
-        made.link(made.shader("VolumePrincipled"), made.output.inputs["Volume"])
-        pane(made.material)
     else:
         made = Build("Pane")
         made.show(made.leaf(0.5))
@@ -412,7 +410,7 @@ def test_what_is_not_as_in_cycles_is_named(name):
         pane(made.material)
     occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
-    share = {"colored": 0.5, "volume": 1.0}.get(name, 0.0)
+    share = 0.5 if name == "colored" else 0.0
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 
@@ -538,6 +536,22 @@ def test_blockers_of_lights_are_those_of_cycles(tmp_path, name):
         found, is_sure = seen_by_rays(occluders, places[light], light)
         assert warnings == [] and found.min() == 0.0
         assert (np.abs(found - expected)[is_sure] > 0.01).sum() <= 2
+
+
+def test_more_sets_of_blockers_than_a_mask_has_bits_are_named():
+    start()
+    cube().name = "A"
+    for number in range(33):
+        light = add_light(f"Light {number:02}", LIGHT)
+        collection = bpy.data.collections.new(light.name)
+        collection.objects.link(bpy.data.objects["A" if number % 2 else "Floor"])
+        light.light_linking.blocker_collection = collection
+    occluders, warnings = scene_parts.collected_occluders()
+    assert len(set(occluders.light_masks.values())) == 31
+    assert seen_by_rays(occluders, name="Light 29")[0].min() == 0.0
+    assert seen_by_rays(occluders, name="Light 30")[0].min() == 1.0
+    assert seen_by_rays(occluders, name="Light 32")[0].min() == 0.0  # as without a collection
+    assert len(warnings) == 1 and "'Light 31', 'Light 32'" in warnings[0]
 
 
 def test_a_light_without_shadows_is_not_blocked(tmp_path):

@@ -56,6 +56,43 @@ def test_no_ray_slips_between_the_triangles_of_a_closed_mesh(libraries):
         assert not tracer.transmittance(origins, directions, np.full(len(targets), np.inf)).any()
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e30, 0.0])
+def test_rays_that_are_none_disturb_no_other(libraries, number):
+    rng = np.random.default_rng(6)
+    occluders, (origins, directions, distances, masks) = random_occluders(rng), random_rays(rng, 4000)
+    wrong = rng.random(4000) < 0.3
+    with open_tracer(occluders, libraries) as tracer:
+        expected = tracer.transmittance(origins, directions, distances, masks)
+        for values in (origins, directions, distances):
+            kept = values[wrong]
+            values[wrong] = number
+            found = tracer.transmittance(origins, directions, distances, masks)
+            assert np.array_equal(found[~wrong], expected[~wrong])
+            assert ((found >= 0.0) & (found <= 1.0)).all()
+            values[wrong] = kept
+
+
+def test_meshes_that_are_none_disturb_no_other(libraries):
+    rng = np.random.default_rng(6)
+    occluders, cast = random_occluders(rng), random_rays(rng, 4000)
+    with open_tracer(occluders, libraries) as tracer:
+        expected = tracer.transmittance(*cast)
+    nowhere = OccluderMesh(np.full((3, 3), np.nan), [[0, 1, 2]])
+    far = OccluderMesh(np.full((3, 3), 1e30), [[0, 1, 2]])
+    point, empty = OccluderMesh(np.zeros((3, 3)), [[0, 1, 2]]), OccluderMesh(np.zeros((0, 3)), np.zeros((0, 3)))
+    flat = np.zeros((8, 3, 4))
+    flat[:, 0, 0] = 1.0  # onto a line
+    mesh = np.concatenate([occluders.mesh, 4 + np.arange(8) % 4])
+    more = Occluders(
+        (*occluders.meshes, nowhere, far, point, empty),
+        mesh,
+        np.concatenate([occluders.matrices, flat]),
+        np.concatenate([occluders.masks, np.full(8, rays.ALL_RAYS)]),
+    )
+    with open_tracer(more, libraries) as tracer:
+        assert np.array_equal(tracer.transmittance(*cast), expected)
+
+
 def test_instances_are_as_copies_of_the_mesh(libraries):
     rng = np.random.default_rng(5)
     vertices, triangles = sphere(8)

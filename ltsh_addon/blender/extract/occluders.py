@@ -10,11 +10,12 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
-from ..evaluated import SURFACE_TYPES, is_rendered, mesh_key, owner_of, read_values
+from ..evaluated import SURFACE_TYPES, is_rendered, owner_of, read_values
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
 from ..materials.values import Value, combined, constant, is_gray, is_srgb, product, value_at
@@ -119,7 +120,7 @@ class _Collector:
             materials = [self._override] * len(materials)
         if self._simplified(ob):
             self._note("camera or distance culling is on, but it blocks everywhere", ob)
-        key = (*mesh_key(instance), tuple(material.name_full if material else "" for material in materials))
+        key = (*_shape_key(ob), tuple(material.name_full if material else "" for material in materials))
         if key not in self._parts:
             clear = [self._clear_of(material) for material in materials]
             places = AS_IT_IS
@@ -228,8 +229,13 @@ class _Clear:
         use = self.value.image
         mapping = np.array(use.mapping, np.float32)
         uv = uv_of(use.uv_map) @ mapping[:, :2].T + mapping[:, 2]
-        interpolation = "Closest" if use.closest else "Linear"
-        return Transparency(1.0, image_of(self.value), uv.astype(np.float32), use.extension, interpolation)
+        return Transparency(
+            image=image_of(self.value),
+            uv=uv.astype(np.float32),
+            extension=use.extension,
+            interpolation="Closest" if use.closest else "Linear",
+            outside=float(np.clip(self.value.offset[0], 0.0, 1.0)),
+        )
 
 
 def _share_at(socket, groups: tuple = ()) -> Value | None:
@@ -300,6 +306,15 @@ def _is_displaced(material) -> bool:
     if surface is None or live_link(surface.node.inputs["Displacement"]) is None:
         return False
     return getattr(material, "displacement_method", "BUMP") != "BUMP"
+
+
+def _shape_key(ob) -> tuple:
+    """What tells the evaluated data of objects apart while a depsgraph stays as it is."""
+    data = ob.data
+    is_mesh = isinstance(data, bpy.types.Mesh)
+    original = data.original.session_uid if data.original is not None else 0
+    owner = 0 if is_mesh and not ob.modifiers else ob.original.session_uid
+    return owner, original, data.as_pointer(), len(data.vertices) if is_mesh else 0
 
 
 # -- shapes --------------------------------------------------------------------------------------------------------

@@ -162,6 +162,23 @@ def vertex_instances():
     child.parent = parent
 
 
+def generated_instances():
+    """A geometry nodes modifier that puts two meshes it makes on points: a ball, and cubes."""
+    tree = bpy.data.node_groups.new("Scatter", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    entry, end, on_points, made = (
+        tree.nodes.new(kind)
+        for kind in ("NodeGroupInput", "NodeGroupOutput", "GeometryNodeInstanceOnPoints", "GeometryNodeMeshCube")
+    )
+    made.inputs["Size"].default_value = (0.5, 0.4, 0.3)
+    tree.links.new(entry.outputs[0], on_points.inputs["Points"])
+    tree.links.new(made.outputs[0], on_points.inputs["Instance"])
+    tree.links.new(on_points.outputs[0], end.inputs[0])
+    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
+    ob.modifiers.new("Scatter", "NODES").node_group = tree
+
+
 def shared_data():
     first = cube((-0.8, 0.0, 1.0), 0.7)
     second = hidden(bpy.data.objects.new("Second", first.data))
@@ -202,16 +219,23 @@ SHAPES = {
     function.__name__: function
     for function in (
         *(modified, curve, text, metaballs, nurbs_surface, collection_instances, vertex_instances, shared_data),
+        *(generated_instances,),
         *(not_in_the_picture, glowing, glass, no_surface_shader, overridden),
     )
 }
+
+
+# Whose instances share a mesh.
+INSTANCES = ("collection_instances", "vertex_instances", "shared_data", "generated_instances")
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shadows_of_shapes_are_those_of_cycles(tmp_path, name):
     start()
     SHAPES[name]()
-    assert_as_cycles(tmp_path)
+    occluders = assert_as_cycles(tmp_path)
+    if name in INSTANCES:
+        assert len(occluders.meshes) == 2 and len(occluders.mesh) > 2  # the floor is one
 
 
 def test_what_casts_no_shadow_blocks_nothing(tmp_path):
@@ -284,8 +308,8 @@ def mapped_image(made):
     return inside
 
 
-def mixed_by_image(made):
-    return made.mix(textured(made, "Color", space="sRGB"), made.leaf(0.5), clear(made, 0.8))
+def mixed_by_image(made, **settings):
+    return made.mix(textured(made, "Color", space="sRGB", **settings), clear(made, 0.2), clear(made, 0.8))
 
 
 def is_shadow_ray(made):
@@ -315,6 +339,7 @@ MATERIALS = {
     "clipped image": (lambda made: alpha_image(made, extension="CLIP"), None),
     "mapped image": (mapped_image, None),
     "mixed by a color": (mixed_by_image, None),
+    "mixed by a clipped color": (lambda made: mixed_by_image(made, extension="CLIP"), None),
 }
 
 
@@ -329,7 +354,7 @@ def test_shadows_of_materials_are_those_of_cycles(tmp_path, name):
     make, share = MATERIALS[name]
     start()
     ob = pane(shown(make))
-    if name == "clipped image":
+    if "clipped" in name:
         uv = ob.data.uv_layers[0].uv
         uv.foreach_set("vector", 1.6 * np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32) - 0.3)
     occluders = assert_as_cycles(tmp_path)

@@ -32,7 +32,7 @@ BLOCK_RAYS = 1 << 15
 # Samples of a block that one process takes at a time, and pairs of samples and lights that take it longer than to start.
 BLOCK_SAMPLES = 1 << 14
 PAIRS_WORTH_A_CHILD = 300_000
-# Of PROBES rays, how many are chosen evenly for pairs with both lobes, a diffuse and a specular one: at first, and later
+# Of PROBES rays, how many are chosen evenly: for pairs with both lobes, a diffuse and a specular one; at first, and later
 # where the specular lobe, or the diffuse one, counts more.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 # Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
@@ -94,8 +94,8 @@ def visible_shares(
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
     `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
-    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
-    process. `progress` may return False to stop: Cancelled is raised.
+    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
+    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
@@ -206,7 +206,7 @@ class Surface:
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)
-        self._known: dict[int, np.ndarray] = {}
+        self._known: list[np.ndarray] = []
         self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)
         self.geometric_normal = self._rows(samples.geometric_normal)
         self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
@@ -223,9 +223,11 @@ class Surface:
 
     def _rows(self, vectors):
         # Normals that stand for each other are the same array.
-        if id(vectors) not in self._known:
-            self._known[id(vectors)] = np.ascontiguousarray(vectors.T, dtype=np.float32)
-        return self._known[id(vectors)]
+        found = np.ascontiguousarray(vectors.T, dtype=np.float32)
+        same = next((known for known in self._known if np.array_equal(known, found)), None)
+        if same is None:
+            self._known.append(found)
+        return found if same is None else same
 
     def horizons(self, name: str) -> tuple[np.ndarray, ...]:
         """The normals (3, P) below whose horizons the lobe of a pass is 0."""
@@ -332,8 +334,8 @@ class Pairs:
             toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
             distance = np.sqrt(dot(toward, toward))
             toward /= np.maximum(distance, _TINY)
-            origins = self.surface.starts.origins(self.index[unmet], toward.T).T
-            found = self._transmittance(origins, toward, distance)
+            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
+            found = self._transmittance(*(rows[..., 0, :] for rows in aimed))
             self.weights[number][:, unmet] = 1.0
             self.arriving[number][:, unmet] = found
 

@@ -21,6 +21,8 @@ class Tracer:
     def __init__(self, passed=lambda origins, directions, distances: np.ones(len(origins))):
         self.passed, self.rays = passed, 0
 
+    library = None
+
     def mask_of(self, name):
         return 0xFFFFFFFF
 
@@ -28,11 +30,9 @@ class Tracer:
         self.position = samples.position
         return self
 
-    def origins(self, index, directions):
-        return self.position[index].astype(np.float32)
-
-    def origins_of_rows(self, index, directions):
-        return np.broadcast_to(self.position[index].T[:, None], directions.shape).astype(np.float32)
+    def aimed(self, index, directions, distances):
+        origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
+        return origins.astype(np.float32), directions, distances
 
     def transmittance(self, origins, directions, distances, masks):
         self.rays += len(origins)

@@ -334,7 +334,7 @@ class _Queue:
 
 
 class Child:
-    """A worker process, and the thread that feeds it in `_feed`. A class of the package at `side` does the work there."""
+    """A worker process, and the thread that feeds it in `_feed`. The class of the package at `side` does its work."""
 
     side = ""
 

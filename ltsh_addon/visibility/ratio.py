@@ -29,11 +29,12 @@ PROBES = 8
 MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
-# Samples of a block that one process takes at a time, and pairs of samples and lights that take it longer than to start.
+# Samples of a block that one process takes at a time. Fewer pairs of samples and lights than that take no longer than a
+# process takes to start.
 BLOCK_SAMPLES = 1 << 14
 PAIRS_WORTH_A_CHILD = 300_000
-# Of PROBES rays, how many are chosen evenly: for pairs with both lobes, a diffuse and a specular one; at first, and later
-# where the specular lobe, or the diffuse one, counts more.
+# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both lobes count
+# alike, as at first, when the specular one counts more, and when the diffuse one does.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 # Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
 # stratified rays falls with their number to the power -0.8.
@@ -95,7 +96,8 @@ def visible_shares(
 
     `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
     shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
-    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may return False to stop: Cancelled is raised.
+    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may
+    return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")

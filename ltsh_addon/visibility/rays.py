@@ -357,8 +357,8 @@ class Hits:
 class Tracer:
     """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`.
 
-    `caster` is as EmbreeCaster, and `description` says which it is; other processes open `library` of Embree, None: there
-    is none.
+    `caster` is as EmbreeCaster, and `description` says which it is. Other processes can open the file `library`; None:
+    they cannot.
     """
 
     def __init__(self, occluders: Occluders, caster):

@@ -98,7 +98,7 @@ def test_weights_are_the_light_that_is_reflected(surface, kind):
         pairs = with_all_rays(samples, light, OPEN)
         # `shade` takes the shadowing of bump maps at one direction.
         for name in PASSES if surface != "tilted" else ("specular",):
-            _, radiance, _ = pairs.found(name)
+            radiance = pairs.unshadowed(name)
             # The rays weigh by the mean color, as far as the light's own color is the same for all of a light.
             color = light.radiance.mean() / light.radiance
             whole = (getattr(expected, name)[0] * color).mean(axis=1)

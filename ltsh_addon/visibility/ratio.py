@@ -33,7 +33,7 @@ BLOCK_RAYS = 1 << 15
 # process takes to start.
 BLOCK_SAMPLES = 1 << 14
 PAIRS_WORTH_A_CHILD = 300_000
-# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both lobes count
+# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both count
 # alike, as at first, when the specular one counts more, and when the diffuse one does.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 # Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
@@ -338,8 +338,9 @@ class Pairs:
             toward /= np.maximum(distance, _TINY)
             aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
             found = self._transmittance(*(rows[..., 0, :] for rows in aimed))
-            self.weights[number][:, unmet] = 1.0
-            self.arriving[number][:, unmet] = found
+            # Next to no light: it counts in no sum of samples.
+            self.weights[number][:, unmet] = _TINY
+            self.arriving[number][:, unmet] = found * _TINY
 
     def _transmittance(self, origins, directions, distances):
         """Of rays: origins and directions (3, R), distances (R,)."""
@@ -371,10 +372,8 @@ class Pairs:
         if trace:
             met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
             flat = np.flatnonzero(met)
-            origins = self.surface.starts.origins_of_rows(view.index, directions)
-            arriving.ravel()[flat] = self._transmittance(
-                *(_taken(rows, flat) for rows in (origins, directions, distance))
-            )
+            aimed = self.surface.starts.aimed(view.index, directions, distance)
+            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in aimed))
             sums = arriving.sum(axis=0)
             self.visible[block] |= sums > 0.0
             self.blocked[block] |= sums < met.sum(axis=0)

@@ -17,6 +17,7 @@ from ..materials.aovs import (
     declare_aovs,
     give_default_material,
     inject_aovs,
+    let_shadow_rays_through,
     materials_in_use,
     objects_without_material,
     remove_aovs,
@@ -80,7 +81,6 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
     progress only about once a minute.
     """
-    remove_occlusion(scene)
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
     samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
@@ -178,7 +178,9 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     inventory.origin = origin
     default = give_default_material(bare)
     materials += [default] if default else []
-    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded)
+    of_materials = inject_aovs(
+        materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque
+    )
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -218,6 +220,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
+        if job.get("shadows"):
+            let_shadow_rays_through(inventory.made_opaque)
+        else:
+            remove_occlusion(scene)
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
     return {

@@ -37,6 +37,7 @@ class ExtractOptions:
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
+    shadows: bool = False  # also what stands in the way of light, in the Cycles reference too
 
 
 # Materials, or other reasons, that an error names.

@@ -22,6 +22,7 @@ from ..materials.aovs import (
     RECEIVER_PROPERTY,
     MaterialLobes,
     give_default_material,
+    let_shadow_rays_through,
     lobes_of,
     objects_without_material,
 )
@@ -383,7 +384,11 @@ def _open(job: dict) -> BakeScene:
     if view.kind == "point":
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
-    remove_occlusion(scene)
+    if job["shadows"] == "on":
+        for found in lobes.values():
+            let_shadow_rays_through(found.made_opaque)
+    else:
+        remove_occlusion(scene)
     name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
     return BakeScene(scene, name, view, lights, warnings, names, meshes, problems, lobes, folder)
 
@@ -464,6 +469,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
         "lights": [pixels.light_record(light) for light in opened.lights],
+        "origin": opened.origin.tolist(),
         "color_space": working_space(),
         "warnings": opened.warnings,
         "sampled_texels": SAMPLED_TEXELS,

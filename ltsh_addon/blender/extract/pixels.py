@@ -220,7 +220,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
-        if job.get("shadows"):
+        if job.get("shadows") == "on":
             let_shadow_rays_through(inventory.made_opaque)
         else:
             remove_occlusion(scene)

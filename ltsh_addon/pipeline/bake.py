@@ -281,8 +281,8 @@ class ObjectBaker:
         layers, shares = {}, None
         if self.tracer is not None:
             options = self.options
-            passes = tuple(sorted(shaded_passes(options) | ({"diffuse"} if "diffuse_light" in options.passes else set())))
-            shares = self.tracer.trace(samples, passes, options.shadow_rays, options.sub_samples).shares
+            passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
+            shares = self.tracer.trace(samples, sorted(passes), options.shadow_rays, options.sub_samples).shares
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)

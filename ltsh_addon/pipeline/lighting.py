@@ -5,15 +5,23 @@ radiance = closed form x the share of the light that the sample sees. The shares
 
 from __future__ import annotations
 
+import json
 import time
+import zipfile
+import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .. import shading, visibility
-from ..scene import AreaLight, Cancelled, Progress, SurfaceSamples
+from ..files import replacing
+from ..scene import AreaLight, Border, Cancelled, ColorSpace, Film, Progress, SurfaceSamples, error_line
 
+# Of the files of `keep_picture`.
+KEPT_SUFFIX = ".samples.npz"
 # Pairs of a sample and a light whose radiance is kept at a time.
 MOST_PAIRS = 1 << 25
 # Of one sample, however many a pixel has.
@@ -106,9 +114,10 @@ def shade_lights(
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
     for first in range(0, len(lights), most):
         part = lights[first : first + most]
+        share = len(part) / len(lights)
 
-        def report(fraction, done=first, count=len(part)):
-            return None if progress is None else progress((done + fraction * count) / len(lights))
+        def report(fraction, done=first / len(lights), share=share):
+            return None if progress is None else progress(done + fraction * share)
 
         own = tuple(_in_group(light, str(number)) for number, light in enumerate(part))
         found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
@@ -131,3 +140,82 @@ def _in_group(light: AreaLight, group: str) -> AreaLight:
 
 def _shading(groups, radiance, error) -> shading.Shading:
     return shading.Shading(groups, radiance.get("specular"), radiance.get("diffuse"), error)
+
+
+@dataclass(frozen=True)
+class KeptPicture:
+    """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is."""
+
+    extraction: Any  # blender.process.client.Extraction, without reference and occluders
+    shadows: Shadows | None
+    options: dict  # fields of PictureOptions
+    had_cycles: bool
+
+    @classmethod
+    def load(cls, path: Path) -> KeptPicture:
+        """Raises OSError, and ValueError where the file is not what `keep_picture` writes."""
+        try:
+            with np.load(path) as data:
+                arrays = {name: data[name] for name in data.files}
+            document = json.loads(str(arrays.pop("document")))
+            return cls._of(document, arrays)
+        except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            problem = f"is no file of --keep-visibility, or not whole ({error_line(error)})"
+            raise ValueError(f"{path}: {problem}; run the picture again") from error
+
+    @classmethod
+    def _of(cls, document, arrays) -> KeptPicture:
+        from ..blender.process.client import UNCHANGED, Extraction
+
+        found = document["extraction"]
+        border, space = found["border"], found["color_space"]
+        extraction = Extraction(
+            **{name: found[name] for name in UNCHANGED},
+            lights=tuple(AreaLight(**light) for light in found["lights"]),
+            samples=SurfaceSamples(**{item.name: arrays[f"samples.{item.name}"] for item in fields(SurfaceSamples)}),
+            film=Film(pixel=arrays["film.pixel"], first=arrays.get("film.first"), **found["film"]),
+            warnings=tuple(found["warnings"]),
+            problems=tuple(found["problems"]),
+            reference=None,
+            border=None if border is None else Border(**border),
+            color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
+        )
+        shadows = document["shadows"]
+        if shadows is not None:
+            shares = {name: arrays[f"shares.{name}"] for name in shadows["noise"]}
+            shadows = Shadows(shares, shadows["noise"], shadows["rays"], shadows["tracer"])
+        options = document["options"]
+        options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
+        return cls(extraction, shadows, {**options, "scene": Path(options["scene"])}, document["had_cycles"])
+
+
+KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
+
+
+def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> None:
+    """Write the .npz that `KeptPicture.load` reads, at once or not at all. Raises OSError."""
+    from ..blender.process.client import UNCHANGED
+
+    film, space = extraction.film, extraction.color_space
+    document = {
+        "extraction": {
+            **{name: getattr(extraction, name) for name in UNCHANGED},
+            "lights": [light.record() for light in extraction.lights],
+            "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
+            "warnings": extraction.warnings,
+            "problems": extraction.problems,
+            "border": None if extraction.border is None else vars(extraction.border),
+            "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
+        },
+        "shadows": None if shadows is None else shadows.report(),
+        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
+        "had_cycles": extraction.reference is not None,
+    }
+    arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
+    arrays["film.pixel"] = film.pixel
+    if film.first is not None:
+        arrays["film.first"] = film.first
+    if shadows is not None:
+        arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, document=json.dumps(document), **arrays)

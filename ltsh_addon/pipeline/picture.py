@@ -147,11 +147,14 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     shadows = None
     if options.shadows == "on":
         shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
-    results = {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
+    results = evaluated(tables, extraction, shadows, options, progress)
 
     comparison = Comparison(options, extraction, results, shadows)
     report = comparison.report()
     files = comparison.write(Path(options.output), report, with_cycles, progress)
+    if options.keep_visibility:
+        files.append(Path(files[0]).with_suffix(lighting.KEPT_SUFFIX).as_posix())
+        lighting.keep_picture(extraction, shadows, options, Path(options.output) / files[-1])
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
     if shadows is not None:
@@ -167,6 +170,11 @@ class Result:
     seconds: dict[str, float]
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # where `shading` has shadows
+
+
+def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Result]:
+    """The results of all techniques, of which `tables` (see `prepare`) has the names."""
+    return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
 
 
 def _evaluate(name, table, extraction, shadows, options, progress) -> Result:

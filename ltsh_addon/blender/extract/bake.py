@@ -468,7 +468,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     return {
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
-        "lights": [pixels.light_record(light) for light in opened.lights],
+        "lights": [light.record() for light in opened.lights],
         "origin": opened.origin.tolist(),
         "color_space": working_space(),
         "warnings": opened.warnings,

@@ -178,9 +178,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
     inventory.origin = origin
     default = give_default_material(bare)
     materials += [default] if default else []
-    of_materials = inject_aovs(
-        materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque
-    )
+    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque)
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -231,7 +229,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [light_record(light) for light in inventory.lights],
+        "lights": [light.record() for light in inventory.lights],
         "origin": inventory.origin.tolist(),
         "warnings": warnings,
         "unshaded": inventory.unshaded,
@@ -266,9 +264,3 @@ def _picture(scene, job: dict) -> dict:
         "exposure": scene.cycles.film_exposure,
         "color_space": working_space(),
     }
-
-
-def light_record(light) -> dict:
-    """`light` as JSON has it; AreaLight(**record) reads it back."""
-    record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}
-    return {**record, "detail": [light_record(part) for part in light.detail]}

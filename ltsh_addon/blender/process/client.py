@@ -56,8 +56,8 @@ class Extraction:
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
     the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
-    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded. `occluders` are what
-    stands in the way of light, around `origin` (3,) in m; None without shadows.
+    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded. `occluders` are
+    what stands in the way of light, around `origin` (3,) in m; None without shadows.
     """
 
     lights: tuple[AreaLight, ...]

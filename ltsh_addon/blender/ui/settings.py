@@ -178,8 +178,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )  # fmt: skip
     shadows: BoolProperty(
         name="Shadows",
-        description="Surfaces stand in each other's light, in the Cycles reference too. Without, pictures show how well "
-        "a technique shades alone",
+        description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
+        "well a technique shades alone",
         default=True,
     )  # fmt: skip
     shadow_rays: IntProperty(

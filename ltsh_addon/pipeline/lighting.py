@@ -114,10 +114,10 @@ def shade_lights(
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
     for first in range(0, len(lights), most):
         part = lights[first : first + most]
-        share = len(part) / len(lights)
+        start, share = first / len(lights), len(part) / len(lights)
 
-        def report(fraction, done=first / len(lights), share=share):
-            return None if progress is None else progress(done + fraction * share)
+        def report(fraction, start=start, share=share):
+            return None if progress is None else progress(start + fraction * share)
 
         own = tuple(_in_group(light, str(number)) for number, light in enumerate(part))
         found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)

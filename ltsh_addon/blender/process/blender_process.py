@@ -86,6 +86,21 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
     return [sys.executable, str(script), str(job)]
 
 
+# Where Blender and pip's bpy have Embree: on Linux, Windows, macOS; beside the binary or the module.
+EMBREE_PLACES = ("lib/libembree4*", "blender.shared/embree4*.dll", "embree4*.dll", "../Resources/lib/libembree4*")
+
+
+def embree_libraries() -> list[Path]:
+    """Files of Embree 4 that this Blender, or pip's bpy, has brought along; none where the system has it."""
+    bpy = sys.modules.get("bpy")
+    own = bpy.app.binary_path if bpy is not None else ""
+    if not own:
+        spec = importlib.util.find_spec("bpy")
+        own = spec.origin if spec is not None and spec.origin else ""
+    folder = Path(own).parent
+    return [path for place in EMBREE_PLACES for path in sorted(folder.glob(place))] if own else []
+
+
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
     """`command` as a process whose own files go to `folder`.
 

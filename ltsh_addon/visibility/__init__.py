@@ -1,0 +1,8 @@
+"""Which share of a light is seen: occluders, rays through them, and what they leave of each light."""
+
+from __future__ import annotations
+
+from .occluders import OccluderMesh, Occluders, Transparency
+from .rays import Tracer, open_tracer
+
+__all__ = ["OccluderMesh", "Occluders", "Tracer", "Transparency", "open_tracer"]

@@ -1,0 +1,205 @@
+"""What stands in the way of light: triangle meshes, instances of them, and how much light they let through."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..files import replacing
+
+EXTENSIONS = ("REPEAT", "EXTEND", "CLIP", "MIRROR")
+INTERPOLATIONS = ("Linear", "Closest")
+# Bits of a mask: all kinds of rays.
+ALL_RAYS = 0xFFFFFFFF
+# Cycles' default of `Object.cycles.shadow_terminator_geometry_offset`.
+TERMINATOR_OFFSET = 0.1
+# Cycles' default of transparent bounces: further transparent surfaces block.
+TRANSPARENT_SURFACES = 8
+
+
+@dataclass(frozen=True)
+class Transparency:
+    """Share of light that a surface lets through: `share`, where there is an image times what it has at `uv`.
+
+    Colors count by their mean. The image (H, W) holds shares, row 0 below; `uv` (T, 3, 2) has the corners of the
+    triangles on it.
+    """
+
+    share: float = 1.0
+    image: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    extension: str = "REPEAT"  # one of EXTENSIONS
+    interpolation: str = "Linear"  # one of INTERPOLATIONS
+
+    def __post_init__(self):
+        if not 0.0 <= self.share <= 1.0:
+            raise ValueError(f"transparency: share is {self.share!r}, expected a number from 0 to 1")
+        if (self.image is None) != (self.uv is None):
+            raise ValueError("transparency: expected an image and its uv, or neither")
+        if self.extension not in EXTENSIONS or self.interpolation not in INTERPOLATIONS:
+            raise ValueError(
+                f"transparency: {self.extension!r} and {self.interpolation!r}, expected one of {', '.join(EXTENSIONS)} "
+                f"and one of {', '.join(INTERPOLATIONS)}"
+            )
+
+    def shares(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Shares (Q,) at the points (1 - u - v) a + u b + v c of the triangles (Q,)."""
+        if self.image is None:
+            return np.full(len(triangle), self.share, np.float32)
+        a, b, c = np.moveaxis(self.uv[triangle], 1, 0)
+        u, v = u[:, None], v[:, None]
+        found = np.clip(self._image_at((1.0 - u - v) * a + u * b + v * c), 0.0, 1.0)
+        return (self.share * found).astype(np.float32)
+
+    def _image_at(self, uv):
+        height, width = self.image.shape
+        place = uv * np.array((width, height), uv.dtype)
+        if self.interpolation == "Closest":
+            x, y = np.floor(place).astype(np.int64).T
+            return self._pixel(x, y)
+        corner = np.floor(place - 0.5)
+        (tx, ty), (x, y) = (place - 0.5 - corner).T, corner.astype(np.int64).T
+        below = (1.0 - tx) * self._pixel(x, y) + tx * self._pixel(x + 1, y)
+        above = (1.0 - tx) * self._pixel(x, y + 1) + tx * self._pixel(x + 1, y + 1)
+        return (1.0 - ty) * below + ty * above
+
+    def _pixel(self, x, y):
+        """Shares of pixels anywhere in the plane; all light passes where there is no image."""
+        height, width = self.image.shape
+        columns, rows = _within(x, width, self.extension), _within(y, height, self.extension)
+        found = self.image[rows, columns]
+        if self.extension == "CLIP":
+            found = np.where((x == columns) & (y == rows), found, 1.0)
+        return found
+
+
+def _within(index, size, extension):
+    if extension == "REPEAT":
+        return index % size
+    if extension == "MIRROR":
+        folded = index % (2 * size)
+        return np.where(folded < size, folded, 2 * size - 1 - folded)
+    return np.clip(index, 0, size - 1)
+
+
+@dataclass(frozen=True)
+class OccluderMesh:
+    """Triangles in the space of an object. `normals` are those of smooth shading, at vertices (V, 3) or at corners
+    (T, 3, 3); left out: it is flat."""
+
+    vertices: np.ndarray  # (V, 3) float32
+    triangles: np.ndarray  # (T, 3) uint32
+    transparency: Transparency | None = None  # None: it blocks
+    normals: np.ndarray | None = None
+
+    def __post_init__(self):
+        vertices = np.ascontiguousarray(self.vertices, np.float32)
+        triangles = np.ascontiguousarray(self.triangles, np.uint32)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or triangles.ndim != 2 or triangles.shape[1] != 3:
+            raise ValueError(f"mesh: vertices {vertices.shape}, triangles {triangles.shape}, expected (V, 3), (T, 3)")
+        if triangles.size and triangles.max() >= len(vertices):
+            raise ValueError(f"mesh: a triangle names vertex {triangles.max()}, expected less than {len(vertices)}")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "triangles", triangles)
+        if self.normals is not None:
+            normals = np.ascontiguousarray(self.normals, np.float32)
+            if normals.shape not in (vertices.shape, (len(triangles), 3, 3)):
+                raise ValueError(f"mesh: normals {normals.shape}, expected {vertices.shape} or {len(triangles), 3, 3}")
+            object.__setattr__(self, "normals", normals)
+        uv = None if self.transparency is None else self.transparency.uv
+        if uv is not None and uv.shape != (len(triangles), 3, 2):
+            raise ValueError(f"mesh: uv {uv.shape}, expected {len(triangles), 3, 2}")
+
+
+@dataclass(frozen=True)
+class Occluders:
+    """`meshes` and I instances: `mesh` (I,) is the number of each one's mesh, `matrices` (I, 3, 4) take it to world
+    space. An instance blocks rays that have a bit of its `masks` (I,) uint32; left out: all.
+
+    `terminators` (I,) are as `shadow_terminator_geometry_offset` of Cycles; left out: its default.
+    A ray through more than `transparent_surfaces` ends.
+    """
+
+    meshes: tuple[OccluderMesh, ...]
+    mesh: np.ndarray
+    matrices: np.ndarray
+    masks: np.ndarray | None = None
+    terminators: np.ndarray | None = None
+    transparent_surfaces: int = TRANSPARENT_SURFACES
+    warnings: tuple[str, ...] = field(default=())
+
+    def __post_init__(self):
+        mesh = np.asarray(self.mesh, np.int64)
+        count = len(mesh)
+        masks = np.full(count, ALL_RAYS) if self.masks is None else self.masks
+        terminators = np.full(count, TERMINATOR_OFFSET) if self.terminators is None else self.terminators
+        values = {
+            "mesh": mesh,
+            "matrices": np.asarray(self.matrices, np.float64).reshape(-1, 3, 4),
+            "masks": np.asarray(masks, np.uint32),
+            "terminators": np.asarray(terminators, np.float32),
+        }
+        for name, value in values.items():
+            if len(value) != count:
+                raise ValueError(f"occluders: {name} has {len(value)} instances, expected {count}")
+            object.__setattr__(self, name, value)
+        if count and (mesh.min() < 0 or mesh.max() >= len(self.meshes)):
+            raise ValueError(f"occluders: an instance names mesh {mesh.max()}, expected 0 to {len(self.meshes) - 1}")
+        object.__setattr__(self, "meshes", tuple(self.meshes))
+        object.__setattr__(self, "warnings", tuple(self.warnings))
+
+    @property
+    def triangle_count(self) -> int:
+        """Number of triangles, those of each instance counted."""
+        sizes = np.array([len(mesh.triangles) for mesh in self.meshes], np.int64)
+        return int(sizes[self.mesh].sum()) if len(self.mesh) else 0
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write an .npz, all or nothing, which `load` reads back bit for bit."""
+        images: dict[int, np.ndarray] = {}
+        arrays = {name: getattr(self, name) for name in ("mesh", "matrices", "masks", "terminators")}
+        about = []
+        for number, mesh in enumerate(self.meshes):
+            clear = mesh.transparency
+            arrays |= {f"vertices{number}": mesh.vertices, f"triangles{number}": mesh.triangles}
+            if mesh.normals is not None:
+                arrays[f"normals{number}"] = mesh.normals
+            if clear is None:
+                about.append(None)
+                continue
+            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation")}
+            if clear.image is not None:
+                images.setdefault(id(clear.image), clear.image)
+                record["image"] = list(images).index(id(clear.image))
+                arrays[f"uv{number}"] = clear.uv
+            about.append(record)
+        arrays |= {f"image{number}": image for number, image in enumerate(images.values())}
+        head = {"meshes": about, "transparent_surfaces": self.transparent_surfaces, "warnings": self.warnings}
+        arrays["about"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, **arrays)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> Occluders:
+        """What `save` wrote. Raises OSError, ValueError."""
+        with np.load(Path(path)) as data:
+            arrays = {name: data[name] for name in data.files}
+        if "about" not in arrays:
+            raise ValueError(f"{path}: no occluders, 'about' is missing")
+        head = json.loads(arrays["about"].tobytes())
+        meshes = []
+        for number, record in enumerate(head["meshes"]):
+            clear = None
+            if record is not None:
+                image = record.pop("image", None)
+                pixels = None if image is None else arrays[f"image{image}"]
+                clear = Transparency(**record, image=pixels, uv=arrays.get(f"uv{number}"))
+            normals = arrays.get(f"normals{number}")
+            meshes.append(OccluderMesh(arrays[f"vertices{number}"], arrays[f"triangles{number}"], clear, normals))
+        instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
+        own = {name: head[name] for name in ("transparent_surfaces", "warnings")}
+        return cls(tuple(meshes), **instances, **own)

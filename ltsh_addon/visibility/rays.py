@@ -1,0 +1,380 @@
+"""Rays through occluders, by the library Embree 4 that Blender ships, called through ctypes.
+
+Embree is a C library; its functions and their arguments are those of the headers rtcore_*.h of Embree 4. A ray packet
+is a block of rows, one for each component, of as many rays as the processor takes at once. Python calls Embree once
+for each packet, and these calls are too short for threads to share a process: a `Tracer` uses one core, and each
+process that traces opens its own.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+from collections import deque
+from collections.abc import Iterable
+from itertools import repeat
+
+import numpy as np
+
+from ..scene import SceneError, error_line, listed
+from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
+
+# Names under which the system may know the library.
+SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
+# Rays in a chunk: its packets stay in the second-level cache.
+CHUNK = 4096
+# Rows of a packet of rays, and of one of rays with what they hit. Two more are room for what some builds of Embree add.
+ORIGIN, NEAR, DIRECTION, FAR, MASK = slice(0, 3), 3, slice(4, 7), 8, 9
+RAY_ROWS, U, V, TRIANGLE, GEOMETRY, INSTANCE, HIT_ROWS = 12, 15, 16, 17, 18, 19, 22
+NONE = 0xFFFFFFFF
+# A ray goes on from a transparent surface by so much of its distance.
+STEP = np.float32(1.0 + 2.0**-21)
+
+_TRIANGLES, _INSTANCES = 0, 121  # RTCGeometryType
+_INDEX_BUFFER, _VERTEX_BUFFER = 0, 1  # RTCBufferType
+_UINT3, _FLOAT3, _FLOAT3X4 = 0x5003, 0x9003, 0x9134  # RTCFormat; row by row
+_ROBUST = 4  # RTCSceneFlags: no ray slips between triangles, as in Cycles
+_VERSION, _NATIVE_16, _NATIVE_8, _HAS_MASKS, _HAS_TRIANGLES = 0, 34, 33, 64, 96  # RTCDeviceProperty
+_POINTER, _SIZE, _UINT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_uint
+_FUNCTIONS = {
+    "rtcNewDevice": (_POINTER, ctypes.c_char_p),
+    "rtcReleaseDevice": (None, _POINTER),
+    "rtcGetDeviceProperty": (ctypes.c_ssize_t, _POINTER, ctypes.c_int),
+    "rtcGetDeviceError": (ctypes.c_int, _POINTER),
+    "rtcNewScene": (_POINTER, _POINTER),
+    "rtcReleaseScene": (None, _POINTER),
+    "rtcSetSceneFlags": (None, _POINTER, ctypes.c_int),
+    "rtcCommitScene": (None, _POINTER),
+    "rtcNewGeometry": (_POINTER, _POINTER, ctypes.c_int),
+    "rtcReleaseGeometry": (None, _POINTER),
+    "rtcSetSharedGeometryBuffer": (
+        *(None, _POINTER, ctypes.c_int, _UINT, ctypes.c_int),
+        *(_POINTER, _SIZE, _SIZE, _SIZE),
+    ),
+    "rtcSetGeometryInstancedScene": (None, _POINTER, _POINTER),
+    "rtcSetGeometryTransform": (None, _POINTER, _UINT, ctypes.c_int, _POINTER),
+    "rtcSetGeometryMask": (None, _POINTER, _UINT),
+    "rtcCommitGeometry": (None, _POINTER),
+    "rtcAttachGeometry": (_UINT, _POINTER, _POINTER),
+}
+_ERRORS = ("no error", "unknown", "invalid argument", "invalid operation", "out of memory", "unsupported processor")
+
+
+class _Unfit(Exception):
+    """A library cannot be used; the text says why."""
+
+
+class _Embree:
+    """The functions of one library, and a device of it."""
+
+    def __init__(self, library: str):
+        try:
+            self._library = ctypes.CDLL(library)
+            # Keeps Python's lock during a call, which is too short to hand it over.
+            quick = ctypes.PyDLL(library)
+            for name, (result, *arguments) in _FUNCTIONS.items():
+                function = getattr(self._library, name)
+                function.restype, function.argtypes = result, arguments
+                setattr(self, name.removeprefix("rtc"), function)
+            device = self.NewDevice(b"")
+        except (OSError, AttributeError) as error:
+            raise _Unfit(error_line(error)) from None
+        if not device:
+            raise _Unfit("it makes no device")
+        self.device = device
+        version = self._property(_VERSION)
+        self.version = f"{version // 10000}.{version // 100 % 100}.{version % 100}"
+        if version // 10000 != 4:
+            raise _Unfit(f"it is version {self.version}, expected 4")
+        if not self._property(_HAS_MASKS) or not self._property(_HAS_TRIANGLES):
+            raise _Unfit("it was built without ray masks, or without triangles")
+        self.width = 16 if self._property(_NATIVE_16) else 8 if self._property(_NATIVE_8) else 4
+        self.occluded = self._packet_function(quick, "rtcOccluded")
+        self.intersect = self._packet_function(quick, "rtcIntersect")
+
+    def _property(self, number) -> int:
+        return self.GetDeviceProperty(self.device, number)
+
+    def _packet_function(self, library, name):
+        function = getattr(library, f"{name}{self.width}")
+        function.restype, function.argtypes = None, (_POINTER,) * 4
+        return function
+
+    def check(self) -> None:
+        """Raise MemoryError or RuntimeError where a call since the last check has failed."""
+        code = self.GetDeviceError(self.device)
+        if code == 4:
+            raise MemoryError("occluders: Embree found no memory for them")
+        if code:
+            raise RuntimeError(f"Embree {self.version}: error {_ERRORS[code] if code < len(_ERRORS) else code}")
+
+
+def _aligned(count: int, dtype=np.float32) -> np.ndarray:
+    """Zeros (count,) of 4 bytes each from an address that 64 divides."""
+    memory = np.zeros(count + 16, dtype)
+    start = -(memory.ctypes.data // 4) % 16
+    return memory[start : start + count]
+
+
+class _Packets:
+    """Room for CHUNK rays in packets of `width`, with `rows` rows, and the addresses of the packets."""
+
+    def __init__(self, width: int, rows: int):
+        count = CHUNK // width
+        self.values = _aligned(count * rows * width).reshape(count, rows, width)
+        self.numbers = self.values.view(np.uint32)
+        self.values[:, DIRECTION] = 1.0
+        start, size = self.values.ctypes.data, rows * width * 4
+        self.addresses = [_POINTER(start + number * size) for number in range(count)]
+        self._valid = _aligned(width, np.int32)
+        self._valid[:] = -1
+        self._width = width
+
+    def set(self, row, values) -> None:
+        """Write `values` (R,) or (R, 3) to a row, or three."""
+        width, target = self._width, self.values if values.dtype == np.float32 else self.numbers
+        whole = len(values) // width
+        if values.ndim == 1:
+            target[:whole, row] = values[: whole * width].reshape(whole, width)
+            if whole * width < len(values):
+                rest = values[whole * width :]
+                target[whole, row, : len(rest)] = rest
+                target[whole, row, len(rest) :] = rest[-1]
+            return
+        target[:whole, row] = values[: whole * width].reshape(whole, width, 3).transpose(0, 2, 1)
+        if whole * width < len(values):
+            rest = values[whole * width :].T
+            target[whole, row, : rest.shape[1]] = rest
+            target[whole, row, rest.shape[1] :] = rest[:, -1:]
+
+    def get(self, row, count: int, numbers: bool = False) -> np.ndarray:
+        """A copy (count,) of a row."""
+        whole = -(-count // self._width)
+        return (self.numbers if numbers else self.values)[:whole, row].reshape(-1)[:count]
+
+    def trace(self, function, scene, count: int) -> None:
+        """Call an Embree function for the packets of `count` rays."""
+        addresses = self.addresses[: -(-count // self._width)]
+        valid = _POINTER(self._valid.ctypes.data)
+        deque(map(function, repeat(valid), repeat(scene), addresses, repeat(None)), maxlen=0)
+
+
+class _Scene:
+    """The instances `index` of `occluders` as a scene of Embree."""
+
+    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray):
+        self._embree, self._kept, self._scenes = embree, [], []
+        self.scene, self.instances, self.is_empty = None, [], True
+        uses = np.bincount(occluders.mesh[index], minlength=len(occluders.meshes))
+        parts: dict[int, int] = {}
+        self.scene = self._new_scene()
+        try:
+            for number in index:
+                mesh, mask = int(occluders.mesh[number]), int(occluders.masks[number])
+                if not len(occluders.meshes[mesh].triangles):
+                    continue
+                matrix = occluders.matrices[number]
+                if uses[mesh] == 1:
+                    self._add_triangles(self.scene, occluders.meshes[mesh], matrix, mask)
+                else:
+                    if mesh not in parts:
+                        parts[mesh] = self._new_scene()
+                        self._add_triangles(parts[mesh], occluders.meshes[mesh], None, ALL_RAYS)
+                        embree.CommitScene(parts[mesh])
+                    self._add_instance(parts[mesh], matrix, mask)
+                self.instances.append(int(number))
+            self.is_empty = not self.instances
+            self.instances = np.array(self.instances, np.int64)
+            embree.CommitScene(self.scene)
+            embree.check()
+        except BaseException:
+            self.close()
+            raise
+
+    def _new_scene(self):
+        scene = self._embree.NewScene(self._embree.device)
+        self._scenes.append(scene)
+        self._embree.SetSceneFlags(scene, _ROBUST)
+        return scene
+
+    def _add_triangles(self, scene, mesh: OccluderMesh, matrix, mask) -> None:
+        embree, vertices = self._embree, mesh.vertices
+        if matrix is not None:
+            vertices = vertices.astype(np.float64) @ matrix[:, :3].T + matrix[:, 3]
+        # Embree reads 4 bytes beyond the last vertex.
+        buffer = _aligned(3 * len(vertices) + 1)
+        buffer[:-1] = vertices.reshape(-1)
+        geometry = embree.NewGeometry(embree.device, _TRIANGLES)
+        for kind, data, form, count in (
+            (_VERTEX_BUFFER, buffer, _FLOAT3, len(vertices)),
+            (_INDEX_BUFFER, mesh.triangles, _UINT3, len(mesh.triangles)),
+        ):
+            embree.SetSharedGeometryBuffer(geometry, kind, 0, form, data.ctypes.data, 0, 12, count)
+            self._kept.append(data)
+        self._attach(scene, geometry, mask)
+
+    def _add_instance(self, part, matrix, mask) -> None:
+        embree, values = self._embree, np.ascontiguousarray(matrix, np.float32)
+        geometry = embree.NewGeometry(embree.device, _INSTANCES)
+        embree.SetGeometryInstancedScene(geometry, part)
+        embree.SetGeometryTransform(geometry, 0, _FLOAT3X4, values.ctypes.data)
+        self._attach(self.scene, geometry, mask)
+
+    def _attach(self, scene, geometry, mask) -> None:
+        embree = self._embree
+        embree.SetGeometryMask(geometry, mask)
+        embree.CommitGeometry(geometry)
+        embree.AttachGeometry(scene, geometry)
+        embree.ReleaseGeometry(geometry)
+
+    def close(self) -> None:
+        while self._scenes:
+            self._embree.ReleaseScene(self._scenes.pop(0))
+        self._kept.clear()
+
+
+class Tracer:
+    """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`."""
+
+    def __init__(self, occluders: Occluders, embree: _Embree):
+        self.occluders, self.description = occluders, f"Embree {embree.version}"
+        self._embree, self._lock = embree, threading.Lock()
+        clear = np.array([mesh.transparency is not None for mesh in occluders.meshes], bool)
+        is_clear = clear[occluders.mesh] if len(occluders.mesh) else np.zeros(0, bool)
+        self._opaque = _Scene(embree, occluders, np.flatnonzero(~is_clear))
+        self._clear = _Scene(embree, occluders, np.flatnonzero(is_clear))
+        self._packets = _Packets(embree.width, RAY_ROWS)
+        self._hits = _Packets(embree.width, HIT_ROWS)
+
+    def __enter__(self) -> Tracer:
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the memory that Embree has taken."""
+        with self._lock:
+            self._opaque.close()
+            self._clear.close()
+
+    def transmittance(
+        self, origins: np.ndarray, directions: np.ndarray, distances: np.ndarray, masks: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Share (R,) float32 of light that comes from `distances` (R,) in m, which may be inf, along unit `directions`
+        (R, 3) to `origins` (R, 3): 0 where something blocks it, 1 where nothing is met.
+
+        `masks` (R,) are as those of `Occluders`; left out: everything counts. Rays of the same origin, one after
+        another, are faster.
+        """
+        origins, directions, distances = (np.asarray(values, np.float32) for values in (origins, directions, distances))
+        count = len(origins)
+        masks = np.broadcast_to(np.uint32(ALL_RAYS), (count,)) if masks is None else np.asarray(masks, np.uint32)
+        shares = np.ones(count, np.float32)
+        with self._lock:
+            for start in range(0, count, CHUNK):
+                part = slice(start, start + CHUNK)
+                rays = origins[part], directions[part], distances[part], masks[part]
+                if not self._opaque.is_empty:
+                    shares[part][self._is_blocked(*rays)] = 0.0
+                if not self._clear.is_empty:
+                    self._attenuate(shares[part], *rays)
+        return shares
+
+    def _is_blocked(self, origins, directions, distances, masks):
+        """Mask (R,) of at most CHUNK rays that an opaque surface blocks."""
+        packets, count = self._packets, len(origins)
+        for row, values in ((ORIGIN, origins), (DIRECTION, directions), (FAR, distances), (MASK, masks)):
+            packets.set(row, values)
+        packets.trace(self._embree.occluded, self._opaque.scene, count)
+        return packets.get(FAR, count) < 0.0  # Embree writes -inf
+
+    def _attenuate(self, shares, origins, directions, distances, masks):
+        """Multiply `shares` (R,) by those of the transparent surfaces that the rays meet."""
+        near = np.zeros(len(shares), np.float32)
+        index = np.flatnonzero(shares > 0.0)
+        for _ in range(self.occluders.transparent_surfaces + 1):
+            if not len(index):
+                return
+            rays = origins[index], directions[index], near[index], distances[index], masks[index]
+            hit, distance, instance, triangle, u, v = self._closest(self._clear, *rays)
+            index = index[hit]
+            for number in np.unique(instance):
+                here = instance == number
+                clear = self._transparency(number)
+                shares[index[here]] *= clear.shares(triangle[here], u[here], v[here])
+            near[index] = distance * STEP
+            index = index[shares[index] > 0.0]
+        shares[index] = 0.0
+
+    def _transparency(self, instance) -> Transparency:
+        return self.occluders.meshes[self.occluders.mesh[instance]].transparency
+
+    def _closest(self, scene, origins, directions, near, far, masks):
+        """What at most CHUNK rays meet first from `near` to `far`: a mask (R,) of those that meet something, then of
+        these the distance, the number of the instance and of its triangle, and the place u, v on it."""
+        packets, count = self._hits, len(origins)
+        for row, values in ((ORIGIN, origins), (NEAR, near), (DIRECTION, directions), (FAR, far), (MASK, masks)):
+            packets.set(row, values)
+        packets.numbers[:, GEOMETRY : INSTANCE + 1] = NONE
+        packets.trace(self._embree.intersect, scene.scene, count)
+        geometry, part = packets.get(GEOMETRY, count, True), packets.get(INSTANCE, count, True)
+        hit = geometry != NONE
+        number = np.where(part == NONE, geometry, part)[hit]
+        values = (packets.get(row, count)[hit] for row in (FAR, U, V))
+        distance, u, v = values
+        return hit, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[hit], u, v
+
+
+# -- which library --------------------------------------------------------------------------------------------------
+
+_trusted: dict[str, _Embree] = {}
+
+
+def open_tracer(occluders: Occluders, libraries: Iterable[str | os.PathLike] = ()) -> Tracer:
+    """A tracer by the first of `libraries`, files of Embree 4, that passes a test; the system's own comes last.
+
+    Raises SceneError where there is none; names what is wrong with each.
+    """
+    reasons = []
+    for library in (*map(str, libraries), *SYSTEM_LIBRARIES):
+        try:
+            if library not in _trusted:
+                embree = _Embree(library)
+                _probe(embree)
+                _trusted[library] = embree
+            return Tracer(occluders, _trusted[library])
+        except _Unfit as error:
+            reasons.append(f"{library}: {error}")
+    raise SceneError(f"no library to trace shadow rays with: {listed(reasons, 8, '; ')}")
+
+
+def _probe(embree: _Embree) -> None:
+    """Raise _Unfit where rays of known answer get another one."""
+    square = OccluderMesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [4, 4, 0]], [[0, 1, 2], [1, 3, 2]])
+    clear = OccluderMesh(square.vertices, square.triangles, Transparency(0.25))
+    here, higher, highest = np.eye(3, 4), np.eye(3, 4), np.eye(3, 4)
+    higher[2, 3], highest[2, 3] = 2.0, 4.0
+    turned = np.array([[0.0, 0, 1, 20], [1, 0, 0, 0], [0, 1, 0, 0]])  # its normal is x, at x = 20
+    occluders = Occluders((square, square, clear), [0, 1, 1, 2], [here, higher, turned, highest], [1, 2, 4, 8])
+    up, along = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    rays = (  # origin, direction, distance, mask, answer
+        ([1, 1, -1], up, np.inf, 1, 0.0),
+        ([1, 1, -1], up, np.inf, 2, 0.0),
+        ([1, 1, -1], up, np.inf, 4, 1.0),
+        ([1, 1, -1], up, 0.9, 1, 1.0),
+        ([1, 1, -1], up, 2.9, 2, 1.0),
+        ([5, 1, -1], up, np.inf, ALL_RAYS, 1.0),
+        ([3, 3, -1], up, np.inf, 8 | 4, 0.25),
+        ([3, 3, -1], up, np.inf, 8 | 1, 0.0),
+        ([3, 3, -1], up, 4.9, 8, 1.0),
+        ([0, 1, 1], along, np.inf, 4, 0.0),
+        ([0, 1, 1], along, 19.9, 4, 1.0),
+        ([0, 5, 1], along, np.inf, 4, 1.0),
+    )
+    origins, directions, distances, masks, answers = map(np.array, zip(*rays, strict=True))
+    with Tracer(occluders, embree) as tracer:
+        found = tracer.transmittance(origins, directions, distances, masks)
+    if not np.array_equal(found, answers.astype(np.float32)):
+        raise _Unfit(f"version {embree.version}: rays of known answer got others")

@@ -282,7 +282,8 @@ class ObjectBaker:
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
-            shares = self.tracer.trace(samples, sorted(passes), options.shadow_rays, options.sub_samples).shares
+            rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
+            shares = self.tracer.trace(samples, sorted(passes), rays).shares
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)

@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import shading, visibility
 from ..files import replacing
-from ..scene import AreaLight, Border, Cancelled, ColorSpace, Film, Progress, SurfaceSamples, error_line
+from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
 
 # Of the files of `keep_picture`.
 KEPT_SUFFIX = ".samples.npz"
@@ -47,12 +47,19 @@ class Shadows:
         return {"rays": self.rays, "noise": self.noise, "tracer": self.tracer}
 
 
+def rays_of_point(rays: int, points: int) -> int:
+    """Of `rays` those of one of the `points` of a pixel or texel."""
+    return max(FEWEST_RAYS, rays // points)
+
+
 class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
     def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
         self._origin, self._lights = origin, [light.moved(-origin) for light in lights]
-        self._tracer = visibility.open_tracer(occluders)
+        from ..blender.process.blender_process import embree_libraries
+
+        self._tracer = visibility.open_tracer(occluders, embree_libraries())
 
     def __enter__(self):
         self._tracer.__enter__()
@@ -61,13 +68,20 @@ class ShadowTracer:
     def __exit__(self, *error):
         return self._tracer.__exit__(*error)
 
-    def trace(self, samples: SurfaceSamples, passes: Sequence[str], rays: int, points: int, progress=None) -> Shadows:
-        """The shares of all lights that `samples` see; `rays` are shared by the `points` of a pixel or texel."""
+    def trace(
+        self,
+        samples: SurfaceSamples,
+        passes: Sequence[str],
+        rays: int,
+        *,
+        film: Film | None = None,
+        progress: Progress | None = None,
+    ) -> Shadows:
+        """The shares of all lights that `samples` see; `film` as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        rays = max(FEWEST_RAYS, rays // points)
         found = visibility.visible_shares(
-            samples, self._lights, self._tracer, passes=passes, rays=rays, progress=progress
+            samples, self._lights, self._tracer, passes=passes, rays=rays, film=film, progress=progress
         )
         shares = {name: getattr(found, name) for name in passes}
         return Shadows(shares, found.noise, found.rays, self._tracer.description, time.perf_counter() - start)
@@ -75,14 +89,9 @@ class ShadowTracer:
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
     """The shares of the lights of an `Extraction` that its samples see."""
-
-    def report(fraction):
-        if progress is not None and progress("shadows", fraction) is False:
-            raise Cancelled("stopped while shadows were traced")
-
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        points = extraction.film.sub_samples
-        return tracer.trace(extraction.samples, passes, rays, points, report)
+        rays = rays_of_point(rays, extraction.film.sub_samples)
+        return tracer.trace(extraction.samples, passes, rays, film=extraction.film, progress=progress)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from .occluders import OccluderMesh, Occluders, Transparency
-from .rays import Tracer, open_tracer
+from .rays import Starts, Tracer, open_tracer
 
-__all__ = ["OccluderMesh", "Occluders", "Tracer", "Transparency", "open_tracer"]
+__all__ = ["OccluderMesh", "Occluders", "Starts", "Tracer", "Transparency", "Visibility", "open_tracer", "visible_shares"]

@@ -16,12 +16,16 @@ import numpy as np
 
 from ..scene import AreaLight
 from ..shading import light_cone
-from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION
+from ..shading.lookup_table import WARP_REGULARIZATION
 from ..shading.polygon import convex_pieces
 
 # Bits of a point of the sequence: what fits into single precision.
-BITS = 24
-_TINY = np.float32(1e-30)
+BITS = 23
+_ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
+# In sr: what is smaller is not seen.
+_LEAST_SOLID_ANGLE = np.float32(1e-20)
+# Of a sequence
+MOST_POINTS = 1024
 # Cells along each side of the picture of a light with a texture.
 _PICTURE = 128
 # Corners of an ellipse to aim at
@@ -29,7 +33,7 @@ _ROUND_CORNERS = 16
 
 
 def sequence(count: int, seed: int = 1) -> np.ndarray:
-    """The first `count` points (2, count) of the Sobol sequence, uint32 of 24 bits, scrambled as by Owen (1995).
+    """The first `count` points (2, count) of the Sobol sequence, uint32 of 23 bits, scrambled as by Owen (1995).
 
     Every 2^k points, counted from the first, are stratified as well as can be. XOR with any number keeps that.
     """
@@ -60,13 +64,28 @@ def _reversed_bits(values):
     return values
 
 
+_POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
+
+
+def unit_points(seeds: np.ndarray, stream: int, first: int, count: int) -> list[np.ndarray]:
+    """Numbers x, y (S, Q) in (0, 1): `count` points of a sequence, changed by the seeds (Q,); `stream` is 0 or 1."""
+    found = []
+    for axis, points in enumerate(_POINTS[stream][:, first : first + count]):
+        own = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
+        numbers = (points[:, None] ^ own).astype(np.float32)
+        numbers += np.float32(0.5)
+        numbers *= np.float32(2.0**-BITS)
+        found.append(numbers)
+    return found
+
+
 def seeds_of(position: np.ndarray) -> np.ndarray:
     """Seeds (P,) uint32 of points (P, 3): the same wherever a point stands in a picture or a block."""
     bits = np.ascontiguousarray(position, dtype=np.float32).view(np.uint32)
-    return _mixed(_mixed(_mixed(bits[:, 0]) ^ bits[:, 1]) ^ bits[:, 2])
+    return mixed_bits(mixed_bits(mixed_bits(bits[:, 0]) ^ bits[:, 1]) ^ bits[:, 2])
 
 
-def _mixed(values):
+def mixed_bits(values):
     """A hash of uint32 (Wellons 2018, "lowbias32")."""
     values = (values ^ (values >> np.uint32(16))) * np.uint32(0x7FEB352D)
     values = (values ^ (values >> np.uint32(15))) * np.uint32(0x846CA68B)
@@ -202,88 +221,150 @@ def _picture(light, center, axes):
 class SphericalQuads:
     """Quadrilaterals (3, 4, Q) as points see them, for directions spread evenly over their solid angles (Q,).
 
-    Two triangles each, sampled as in Peters 2021, "BRDF importance sampling for polygonal lights", section 3
-    (after Arvo 1995), doi:10.1145/3450626.3459672.
+    Two triangles on either side of a diagonal, sampled as in Peters 2021, "BRDF importance sampling for polygonal
+    lights", section 3 (after Arvo 1995), doi:10.1145/3450626.3459672.
     """
 
     def __init__(self, corners: np.ndarray):
-        length = np.sqrt(dot(corners, corners))
-        unit = corners / np.maximum(length, _TINY)
-        self.apex, second, third, fourth = (unit[:, k] for k in range(4))
-        self.sides = ((second, third), (third, fourth))
+        unit = corners / np.maximum(np.sqrt(dot(corners, corners)), _TINY)
+        self.apex, self.far, self.near = unit[:, 0], unit[:, 2], (unit[:, 1], unit[:, 3])
+        self.apex_far = dot(self.apex, self.far)
+        chord = self.far - self.apex
         self.terms, angles = [], []
-        for near, far in self.sides:
-            across = [near[k] - self.apex[k] for k in range(3)], [far[k] - self.apex[k] for k in range(3)]
-            volume = np.abs(dot(_cross(*across), self.apex))
-            near_far, apex_near, apex_far = dot(near, far), dot(self.apex, near), dot(self.apex, far)
-            y, z = apex_far + near_far, 1.0 + apex_near
-            self.terms.append((volume, y, z, apex_near, apex_far, near_far))
-            angles.append(2.0 * np.arctan2(volume, y + z))
+        for near in self.near:
+            # By differences: all corners may be close together.
+            volume = np.abs(dot(np.cross(near - self.apex, chord, axis=0), self.apex))
+            apex_near, near_far = dot(self.apex, near), dot(near, self.far)
+            self.terms.append((volume, apex_near, near_far))
+            angles.append(2.0 * np.arctan2(volume, self.apex_far + near_far + 1.0 + apex_near))
         self.first, self.solid_angle = angles[0], angles[0] + angles[1]
+        self.is_seen = self.solid_angle > _LEAST_SOLID_ANGLE
+        np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
 
-    def directions(self, x, y) -> list[np.ndarray]:
-        """Unit vectors, three (S, Q), for numbers in [0, 1)."""
-        target = x * self.solid_angle
-        is_second = target > self.first
-        half = 0.5 * (target - np.where(is_second, self.first, np.float32(0.0)))
-        volume, ty, tz, apex_near, apex_far, near_far = (
-            np.where(is_second, b, a) for a, b in zip(*self.terms, strict=True)
-        )
-        cosine, sine = np.cos(half), np.sin(half)
+    def directions(self, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Unit vectors `out` (3, S, Q) for numbers (S, Q) in [0, 1), which are lost."""
+        x *= self.solid_angle
+        is_second = x > self.first
+        x -= np.where(is_second, self.first, _ZERO)
+        x *= np.float32(0.5)
+        volume, apex_near, near_far = (np.where(is_second, b, a) for a, b in zip(*self.terms, strict=True))
+        cosine, sine = np.cos(x), np.sin(x, out=x)
         # The third corner of the part of the triangle that has the solid angle: `apex` and `far` times these.
-        on_apex, on_far = volume * cosine - ty * sine, tz * sine
-        along = on_apex + on_far * apex_far
-        scale = 2.0 * along / np.maximum(on_apex * along + on_far * (on_far + on_apex * apex_far), _TINY)
-        on_apex = scale * on_apex - 1.0
+        cosine *= volume
+        cosine -= (self.apex_far + near_far) * sine
+        on_apex, on_far = cosine, sine
+        on_far *= _ONE + apex_near
+        scale = on_far * self.apex_far
+        scale += on_apex
+        squared = on_apex * scale
+        along = on_apex * self.apex_far
+        along += on_far
+        along *= on_far
+        squared += along
+        np.maximum(squared, _TINY, out=squared)
+        scale /= squared
+        scale *= np.float32(2.0)
+        on_apex *= scale
+        on_apex -= _ONE
         on_far *= scale
         # Between the corner `near` and that one.
-        cosine = np.clip(on_apex * apex_near + on_far * near_far, -1.0, 1.0)
-        height = 1.0 - y * (1.0 - cosine)
-        share = np.sqrt(y * (1.0 + height) / np.maximum(1.0 + cosine, _TINY))
-        on_near = height - share * cosine
+        apex_near *= on_apex
+        near_far *= on_far
+        apex_near += near_far
+        cosine = np.clip(apex_near, -_ONE, _ONE, out=apex_near)
+        height = cosine - _ONE
+        height *= y
+        height += _ONE
+        cosine_plus = np.maximum(cosine + _ONE, _TINY)
+        share = height + _ONE
+        share *= y
+        share /= cosine_plus
+        np.sqrt(share, out=share)
         on_apex *= share
         on_far *= share
-        vector = []
+        cosine *= share
+        height -= cosine
         for k in range(3):
-            part = on_apex * self.apex[k]
-            part += on_near * np.where(is_second, self.sides[1][0][k], self.sides[0][0][k])
-            part += on_far * np.where(is_second, self.sides[1][1][k], self.sides[0][1][k])
-            vector.append(part)
-        return vector
+            near = np.where(is_second, self.near[1][k], self.near[0][k])
+            np.multiply(near, height, out=out[k])
+            out[k] += on_apex * self.apex[k]
+            out[k] += on_far * self.far[k]
+        # Rounding leaves 1e-3 where two corners are nearly opposite.
+        length = np.sqrt(dot(out, out))
+        np.maximum(length, _TINY, out=length)
+        out /= length
+        return out
 
 
 class Warps:
-    """The maps (3, 3, Q) from the world to where GGX lobes have no peak: those of `shading.lookup_table` with A, B and
-    C = 1, the limit for alpha -> 0, after the local frame."""
+    """The maps from the world to where GGX lobes have no peak: local frames, then the warps of `shading.lookup_table`
+    with A, B and C = 1, the limit for alpha -> 0."""
 
     def __init__(self, rows: np.ndarray, cosine: np.ndarray, sine: np.ndarray, alpha: np.ndarray):
-        """Local frames (3, 3, Q), cosine and sine of the view's angle from the normal, all (Q,)."""
+        """Local frames (3, 3, Q); cosine and sine of the view's angle from the normal, and alpha, (Q,)."""
         self.rows = rows
-        alpha = np.maximum(alpha, np.float32(MIN_ALPHA))
         self.xx = cosine * cosine + np.float32(WARP_REGULARIZATION**2) * alpha * alpha
         self.xz = np.sqrt(self.xx) * sine
         self.zz = 2.0 * alpha
         self.determinant = self.xx * self.zz
 
-    def warped(self, local) -> list[np.ndarray]:
-        """Of vectors, three (..., Q), in local frames."""
-        return [self.xx * local[0] + self.xz * local[2], local[1], self.zz * local[2]]
+    def local(self, vectors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Vectors (3, S, Q) along the local frames of those in the world."""
+        return self._turned(vectors, self.rows, out)
 
-    def local(self, vectors) -> list[np.ndarray]:
-        """Three (..., Q) along the local frames of vectors in the world."""
-        return [dot(vectors, row) for row in self.rows]
+    def world(self, vectors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Vectors (3, S, Q) in the world of those in the local frames."""
+        return self._turned(vectors, self.rows.transpose(1, 0, 2), out)
 
-    def unwarped(self, unit):
-        """Unit vectors, three (S, Q), in the local frames, and the lengths (S, Q) of these after the warp, for warped
-        unit vectors."""
-        z = unit[2] / self.zz
-        x = (unit[0] - self.xz * z) / self.xx
-        length = 1.0 / np.sqrt(x * x + unit[1] * unit[1] + z * z)
-        return [x * length, unit[1] * length, z * length], length
+    def _turned(self, vectors, rows, out):
+        out = np.empty_like(vectors) if out is None else out
+        for k in range(3):
+            np.multiply(vectors[0], rows[k, 0], out=out[k])
+            out[k] += vectors[1] * rows[k, 1]
+            out[k] += vectors[2] * rows[k, 2]
+        return out
 
-    def world(self, local) -> list[np.ndarray]:
-        """Three (S, Q) in the world of vectors in the local frames."""
-        return [dot(local, column) for column in self.rows.transpose(1, 0, 2)]
+    def warped(self, local: np.ndarray) -> np.ndarray:
+        """Vectors (3, S, Q) after the warp of those in the local frames."""
+        return np.stack([self.xx * local[0] + self.xz * local[2], local[1], self.zz * local[2]])
+
+    def lengths(self, local: np.ndarray) -> np.ndarray:
+        """Lengths (S, Q) after the warp of unit vectors (3, S, Q) in the local frames."""
+        warped = self.warped(local)
+        warped *= warped
+        return np.sqrt(warped[0] + warped[1] + warped[2])
+
+    def unwarped(self, vectors: np.ndarray) -> np.ndarray:
+        """Turn warped unit vectors (3, S, Q), which are lost, into unit vectors in the local frames; their `lengths`."""
+        x, y, z = vectors
+        z /= self.zz
+        x -= self.xz * z
+        x /= self.xx
+        length = x * x
+        length += y * y
+        length += z * z
+        np.maximum(length, _TINY, out=length)
+        np.sqrt(length, out=length)
+        np.divide(_ONE, length, out=length)
+        vectors *= length
+        return length
+
+
+def frames(normal: np.ndarray, view: np.ndarray):
+    """Cosine and sine (Q,) of the view's angle from the normal, both (3, Q), and local frames (3, 3, Q): rows tangent,
+    bitangent, normal."""
+    # The difference of vectors that are close is exact; a normal from single precision is not quite a unit vector.
+    across = view - normal
+    squared = dot(normal, normal)
+    across -= dot(across, normal) / squared * normal
+    sine = np.sqrt(dot(across, across))
+    axis = np.eye(3, dtype=np.float32)[np.argmin(np.abs(normal), axis=0)].T
+    tangent = np.where(sine > 1e-6, across / np.maximum(sine, _TINY), axis)
+    tangent -= dot(tangent, normal) / squared * normal
+    tangent /= np.sqrt(dot(tangent, tangent))
+    normal = normal / np.sqrt(squared)
+    rows = np.stack([tangent, np.cross(normal, tangent, axis=0), normal])
+    return np.clip(dot(normal, view), _ZERO, _ONE), sine, rows
 
 
 def dot(a, b):

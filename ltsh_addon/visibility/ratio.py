@@ -11,19 +11,19 @@ neighbor in the picture found otherwise; the pairs that are left take all rays.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import PASSES, AreaLight, Cancelled, Film, Progress, SurfaceSamples
-from ..shading.brdf import dielectric_reflectance
-from ..shading.light_polygons import has_lobe, in_front
-from ..shading.parallel import cores
-from .directions import BITS, Emitter, SphericalQuads, Warps, dot, seeds_of, sequence
+from ..scene import FARTHEST, PASSES, AreaLight, Cancelled, Film, Progress, SurfaceSamples
+from ..shading import light_cone
+from ..shading.brdf import dielectric_reflectance, schlick_curve
+from ..shading.light_polygons import has_lobe
+from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
 
-# Rays of the first look at a pair.
+# Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
+MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
 # How often neighbors of mixed pairs that turn out mixed pass that on.
@@ -31,6 +31,10 @@ ROUNDS = 4
 # Rays end this share of their length before the light.
 END = np.float32(1.0 - 1e-4)
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
+_MIN_ALPHA = np.float32(1e-5)
+_FARTHEST = np.float32(FARTHEST)
+# Of unit vectors after a warp.
+_LENGTHS = np.float32(1e-11), np.float32(4.0)
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,16 @@ class Visibility:
 
     specular: np.ndarray | None  # (L, P) float32
     diffuse: np.ndarray | None
-    noise: dict[str, float]  # by pass: estimated relative L2 error of the light that all samples reflect together
+    # By pass, for the light of all lights that each sample reflects, about: (P,) radiance, and its standard deviation
+    radiance: dict[str, np.ndarray]
+    deviation: dict[str, np.ndarray]
     rays: int  # that were traced
     mixed: np.ndarray  # (L, P) bool: pairs of which some rays arrived and some did not
+
+    def noise(self, name: str) -> float:
+        """Estimated relative L2 error of a pass, by the two halves of the rays."""
+        power = np.square(self.radiance[name], dtype=np.float64).sum()
+        return float(np.sqrt(np.square(self.deviation[name], dtype=np.float64).sum() / max(power, 1e-30)))
 
 
 def visible_shares(
@@ -57,32 +68,32 @@ def visible_shares(
     film: Film | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
-    """At most `rays` for each pair of one of the P samples and a light, a multiple of 8.
+    """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. The result is the same for any number of
-    threads. `progress` may return False to stop: Cancelled is raised.
+    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
+    returns it. `progress` may return False to stop: Cancelled is raised.
     """
-    if rays < PROBES or rays % PROBES:
-        raise ValueError(f"shadow rays are {rays}, expected a multiple of {PROBES}")
-    shape = (len(lights), len(samples))
-    shares = {name: np.ones(shape, np.float32) for name in passes}
-    mixed = np.zeros(shape, bool)
-    sums = {name: np.zeros((3, len(samples))) for name in passes}
-    neighbors = Neighbors.of(film, len(samples))
-    seeds, traced = seeds_of(samples.position), 0
-    with ThreadPoolExecutor(cores()) as pool:
-        for number, light in enumerate(lights):
-            if progress is not None and progress("shadows", number / len(lights)) is False:
-                raise Cancelled("shadows were stopped")
-            work = _LightWork(samples, light, tracer, passes, seeds, pool)
-            work.trace(rays, neighbors)
-            traced += work.traced
-            mixed[number, work.index] = work.mixed
-            for name in passes:
-                shares[name][number, work.index] = work.shares(name)
-                work.add_noise(name, sums[name])
-    noise = {name: float(np.sqrt(error.sum() / max(np.square(light).sum(), 1e-30))) for name, (error, light, _) in sums.items()}
-    return Visibility(shares.get("specular"), shares.get("diffuse"), noise, traced, mixed)
+    if not PROBES <= rays <= MOST_RAYS:
+        raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
+    rays, count = rays // PROBES * PROBES, len(samples)
+    shares = {name: np.ones((len(lights), count), np.float32) for name in passes}
+    radiance, variance = ({name: np.zeros(count) for name in passes} for _ in range(2))
+    mixed = np.zeros((len(lights), count), bool)
+    surface, neighbors, traced = Surface(samples, passes, tracer), Neighbors.of(film, count), 0
+    for number, light in enumerate(lights):
+        if progress is not None and progress("shadows", number / len(lights)) is False:
+            raise Cancelled("shadows were stopped")
+        pairs = Pairs(surface, light)
+        pairs.trace(rays, neighbors)
+        traced += pairs.traced
+        index = pairs.index
+        mixed[number, index] = pairs.visible & pairs.blocked
+        for name in passes:
+            shares[name][number, index], mean, deviation = pairs.found(name)
+            radiance[name][index] += mean
+            variance[name][index] += deviation * deviation
+    deviation = {name: np.sqrt(values) for name, values in variance.items()}
+    return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
 @dataclass(frozen=True)
@@ -95,244 +106,320 @@ class Neighbors:
 
     @classmethod
     def of(cls, film: Film | None, count: int) -> Neighbors:
+        """Those of a film; without one, samples before and after each other."""
         if film is None:
             return cls(np.arange(count), count, 1)
-        return cls(film.pixel, film.width, film.height)
+        # Of a part of a picture the rows that it has.
+        top = int(film.pixel.min(initial=film.width * film.height)) // film.width
+        height = int(film.pixel.max(initial=0)) // film.width + 1 - top
+        return cls(film.pixel - top * film.width, film.width, max(height, 0))
 
-    def of_mixed(self, index: np.ndarray, visible: np.ndarray, blocked: np.ndarray) -> np.ndarray:
-        """Mask (Q,) of the samples `index` around which some light is `visible` (Q,) and some is `blocked` (Q,)."""
-        found = [self._around(self.pixel[index], mask)[self.pixel[index]] for mask in (visible, blocked)]
-        return found[0] & found[1]
-
-    def _around(self, pixel, mask):
+    def any_around(self, index: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Mask (Q,) of the samples `index` (Q,) around which `mask` (Q,) is true for one of them."""
+        pixel = self.pixel[index]
         marked = np.zeros(self.width * self.height, bool)
         marked[pixel[mask]] = True
         grid = np.pad(marked.reshape(self.height, self.width), 1)
         grid = grid[1:-1] | grid[:-2] | grid[2:]
-        return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()
+        return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()[pixel]
 
 
-class _LightWork:
-    """All pairs of one light: which there are, and what their rays have found so far."""
+class Surface:
+    """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
 
-    def __init__(self, samples, light, tracer, passes, seeds, pool):
-        self.samples, self.tracer, self.seeds, self.pool = samples, tracer, seeds, pool
-        self.emitter, self.light = Emitter(light), light
-        lobes = dict(zip(("diffuse", "specular"), has_lobe(samples), strict=True))
-        wanted = {
-            name: lobes[name] & (name in passes) & getattr(light, f"affects_{name}") for name in ("diffuse", "specular")
-        }
-        index = in_front(samples, light, np.flatnonzero(wanted["diffuse"] | wanted["specular"]))
-        self.index = index
-        self.wanted = {name: mask[index] for name, mask in wanted.items()}
-        # By pass, half of the rays, and sum of the weights or of those of the light that arrives.
-        self.sums = np.zeros((2, 2, 2, len(index)), np.float32)
-        self.visible, self.blocked = np.zeros(len(index), bool), np.zeros(len(index), bool)
-        self.count = np.zeros(len(index), np.int32)
+    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
+        self.tracer, self.starts = tracer, tracer.starts(samples)
+        self.position = np.ascontiguousarray(samples.position.T)
+        self.receiver = samples.receiver
+        self.seeds = seeds_of(samples.position)
+        self._known: dict[int, np.ndarray] = {}
+        self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)
+        self.geometric_normal = self._rows(samples.geometric_normal)
+        self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
+        self.bump_alpha2 = samples.bump_alpha2.astype(np.float32)
+        self.alpha = np.maximum(np.square(samples.roughness.astype(np.float32)), _MIN_ALPHA)
+        names = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo")
+        terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
+        self.f0, f90, self.dip, self.dielectric, self.albedo = terms
+        self.rise = f90 - self.f0
+        self.ior = np.maximum(samples.ior.astype(np.float32), _ONE)
+        diffuse, specular = has_lobe(samples)
+        specular &= dot(self.normal, self.view) > 0.0
+        self.lobes = {"specular": specular & ("specular" in passes), "diffuse": diffuse & ("diffuse" in passes)}
+
+    def _rows(self, vectors):
+        # Normals that stand for each other are the same array.
+        if id(vectors) not in self._known:
+            self._known[id(vectors)] = np.ascontiguousarray(vectors.T, dtype=np.float32)
+        return self._known[id(vectors)]
+
+    def horizons(self, name: str) -> tuple[np.ndarray, ...]:
+        """The normals (3, P) below whose horizons the lobe of a pass is 0."""
+        if name == "diffuse":
+            return _different(self.diffuse_normal, self.smooth_normal)
+        return _different(self.normal, self.geometric_normal)
+
+
+def _different(first, second):
+    return (first,) if first is second else (first, second)
+
+
+class Pairs:
+    """The samples that a light may reach, and what their rays have found so far."""
+
+    def __init__(self, surface: Surface, light: AreaLight):
+        self.surface, self.light = surface, light
+        self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.emitter = Emitter(light)
+        offset = (light.center[:, None] - surface.position).astype(np.float32)
+        ahead = dot(light.direction.astype(np.float32), offset) < 0.0
+        if light.is_focused:
+            ahead &= light_cone.may_reach(light, surface.position)
+        if light.receivers is not None:
+            ahead &= light.receives(surface.receiver)
+        radius, self.wanted, above = np.float32(1.001 * light.radius), {}, {}
+        for name, lobe in surface.lobes.items():
+            self.wanted[name] = lobe & ahead & getattr(light, f"affects_{name}")
+            for normal in surface.horizons(name):
+                if id(normal) not in above:
+                    above[id(normal)] = dot(normal, offset) > -radius
+                self.wanted[name] &= above[id(normal)]
+        self.index = np.flatnonzero(self.wanted["specular"] | self.wanted["diffuse"])
+        self.wanted = {name: wanted[self.index] for name, wanted in self.wanted.items()}
+        count = len(self.index)
+        # Of the weights, and of those of the light that arrives, by pass and half of the rays
+        self.weights, self.arriving = np.zeros((2, 2, 2, count), np.float32)
+        self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
+        self.count = np.zeros(count, np.int32)
         self.traced = 0
-
-    @property
-    def mixed(self) -> np.ndarray:
-        return self.visible & self.blocked
 
     def trace(self, rays: int, neighbors: Neighbors) -> None:
         """Probes for all pairs, and up to `rays` for those that need them."""
+        if self.mask == 0 or not self.light.area_vector.any():
+            return
         self._add_rays(np.arange(len(self.index)), 0, PROBES)
-        for _ in range(ROUNDS):
-            mask = neighbors.of_mixed(self.index, self.visible, self.blocked) & (self.count < rays)
-            # Nothing above the horizon was met so far.
-            mask |= (self.sums[:, :, 0].sum(axis=1) == 0.0).any(axis=0) & (self.count < rays)
-            if rays == PROBES or not mask.any():
-                break
-            self._add_rays(np.flatnonzero(mask), PROBES, rays)
+        self._leave_out_unlit()
+        if rays > PROBES:
+            for _ in range(ROUNDS):
+                chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
+                chosen |= self._unmet()
+                chosen &= self.count < rays
+                if not chosen.any():
+                    break
+                self._add_rays(np.flatnonzero(chosen), PROBES, rays)
+        self._aim_at_corners()
+
+    def _unmet(self):
+        """Mask (Q,) of the pairs with a lobe that no ray met so far."""
+        unmet = np.zeros(len(self.index), bool)
+        for number, name in enumerate(PASSES):
+            unmet |= self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0)
+        return unmet
+
+    def _corner_heights(self, name, members):
+        """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
+        surface, index = self.surface, self.index[members]
+        center = self.light.center[:, None] - surface.position[:, index]
+        offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
+        heights = [dot(offset, normal[:, None, index]) for normal in surface.horizons(name)]
+        return np.minimum.reduce(heights), offset
+
+    def _leave_out_unlit(self):
+        """Forget lobes for which all of the light is below the horizon."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
+
+    def _aim_at_corners(self):
+        """For lobes that no ray met, which see but a corner of the light: a ray to the corner that is highest."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            if len(unmet) == 0:
+                continue
+            heights, offset = self._corner_heights(name, unmet)
+            toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
+            distance = np.sqrt(dot(toward, toward))
+            found = self._transmittance(self.index[unmet], toward / np.maximum(distance, _TINY), distance)
+            self.weights[number][:, unmet] = 1.0
+            self.arriving[number][:, unmet] = found
+
+    def _transmittance(self, index, directions, distances):
+        """Of one ray for each of the samples `index` (R,): directions (3, R), distances (R,)."""
+        origins = self.surface.starts.origins(index, directions.T)
+        self.traced += len(index)
+        masks = np.broadcast_to(self.mask, index.shape)
+        return self.surface.tracer.transmittance(origins, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last):
         """Rays `first` to `last` for the pairs `members` (M,)."""
-        if self.light.receivers == ():
-            return
-        for kind in ((True, True), (True, False), (False, True)):
-            chosen = members[(self.wanted["diffuse"][members] == kind[0]) & (self.wanted["specular"][members] == kind[1])]
-            size = max(BLOCK_RAYS // (last - first), 1)
-            blocks = [chosen[start : start + size] for start in range(0, len(chosen), size)]
-            for block, found in zip(blocks, self.pool.map(lambda b: self._block(b, kind, first, last), blocks), strict=True):
-                sums, visible, blocked, traced = found
-                self.sums[..., block] += sums
-                self.visible[block] |= visible
-                self.blocked[block] |= blocked
-                self.traced += traced
+        diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
+        for chosen in (diffuse & specular, diffuse & ~specular, ~diffuse & specular):
+            chosen = members[chosen]
+            for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
+                block = chosen[start : start + BLOCK_RAYS // PROBES]
+                view = View(self.surface, self.index[block], self.emitter, self._lobes_of(block))
+                for number in range(first, last, PROBES):
+                    self._add_block(block, view, number)
         self.count[members] = last
 
-    def _block(self, members, kind, first, last):
-        """Sums (2, 2, 2, Q), whether some rays arrive and some do not (Q,), and how many rays were traced."""
-        index = self.index[members]
-        view = _View(self.samples, index, self.emitter, kind)
-        towards, weights, distance = view.rays(self.seeds[index], first, last)
-        met = np.flatnonzero(np.logical_or.reduce([weight > 0.0 for weight in weights if weight is not None]))
-        shape = distance.shape
-        column = met % shape[1]
-        origins = np.stack([np.take(row, column) for row in view.origin])
-        directions = np.stack([np.take(row, met) for row in towards])
-        masks = np.full(len(met), 0xFFFFFFFF, np.uint32)
-        transmittance = np.zeros(shape, np.float32)
-        found = self.tracer.transmittance(origins.T, directions.T, np.take(distance, met) * END, masks)
-        transmittance.ravel()[met] = found
-        sums = np.zeros((2, 2, 2, shape[1]), np.float32)
-        for number, weight in enumerate(weights):
-            if weight is not None:
-                seen = weight * transmittance
-                for half in range(2):
-                    sums[number, half, 0] = weight[half::2].sum(axis=0)
-                    sums[number, half, 1] = seen[half::2].sum(axis=0)
-        visible, blocked = np.zeros(shape, bool), np.zeros(shape, bool)
-        visible.ravel()[met] = found > 0.0
-        blocked.ravel()[met] = found < 1.0
-        return sums, visible.any(axis=0), blocked.any(axis=0), len(met)
+    def _lobes_of(self, block):
+        return tuple(name for name in PASSES if self.wanted[name][block[0]])
 
-    def shares(self, name: str) -> np.ndarray:
-        """Shares (Q,) of the pairs."""
-        whole, seen = self.sums[PASSES.index(name)].sum(axis=0)
-        return np.divide(seen, whole, out=np.ones_like(seen), where=whole > 0.0)
+    def _add_block(self, block, view, first):
+        """PROBES rays each for the pairs `block` (B,) of a view."""
+        directions, distance, weights = view.rays(first)
+        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+        arriving = np.zeros(met.shape, np.float32)
+        flat = np.flatnonzero(met)
+        towards = np.stack([np.take(row, flat) for row in directions])
+        index = np.take(np.broadcast_to(view.index, met.shape), flat)
+        arriving.ravel()[flat] = self._transmittance(index, towards, np.take(distance, flat))
+        sums = arriving.sum(axis=0)
+        self.visible[block] |= sums > 0.0
+        self.blocked[block] |= sums < met.sum(axis=0)
+        for name, weight in weights.items():
+            number = PASSES.index(name)
+            for half in range(2):
+                self.weights[number, half, block] += weight[half::2].sum(axis=0)
+            weight *= arriving
+            for half in range(2):
+                self.arriving[number, half, block] += weight[half::2].sum(axis=0)
 
-    def add_noise(self, name: str, sums: np.ndarray) -> None:
-        pass
+    def found(self, name: str):
+        """Shares (Q,) of a pass, the radiance (Q,) that it reflects, about, and its standard deviation."""
+        number = PASSES.index(name)
+        weights, arriving = self.weights[number], self.arriving[number]
+        halves = np.divide(arriving, weights, out=np.ones_like(weights), where=weights > 0.0)
+        whole = weights.sum(axis=0)
+        share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
+        scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
+        scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
+        unshadowed = whole * scale * self.wanted[name]
+        return share, unshadowed * share, unshadowed * 0.5 * np.abs(halves[0] - halves[1])
 
 
-class _View:
-    """A light seen from the points of a block, single precision, arrays (Q,) and lists of three of them."""
+class View:
+    """A light seen from a block of samples: arrays (Q,) and (3, Q)."""
 
-    def __init__(self, samples, index, emitter, kind):
-        self.samples, self.emitter = samples, emitter
-        self.has_diffuse, self.has_specular = kind
+    def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter, lobes: tuple[str, ...]):
+        self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
-        position = samples.position[index]
-        self.origin = np.ascontiguousarray(position.T, dtype=np.float32)
-        offset = (light.center - position).T
-        self.height = (-(light.direction @ offset)).astype(np.float32)
-        self.offset = np.ascontiguousarray(offset, dtype=np.float32)
+        offset = light.center[:, None] - np.take(surface.position, index, axis=1)
+        self.height = (-dot(light.direction, offset)).astype(np.float32)
+        self.offset = offset.astype(np.float32)
         corners = emitter.corners_from(self.offset, self.height)
         self.quads = SphericalQuads(corners)
-
-        def vectors(name):
-            return np.ascontiguousarray(getattr(samples, name)[index].T, dtype=np.float32)
-
-        def numbers(name):
-            return getattr(samples, name)[index].astype(np.float32)
-
-        def means(name):
-            return getattr(samples, name)[index].mean(axis=1, dtype=np.float32)
-
-        if self.has_diffuse:
-            self.diffuse_normal, self.smooth_normal = vectors("diffuse_normal"), vectors("smooth_normal")
-            self.is_bumped = (self.diffuse_normal != self.smooth_normal).any()
-            self.bump_alpha2 = numbers("bump_alpha2")
-        if self.has_specular:
-            normal, view = vectors("normal"), vectors("view")
-            self.geometric_normal = vectors("geometric_normal")
-            self.cosine, self.sine, rows = _frames(normal, view)
-            self.alpha = np.maximum(np.square(numbers("roughness")), np.float32(1e-5))
+        self.is_seen = self.quads.is_seen
+        self.seeds = surface.seeds[index]
+        if "diffuse" in lobes:
+            self.horizons = [np.take(normal, index, axis=1) for normal in surface.horizons("diffuse")]
+            self.bump_alpha2 = surface.bump_alpha2[index]
+        if "specular" in lobes:
+            normal, view = np.take(surface.normal, index, axis=1), np.take(surface.view, index, axis=1)
+            self.geometric_normal = np.take(surface.geometric_normal, index, axis=1)
+            self.has_own_horizon = surface.geometric_normal is not surface.normal
+            self.cosine, self.sine, rows = frames(normal, view)
+            self.alpha = surface.alpha[index]
             self.warps = Warps(rows, self.cosine, self.sine, self.alpha)
-            warped = [self.warps.warped(self.warps.local([c[k] for c in corners])) for k in range(4)]
-            self.warped_quads = SphericalQuads(np.stack([np.stack([warped[k][i] for k in range(4)]) for i in range(3)]))
-            self.f0, self.rise, self.dip, self.dielectric = (
-                means(name) for name in ("specular_f0", "specular_f90", "specular_dip", "dielectric")
-            )
-            self.rise = self.rise - self.f0
-            self.ior = np.maximum(numbers("ior"), _ONE)
+            self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
+            self.is_seen = self.is_seen & self.warped_quads.is_seen
+            self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
+            self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
-    def rays(self, seeds, first, last):
-        """Unit vectors, three (S, Q), weights (S, Q) or None of the specular and the diffuse lobe, distances (S, Q)."""
-        shares = [0.5, 0.5] if self.has_specular and self.has_diffuse else [float(self.has_diffuse), float(self.has_specular)]
-        towards, local, length = [], [], []
-        for number, share in enumerate(shares):
-            if share == 0.0:
-                continue
-            x, y = unit_points(seeds, number, int(first * share), int(last * share))
-            if number == 0:
-                towards.append(self.quads.directions(x, y))
-                if self.has_specular:
-                    local.append(self.warps.local(towards[-1]))
-                    length.append(np.sqrt(dot(*[self.warps.warped(local[-1])] * 2)))
-            else:
-                inside, size = self.warps.unwarped(self.warped_quads.directions(x, y))
-                local.append(inside)
-                length.append(size)
-                towards.append(self.warps.world(inside))
-        towards = [np.concatenate(parts) for parts in zip(*towards, strict=True)]
-        light = self.emitter.light
-        falling = -dot(towards, light.direction.astype(np.float32))
-        distance = self.height / np.maximum(falling, _TINY)
-        density = np.divide(np.float32(shares[0]), np.maximum(self.quads.solid_angle, _TINY))
-        if self.has_specular:
-            local = [np.concatenate(parts) for parts in zip(*local, strict=True)]
-            length = np.concatenate(length)
-            scale = np.float32(shares[1]) * self.warps.determinant / np.maximum(self.warped_quads.solid_angle, _TINY)
+    def rays(self, first: int):
+        """Unit directions (3, S, Q) of the PROBES rays from `first` on, distances (S, Q), weights (S, Q) by lobe."""
+        shares = {("specular", "diffuse"): (4, 4), ("specular",): (6, 2), ("diffuse",): (0, 8)}[self.lobes]
+        by_lobe, evenly = shares
+        shape = (PROBES, len(self.index))
+        directions = np.empty((3, *shape), np.float32)
+        if evenly:
+            points = unit_points(self.seeds, 0, first * evenly // PROBES, evenly)
+            self.quads.directions(*points, out=directions[:, :evenly])
+        density = np.float32(evenly / PROBES) / self.quads.solid_angle
+        if by_lobe:
+            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
+            points = unit_points(self.seeds, 1, first * by_lobe // PROBES, by_lobe)
+            length[evenly:] = self.warps.unwarped(self.warped_quads.directions(*points, out=local[:, evenly:]))
+            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
+            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
+            length[:evenly] = self.warps.lengths(local[:, :evenly])
+            scale = np.float32(by_lobe / PROBES) * self.warps.determinant / self.warped_quads.solid_angle
+            scale *= self.is_seen
+            np.clip(length, *_LENGTHS, out=length)
             density = density + scale / (length * length * length)
-        factor = (falling > 0.0) / density
-        brightness = self.emitter.brightness(towards, distance, self.offset, self.height)
+        light = self.emitter.light
+        falling = dot(directions, -light.direction.astype(np.float32))
+        distance = np.minimum(self.height / np.maximum(falling, _TINY), _FARTHEST)
+        falls = falling > 0.0
+        falls &= self.is_seen
+        factor = falls / density
+        brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
         if brightness is not None:
             factor *= brightness
-        specular = factor * self._specular(towards, local) if self.has_specular else None
-        diffuse = factor * self._diffuse(towards) if self.has_diffuse else None
-        return towards, (specular, diffuse), distance
+        weights = {}
+        if "specular" in self.lobes:
+            weights["specular"] = self._specular(directions, local)
+            weights["specular"] *= factor
+        if "diffuse" in self.lobes:
+            weights["diffuse"] = self._diffuse(directions)
+            weights["diffuse"] *= factor
+        return directions, distance, weights
 
-    def _diffuse(self, towards):
-        cosine = np.maximum(dot(towards, self.diffuse_normal), _ZERO)
-        if not self.is_bumped:
+    def _diffuse(self, directions):
+        """The cosine (S, Q), shadowed where a bump map has another horizon."""
+        cosine = dot(directions, self.horizons[0])
+        np.maximum(cosine, _ZERO, out=cosine)
+        if len(self.horizons) == 1:
             return cosine
-        above = np.maximum(dot(towards, self.smooth_normal), _ZERO)
+        above = dot(directions, self.horizons[1])
+        np.maximum(above, _ZERO, out=above)
         squared = above * above
-        # 2 / (1 + sqrt(1 + bump_alpha2 tan^2)) without a quotient by the cosine
-        shadowing = 2.0 * above / np.maximum(above + np.sqrt(squared + self.bump_alpha2 * (_ONE - squared)), _TINY)
-        return cosine * shadowing
+        slope = np.sqrt(squared + self.bump_alpha2 * (_ONE - squared))
+        slope += above
+        np.maximum(slope, _TINY, out=slope)
+        above /= slope
+        above *= np.float32(2.0)
+        cosine *= above
+        return cosine
 
-    def _specular(self, towards, local):
-        x, y, z = local
-        half_x, half_z = x + self.sine, z + self.cosine
-        horizontal, vertical = half_x * half_x + y * y, half_z * half_z
+    def _specular(self, directions, local):
+        """GGX BRDF with its Fresnel factor times cosine times 2 pi (S, Q); see `shading.brdf.ggx_brdf_cosine`."""
+        half_x, half_z = local[0] + self.sine, local[2] + self.cosine
         alpha2 = self.alpha * self.alpha
-        squared = horizontal + vertical
-        ratio = squared / (horizontal + alpha2 * vertical)
-        mu = np.maximum(z, _ZERO)
-        length_o = np.sqrt(self.cosine * self.cosine * (_ONE - alpha2) + alpha2)
-        length_i = np.sqrt(mu * mu * (_ONE - alpha2) + alpha2)
-        value = alpha2 * ratio * ratio * mu / (self.cosine * length_i + mu * length_o)
-        cosine = np.minimum(0.5 * np.sqrt(squared), _ONE)
-        reflectance = self.f0 + self.rise * (_ONE - cosine) ** 5
+        half_x *= half_x
+        half_x += local[1] * local[1]
+        half_z *= half_z
+        squared = half_x + half_z
+        half_z *= alpha2
+        half_x += half_z
+        ratio = np.divide(squared, half_x, out=half_x)
+        mu = np.maximum(local[2], _ZERO, out=half_z)
+        slope = mu * mu
+        slope *= _ONE - alpha2
+        slope += alpha2
+        np.sqrt(slope, out=slope)
+        slope *= self.cosine
+        slope += mu * np.sqrt(self.cosine * self.cosine * (_ONE - alpha2) + alpha2)
+        ratio *= ratio
+        ratio *= alpha2
+        ratio *= mu
+        ratio /= slope
+        ratio *= self._reflectance(squared)
+        if self.has_own_horizon:
+            ratio *= dot(directions, self.geometric_normal) > 0.0
+        return ratio
+
+    def _reflectance(self, squared):
+        """The Fresnel factor for squared lengths (S, Q) of unit view plus unit light, which are lost."""
+        cosine = np.sqrt(squared, out=squared)
+        cosine *= np.float32(0.5)
+        np.minimum(cosine, _ONE, out=cosine)
+        result = schlick_curve(cosine)
         if self.dip.any():
-            reflectance -= self.dip * cosine * (_ONE - cosine) ** 6
+            result *= self.rise - self.dip * (cosine * (_ONE - cosine))
+        else:
+            result *= self.rise
+        result += self.f0
         if self.dielectric.any():
-            reflectance += self.dielectric * dielectric_reflectance(cosine, self.ior)
-        value *= np.maximum(reflectance, _ZERO)
-        value *= dot(towards, self.geometric_normal) > 0.0
-        return value
-
-
-def _frames(normal, view):
-    """Cosine and sine (Q,) of the view's angle from the normal, both (3, Q), and local frames (3, 3, Q)."""
-    cosine = dot(normal, view)
-    across = view - cosine * normal
-    sine = np.sqrt(dot(across, across))
-    axis = np.eye(3, dtype=np.float32)[np.argmin(np.abs(normal), axis=0)].T
-    other = axis - dot(axis, normal) * normal
-    tangent = np.where(sine > 1e-6, across, other)
-    tangent = tangent / np.sqrt(dot(tangent, tangent))
-    bitangent = np.cross(normal, tangent, axis=0)
-    return np.clip(cosine, _ZERO, _ONE), sine, np.stack([tangent, bitangent, normal])
-
-
-_SEQUENCES = {}
-
-
-def unit_points(seeds, stream, first, last):
-    """x, y (S, Q) in [0, 1) of the points `first` to `last` of the sequence, changed by the seeds (Q,)."""
-    points = sequence(1024, stream + 1)[:, first:last] if stream not in _SEQUENCES else _SEQUENCES[stream][:, first:last]
-    found = []
-    for axis in range(2):
-        own = _own(seeds, 2 * stream + axis)
-        found.append(((points[axis][:, None] ^ own) + np.float32(0.5)) * np.float32(2.0**-BITS))
-    return found
-
-
-def _own(seeds, number):
-    from .directions import _mixed
-    return (_mixed(seeds + np.uint32(number * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS))
+            result += self.dielectric * dielectric_reflectance(cosine, self.ior)
+        return np.maximum(result, _ZERO, out=result)

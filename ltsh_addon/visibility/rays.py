@@ -13,11 +13,12 @@ import os
 import threading
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 from itertools import repeat
 
 import numpy as np
 
-from ..scene import SceneError, error_line, listed
+from ..scene import SceneError, SurfaceSamples, error_line, listed
 from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
 
 # Names under which the system may know the library.
@@ -28,6 +29,10 @@ CHUNK = 4096
 ORIGIN, NEAR, DIRECTION, FAR, MASK = slice(0, 3), 3, slice(4, 7), 8, 9
 RAY_ROWS, U, V, TRIANGLE, GEOMETRY, INSTANCE, HIT_ROWS = 12, 15, 16, 17, 18, 19, 22
 NONE = 0xFFFFFFFF
+# Of the size of coordinates: 8 times their rounding in single precision; 2 times are too few, 4 seem to suffice.
+CLEARANCE = 2.0**-21
+# A sample is looked for so far from its place, in m for a sample near the origin; and in so many surfaces there.
+NEARBY, LAYERS = 2.0**-14, 4
 # A ray goes on from a transparent surface by so much of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 
@@ -234,6 +239,65 @@ class _Scene:
         self._kept.clear()
 
 
+@dataclass(frozen=True)
+class _Shape:
+    """Q points on triangles of one instance: corners (Q, 3, 3) and normals there, all in the space in which Cycles has
+    them, or no normals where they are flat; shares (Q, 3) of the corners; and what takes directions to world space."""
+
+    corners: np.ndarray
+    normals: np.ndarray | None
+    shares: np.ndarray
+    to_world: np.ndarray | None
+    size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
+
+    @classmethod
+    def of(cls, occluders: Occluders, instance: int, is_applied: bool, triangle, u, v) -> _Shape:
+        mesh, matrix = occluders.meshes[occluders.mesh[instance]], occluders.matrices[instance]
+        named = mesh.triangles[triangle]
+        corners, normals = mesh.vertices[named].astype(np.float64), mesh.normals
+        if normals is not None:
+            normals = (normals[named] if normals.ndim == 2 else normals[triangle]).astype(np.float64)
+        shares = np.stack([1.0 - u - v, u, v], axis=-1)
+        in_world = corners @ matrix[:, :3].T
+        size = np.abs(in_world - in_world[:, :1]).max(axis=(1, 2))
+        if not is_applied:
+            return cls(corners, normals, shares, matrix[:, :3], size + np.abs(in_world).max(axis=(1, 2)))
+        if normals is not None:
+            normals = normals @ _cofactors(matrix[:, :3]).T
+            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+        return cls(in_world + matrix[:, 3], normals, shares, None, size)
+
+    def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
+        """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
+        (Q, 3), and from the other: `shadow_ray_smooth_surface_offset` of Cycles."""
+        (v0, v1, v2), (n0, n1, n2) = np.moveaxis(self.corners, 1, 0), np.moveaxis(self.normals, 1, 0)
+        point, normal = (np.einsum("qc,qck->qk", self.shares, values) for values in (self.corners, self.normals))
+        s, t = self.shares[:, 0], self.shares[:, 1]
+        a, b, c = _dot(n2 - n0, v0 - v2), _dot(n2 - n1, v1 - v2), _dot(n1 - n0, v1 - v0)
+        parabola = 0.5 * (a * s * (s - 1.0) + (a + b + c) * s * t + b * t * (t - 1.0))
+        corners = ((v0, v1, v2, n0), (v1, v0, v2, n1), (v2, v0, v1, n2))
+        heights = []
+        for side in (1.0, -1.0):
+            envelope = [
+                np.maximum(
+                    side * _dot(own - point, n)
+                    + np.maximum(np.maximum(side * _dot(one - own, n), side * _dot(other - own, n)), 0.0),
+                    0.0,
+                )
+                for own, one, other, n in corners
+            ]
+            heights.append(side * np.maximum(np.minimum.reduce(envelope), side * parabola))
+        normal = normal if self.to_world is None else normal @ self.to_world.T
+        above = _dot(normal, geometric_normal) > 0.0
+        heights = np.where(above, heights, heights[::-1])
+        return heights[:, :, None] * normal
+
+
+def _cofactors(matrix):
+    """What takes normals (3,) along with points: the inverse transposed times the determinant."""
+    return np.array([np.cross(matrix[1], matrix[2]), np.cross(matrix[2], matrix[0]), np.cross(matrix[0], matrix[1])])
+
+
 class Tracer:
     """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`."""
 
@@ -244,6 +308,8 @@ class Tracer:
         is_clear = clear[occluders.mesh] if len(occluders.mesh) else np.zeros(0, bool)
         self._opaque = _Scene(embree, occluders, np.flatnonzero(~is_clear))
         self._clear = _Scene(embree, occluders, np.flatnonzero(is_clear))
+        uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes)) if len(occluders.mesh) else np.zeros(0, int)
+        self._is_applied = uses[occluders.mesh] == 1
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
 
@@ -281,6 +347,64 @@ class Tracer:
                 if not self._clear.is_empty:
                     self._attenuate(shares[part], *rays)
         return shares
+
+    def mask_of(self, name: str) -> int:
+        """The mask of the rays to the light `name`."""
+        return ALL_RAYS
+
+    def starts(self, samples: SurfaceSamples) -> Starts:
+        """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
+
+        Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
+        from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
+        occluders keeps a small distance from its surface.
+        """
+        position, normal, smooth_normal = (
+            np.ascontiguousarray(values, np.float32)
+            for values in (samples.position, samples.geometric_normal, samples.smooth_normal)
+        )
+        count = len(position)
+        reach = np.abs(position).max(axis=1, initial=0.0)
+        clearance = (CLEARANCE * 8.0 * reach).astype(np.float32)
+        lift, terminator = np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32)
+        for start in range(0, count, CHUNK):
+            part = np.arange(start, min(start + CHUNK, count))
+            found, instance, triangle, u, v = self._triangles_at(position[part], normal[part])
+            part = part[found]
+            for number in np.unique(instance):
+                here = np.flatnonzero(instance == number)
+                shape = _Shape.of(self.occluders, number, self._is_applied[number], triangle[here], u[here], v[here])
+                clearance[part[here]] = CLEARANCE * (reach[part[here]] + shape.size)
+                if shape.normals is not None:
+                    lifts = shape.lifts(normal[part[here]])
+                    lift[:, part[here]] = lifts
+                    terminator[part[here]] = self.occluders.terminators[number] * np.any(lifts, axis=(0, 2))
+        return Starts(position, normal, smooth_normal, clearance, lift, terminator)
+
+    def _triangles_at(self, position, normal):
+        """Which triangles at most CHUNK samples lie on, as `_closest` has it."""
+        reach = (NEARBY * (1.0 + np.abs(position).max(axis=1))).astype(np.float32)
+        origins = position + reach[:, None] * normal
+        everything = np.full(len(position), ALL_RAYS, np.uint32)
+        best = np.full(len(position), np.inf, np.float32)
+        instance, triangle = np.zeros((2, len(position)), np.int64)
+        u, v = np.zeros((2, len(position)), np.float32)
+        with self._lock:
+            for scene in (self._opaque, self._clear):
+                near = np.zeros(len(position), np.float32)
+                # The first triangle may be that of another surface, close above.
+                for _ in range(0 if scene.is_empty else LAYERS):
+                    hit, *found = self._closest(scene, origins, -normal, near, 2.0 * reach, everything)
+                    index, off = np.flatnonzero(hit), np.abs(found[0] - reach[hit])
+                    closer = off < best[index]
+                    index = index[closer]
+                    best[index] = off[closer]
+                    for values, new in zip((instance, triangle, u, v), found[1:], strict=True):
+                        values[index] = new[closer]
+                    near[hit] = found[0] * STEP
+                    near[~hit] = np.inf
+        found = np.isfinite(best)
+        return found, instance[found], triangle[found], u[found], v[found]
 
     def _is_blocked(self, origins, directions, distances, masks):
         """Mask (R,) of at most CHUNK rays that an opaque surface blocks."""
@@ -325,6 +449,52 @@ class Tracer:
         values = (packets.get(row, count)[hit] for row in (FAR, U, V))
         distance, u, v = values
         return hit, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[hit], u, v
+
+
+# -- where shadow rays start -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where shadow rays of P samples start, see `Tracer.starts`; `origins` tells it for each ray."""
+
+    position: np.ndarray  # (P, 3) float32
+    geometric_normal: np.ndarray  # (P, 3)
+    smooth_normal: np.ndarray  # (P, 3)
+    clearance: np.ndarray  # (P,) m, so far from its plane a ray surely does not meet the sample's own triangle
+    lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
+    terminator: np.ndarray  # (P,) as Occluders.terminators, 0 for all that is flat
+
+    def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
+        facing = _dot(self.geometric_normal[index], directions)
+        side = np.copysign(self.clearance[index], facing)
+        terminator = self.terminator[index]
+        smooth = np.flatnonzero(terminator)
+        lift = None
+        if len(smooth):
+            lift, own = self._lifts(index[smooth], directions[smooth], facing[smooth], terminator[smooth])
+            side[smooth] = np.where(own, np.abs(side[smooth]) * own, side[smooth])
+        found = self.position[index] + side[:, None] * self.geometric_normal[index]
+        if lift is not None:
+            found[smooth] += lift
+        return found
+
+    def _lifts(self, index, directions, facing, terminator):
+        """How far (S, 3) rays of smooth samples start from the sample, and where they start not to pass their own
+        triangle (S,): above it (1), below (-1) or where the direction tells (0)."""
+        smooth_facing = _dot(self.smooth_normal[index], directions)
+        flipped = np.where(smooth_facing < 0.0, np.float32(-1.0), np.float32(1.0))
+        facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
+        grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
+        amount = np.clip(grazing, 0.0, 1.0)
+        lift = amount[:, None] * self.lift[(flipped < 0.0).astype(np.intp), index]
+        # As in Cycles, light from behind the own triangle meets it.
+        return lift, np.where((amount > 0.0) & (facing <= 0.0), flipped, 0.0)
+
+
+def _dot(first, second):
+    return np.einsum("rk,rk->r", first, second)
 
 
 # -- which library --------------------------------------------------------------------------------------------------

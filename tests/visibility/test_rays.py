@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
-from ltsh_addon.scene import SceneError
+from ltsh_addon.scene import SceneError, SurfaceSamples
 from ltsh_addon.visibility import OccluderMesh, Occluders, Transparency, open_tracer, rays
 
 # Near the edge of a triangle, or where a ray ends on it, single precision may decide otherwise: in units of the scene,
@@ -215,3 +215,136 @@ def test_what_is_no_mesh_is_refused():
         Transparency(1.5)
     with pytest.raises(ValueError, match="mesh 1"):
         Occluders((OccluderMesh(np.zeros((3, 3)), [[0, 1, 2]]),), [1], np.zeros((1, 3, 4)))
+
+
+# -- where rays start --
+
+
+def samples_on(mesh, matrix, rng, count, facets=None):
+    """Samples anywhere on the triangles of a mesh, or on some, as Cycles would see them from outside."""
+    triangle = rng.choice(len(mesh.triangles) if facets is None else facets, count)
+    shares = rng.dirichlet((1.0, 1.0, 1.0), count)
+    named = mesh.triangles[triangle]
+    corners = mesh.vertices[named] @ matrix[:, :3].T + matrix[:, 3]
+    position = np.einsum("pc,pck->pk", shares, corners)
+    geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    geometric /= np.linalg.norm(geometric, axis=1)[:, None]
+    smooth = geometric
+    if mesh.normals is not None:
+        smooth = np.einsum("pc,pck->pk", shares, mesh.normals[named]) @ matrix[:, :3].T
+        smooth /= np.linalg.norm(smooth, axis=1)[:, None]
+    return surface_samples(*(values.astype(np.float32) for values in (position, geometric, smooth)))
+
+
+def surface_samples(position, geometric, smooth):
+    ones = np.ones(len(position))
+    colors = np.ones((len(position), 3))
+    return SurfaceSamples(
+        position=position, view=geometric, normal=smooth, diffuse_normal=smooth, roughness=ones, specular_f0=colors,
+        specular_f90=colors, dielectric=ones, ior=ones, diffuse_albedo=colors, geometric_normal=geometric,
+        smooth_normal=smooth,
+    )  # fmt: skip
+
+
+def directions_around(normals, rng, per_sample):
+    """For each normal (P, 3) directions of its hemisphere (P * per_sample, 3), and the number of their sample."""
+    index = np.repeat(np.arange(len(normals)), per_sample)
+    directions = rng.normal(size=(len(index), 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    facing = np.einsum("rk,rk->r", directions, normals[index])
+    return index, (directions * np.sign(facing)[:, None]).astype(np.float32)
+
+
+def seen(tracer, samples, index, directions, distance=np.inf):
+    starts = tracer.starts(samples)
+    origins = starts.origins(index, directions)
+    return starts, tracer.transmittance(origins, directions, np.full(len(index), distance))
+
+
+@pytest.mark.parametrize("place", [0.0, 3.0, 100.0, 2000.0])
+@pytest.mark.parametrize("instances", [1, 2])
+def test_a_convex_surface_does_not_hide_itself(libraries, place, instances):
+    rng = np.random.default_rng(int(place) + instances)
+    vertices, triangles = sphere(16)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    matrix = np.concatenate([1.3 * turn, [[place], [-place], [0.3 * place]]], axis=1)
+    for normals in (None, vertices):
+        mesh = OccluderMesh(vertices, triangles, normals=normals)
+        matrices = [matrix, np.concatenate([np.eye(3), [[0], [0], [50.0 + place]]], axis=1)][:instances]
+        with open_tracer(Occluders((mesh,), [0] * instances, matrices), libraries) as tracer:
+            samples = samples_on(mesh, matrix, rng, 3000)
+            index, directions = directions_around(samples.smooth_normal, rng, 8)
+            facing = np.einsum("rk,rk->r", directions, samples.geometric_normal[index])
+            index, directions = index[facing > 1e-6], directions[facing > 1e-6]
+            starts, found = seen(tracer, samples, index, directions, 20.0)
+        assert (starts.terminator > 0.0).mean() == (0.0 if normals is None else 1.0)
+        assert found.all(), f"{(found == 0).sum()} of {found.size} rays are blocked"
+
+
+def test_a_large_plane_of_many_triangles_does_not_hide_itself(libraries):
+    rng = np.random.default_rng(2)
+    # Triangles of all sizes side by side, in a plane that no axis is parallel to.
+    corners = np.sort(np.concatenate([rng.uniform(-40, 40, 30), rng.normal(0, 0.1, 30), [-40, 40]]))
+    x, y = np.meshgrid(corners, corners, indexing="ij")
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    vertices = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3) @ turn.T + [1, 2, 3]
+    n = len(corners)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    triangles = np.concatenate([np.stack([a, a + n, a + n + 1], 1), np.stack([a, a + n + 1, a + 1], 1)])
+    mesh = OccluderMesh(vertices, triangles)
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
+        samples = samples_on(mesh, np.eye(3, 4), rng, 20_000)
+        index, directions = directions_around(samples.geometric_normal, rng, 8)
+        _, found = seen(tracer, samples, index, directions)
+    facing = np.einsum("rk,rk->r", directions, samples.geometric_normal[index])
+    assert found[facing > 1e-4].all(), f"{(found == 0).sum()} of {found.size} rays are blocked"
+
+
+def test_nothing_leaks_through_a_wall_of_a_millimetre(libraries):
+    rng = np.random.default_rng(4)
+    for place in (0.0, 30.0, 300.0):
+        low, high = np.array([-2, -0.0005, -2]), np.array([2, 0.0005, 2])
+        vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+        quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+        triangles = np.array([[q[0], q[i], q[i + 1]] for q in quads for i in (1, 2)])
+        matrix = np.concatenate([np.linalg.qr(rng.normal(size=(3, 3)))[0], np.full((3, 1), place)], axis=1)
+        matrix[:, 0] *= np.sign(np.linalg.det(matrix[:, :3]))
+        mesh = OccluderMesh(vertices, triangles)
+        with open_tracer(Occluders((mesh,), [0], [matrix]), libraries) as tracer:
+            samples = samples_on(mesh, matrix, rng, 5000, [4, 5, 6, 7])  # on its wide sides
+            index, directions = directions_around(samples.geometric_normal, rng, 4)
+            _, found = seen(tracer, samples, index, directions)
+            assert found.all()
+            _, found = seen(tracer, samples, index, -directions)
+            assert not found.any(), f"{found.sum()} of {found.size} rays leak {place} m away"
+
+
+def test_a_smooth_sphere_is_lit_up_to_its_horizon_as_cycles_lifts_it(libraries):
+    """Light that falls on the smooth surface from behind a flat triangle passes it, but for what Cycles cuts."""
+    rng = np.random.default_rng(8)
+    vertices, triangles = sphere(12)
+    mesh = OccluderMesh(vertices, triangles, normals=vertices)
+    blocked = {}
+    for terminator in (0.0, 0.1, 1.0):
+        with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)], terminators=[terminator]), libraries) as tracer:
+            samples = samples_on(mesh, np.eye(3, 4), rng, 4000)
+            index, directions = directions_around(samples.smooth_normal, rng, 8)
+            starts, found = seen(tracer, samples, index, directions)
+            facing = np.einsum("rk,rk->r", directions, samples.geometric_normal[index])
+            assert found[facing > 1e-3].all()
+            blocked[terminator] = 1.0 - found[facing < -1e-3].mean()
+        # At the corners of a triangle the smooth surface is the triangle, in the middle it is above.
+        height = np.linalg.norm(starts.position + starts.lift[0], axis=1) - np.linalg.norm(starts.position, axis=1)
+        assert 0.0 <= height.min() < 1e-3 and height.max() < 2.0 * (1.0 - np.cos(np.pi / 12))
+    assert blocked[0.0] == 1.0 and blocked[0.1] < 0.01 and blocked[1.0] < 0.01, blocked
+
+
+def test_a_sample_off_all_triangles_starts_beside_its_surface(libraries):
+    mesh = OccluderMesh(*sphere(8))
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
+        up = np.array([[0.0, 0, 1]])
+        starts = tracer.starts(surface_samples(np.array([[0.0, 0, 4]]), up, up))
+    assert starts.terminator == 0 and 0 < starts.clearance[0] < 1e-4
+    above, below = starts.origins(np.array([0, 0]), np.array([[0, 0, 1], [0, 0, -1]], np.float32))
+    assert below[2] < 4.0 < above[2]

@@ -84,7 +84,8 @@ class ShadowTracer:
             samples, self._lights, self._tracer, passes=passes, rays=rays, film=film, progress=progress
         )
         shares = {name: getattr(found, name) for name in passes}
-        return Shadows(shares, found.noise, found.rays, self._tracer.description, time.perf_counter() - start)
+        noise = {name: found.noise(name) for name in passes}
+        return Shadows(shares, noise, found.rays, self._tracer.description, time.perf_counter() - start)
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:

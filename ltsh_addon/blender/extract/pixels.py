@@ -33,6 +33,7 @@ from ..render_settings import (
     without_scripts,
     working_space,
 )
+from .occluders import collect_occluders
 from .origin import move_to_origin
 
 
@@ -54,6 +55,8 @@ def render_pixel_samples(
     return files
 
 
+# File with what stands in the way of light.
+OCCLUDERS = "occluders.npz"
 SEEDS = {"A": 1, "B": 7919}
 FIRST_CHUNK = 16
 CHUNK_SECONDS = 4.0
@@ -162,7 +165,9 @@ def _reason(error: RuntimeError, path: Path) -> str:
     return text
 
 
-def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
+def prepare_scene(
+    scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False
+) -> LightInventory:
     """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -172,7 +177,10 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
         bare = [] if override else objects_without_material(surfaces)
-        return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
+        inventory = collect_lights(depsgraph, override)
+        if with_occluders:
+            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn)
+        return inventory, materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     inventory.origin = origin
@@ -208,8 +216,12 @@ def extract(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
     picture = _picture(scene, job)
-    inventory = prepare_scene(scene, view_layer, camera, warnings)
+    has_shadows = job.get("shadows") == "on"
+    inventory = prepare_scene(scene, view_layer, camera, warnings, with_occluders=has_shadows)
     seconds["start"] = time.monotonic() - started
+
+    if has_shadows:
+        inventory.occluders.save(folder / OCCLUDERS)
 
     started = time.monotonic()
     extra_passes = ("emit",) if job.get("emission") else ()
@@ -218,7 +230,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
-        if job.get("shadows") == "on":
+        if has_shadows:
             let_shadow_rays_through(inventory.made_opaque)
         else:
             remove_occlusion(scene)
@@ -231,6 +243,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         **picture,
         "lights": [light.record() for light in inventory.lights],
         "origin": inventory.origin.tolist(),
+        "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
         "samples": samples,

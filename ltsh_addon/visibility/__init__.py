@@ -3,6 +3,16 @@
 from __future__ import annotations
 
 from .occluders import OccluderMesh, Occluders, Transparency
+from .ratio import Visibility, visible_shares
 from .rays import Starts, Tracer, open_tracer
 
-__all__ = ["OccluderMesh", "Occluders", "Starts", "Tracer", "Transparency", "Visibility", "open_tracer", "visible_shares"]
+__all__ = [
+    "OccluderMesh",
+    "Occluders",
+    "Starts",
+    "Tracer",
+    "Transparency",
+    "Visibility",
+    "open_tracer",
+    "visible_shares",
+]

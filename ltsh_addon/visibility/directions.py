@@ -10,8 +10,6 @@ All is in single precision, arrays are (S, Q): S directions from each of Q point
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ..scene import AreaLight

@@ -7,9 +7,8 @@ import pytest
 import random_surfaces
 
 from ltsh_addon import shading
-from ltsh_addon.scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import PASSES, AreaLight, Film, SurfaceSamples
 from ltsh_addon.visibility import ratio
-from ltsh_addon.visibility.directions import SphericalQuads, sequence, unit_points
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light) for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS)

@@ -10,6 +10,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from ..pipeline.options import BakeOptions, PictureOptions, options_from, table
@@ -33,7 +34,9 @@ from .output import baseline_of, do_job, merge_job, print_json
 from .progress import print_out
 
 DEMO_RESOLUTION = (480, 270)
-DEMO = "Build the example scene, OUT/demo.blend, and do with it what compare does."
+UNSHADOWED = "unshadowed"
+DEMO = """Build the example scene, OUT/demo.blend, and do with it what compare does; then the
+same without shadows, in OUT/unshadowed, which compares the lobes alone."""
 COMPARE = """Shade what the camera sees with several techniques, render the same direct light
 with Cycles, and measure how far apart they are. OUT gets compare.exr (all layers
 in float), compare.png (side by side, signed errors below), report.html and
@@ -118,7 +121,14 @@ def _demo(arguments, bar, open_file) -> int:
     job = job_of(arguments, (arguments.output / "demo.blend",))
     prepare(job.options)
     client.build_demo(job.scenes[0], progress=bar)
-    return _printed(arguments, *do_job(job, arguments, bar))
+    document, code = do_job(job, arguments, bar)
+    if job.options.shadows == "on":
+        alone = replace(job.options, shadows="off", output=arguments.output / UNSHADOWED)
+        if not arguments.json:
+            print_out("\nwithout shadows, which compares the lobes alone:")
+        document[UNSHADOWED], other = do_job(replace(job, options=alone), arguments, bar)
+        code = max(code, other)
+    return _printed(arguments, document, code)
 
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> Job:

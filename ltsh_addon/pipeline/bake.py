@@ -92,7 +92,7 @@ def bake_objects(
 
 def _shadow_tracer(options, manifest, folder):
     """What finds shadows, for a with-statement that gets None without shadows."""
-    if options.shadows == "off":
+    if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
     return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]))

@@ -145,7 +145,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples)
     extraction = client.extract(job, progress=progress)
     shadows = None
-    if options.shadows == "on":
+    if extraction.occluders is not None:
         shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
     results = evaluated(tables, extraction, shadows, options, progress)
 

@@ -198,7 +198,7 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
     names = list(dict.fromkeys(job.shaded_as().values()))
     share, start, shares = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE, None
-    if job.shadows == "on":
+    if extraction.occluders is not None:
         shares = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share)).shares
     images = {
         name: _images(extraction, name, shares, _part(progress, start + (index + 1) * share, share))

@@ -165,9 +165,7 @@ def _reason(error: RuntimeError, path: Path) -> str:
     return text
 
 
-def prepare_scene(
-    scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False
-) -> LightInventory:
+def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False) -> LightInventory:
     """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
     render_settings.prepare_surfaces(warnings)

@@ -52,7 +52,7 @@ def test_the_demo_end_to_end(capsys, out):
     report = json.loads(stdout)
     assert code == 0 and report["warnings"] == [] and report["resolution"] == [48, 27]
     names = {path.name for path in out.iterdir()}
-    assert names == {"compare.exr", "compare.png", "demo.blend", "report.html", *ALWAYS}
+    assert names == {"compare.exr", "compare.png", "demo.blend", "report.html", "unshadowed", *ALWAYS}
     assert {light["shape"] for light in report["lights"]} == {"SQUARE", "RECTANGLE", "DISK", "ELLIPSE"}
     layers = imaging.read_layers(out / "compare.exr")
     assert all(np.isfinite(plane).all() for plane in layers.values())

@@ -34,6 +34,7 @@ class Transparency:
     uv: np.ndarray | None = None
     extension: str = "REPEAT"  # one of EXTENSIONS
     interpolation: str = "Linear"  # one of INTERPOLATIONS
+    outside: float = 1.0  # what stands for the image beside it, where `extension` is CLIP
 
     def __post_init__(self):
         if not 0.0 <= self.share <= 1.0:
@@ -73,7 +74,7 @@ class Transparency:
         columns, rows = _within(x, width, self.extension), _within(y, height, self.extension)
         found = self.image[rows, columns]
         if self.extension == "CLIP":
-            found = np.where((x == columns) & (y == rows), found, 1.0)
+            found = np.where((x == columns) & (y == rows), found, self.outside)
         return found
 
 
@@ -151,6 +152,12 @@ class Occluders:
             raise ValueError(f"occluders: an instance names mesh {mesh.max()}, expected 0 to {len(self.meshes) - 1}")
         object.__setattr__(self, "meshes", tuple(self.meshes))
 
+    def split(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the instances that block, and of those that let light through; without triangles: neither."""
+        is_clear = np.array([mesh.transparency is not None for mesh in self.meshes], bool)[self.mesh]
+        is_there = np.array([len(mesh.triangles) > 0 for mesh in self.meshes], bool)[self.mesh]
+        return np.flatnonzero(is_there & ~is_clear), np.flatnonzero(is_there & is_clear)
+
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name; 0: nothing is in its way."""
         return self.light_masks.get(light, 1)
@@ -174,7 +181,7 @@ class Occluders:
             if clear is None:
                 about.append(None)
                 continue
-            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation")}
+            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation", "outside")}
             if clear.image is not None:
                 images.setdefault(id(clear.image), clear.image)
                 record["image"] = list(images).index(id(clear.image))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import scene_parts
 from mathutils import Vector
-from test_occluders import collected
 
 from ltsh_addon.blender.extract import pixels
 from ltsh_addon.blender.process.blender_process import embree_libraries
@@ -63,7 +62,7 @@ def shares(tracer, origins):
 @pytest.mark.parametrize("name", KINDS)
 def test_a_surface_hides_itself_as_in_cycles(tmp_path, monkeypatch, name):
     build(name)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     prepared = scene_parts.prepare()
     ((samples, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
     expected, lit = (values[pixel] for values in seen_by_cycles(tmp_path, prepared, monkeypatch))

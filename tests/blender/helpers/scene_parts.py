@@ -8,7 +8,9 @@ import bpy
 import numpy as np
 
 from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.evaluated import with_render_depsgraph
 from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.process import client
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
@@ -173,6 +175,16 @@ def prepare():
     layer = render_settings.choose_view_layer(scene, warnings)
     inventory = pixels.prepare_scene(scene, layer, camera, warnings)
     return scene, layer, inventory, warnings
+
+
+def collected_occluders():
+    """What blocks light in the open scene, and the warnings about it."""
+    warnings, override = [], bpy.context.view_layer.material_override
+
+    def visit(depsgraph):
+        return collect_occluders(depsgraph, override, warnings.append)
+
+    return with_render_depsgraph(bpy.context.scene, visit), warnings
 
 
 def silent(stage, fraction):

@@ -65,10 +65,10 @@ def _reversed_bits(values):
 _POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
 
 
-def unit_points(seeds: np.ndarray, stream: int, first: int, count: int) -> list[np.ndarray]:
-    """Numbers x, y (S, Q) in (0, 1): `count` points of a sequence, changed by the seeds (Q,); `stream` is 0 or 1."""
+def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[np.ndarray]:
+    """Numbers x, y (S, Q) in (0, 1): points `first` to `last` of a sequence, changed by the seeds (Q,); `stream` is 0 or 1."""
     found = []
-    for axis, points in enumerate(_POINTS[stream][:, first : first + count]):
+    for axis, points in enumerate(_POINTS[stream][:, first:last]):
         own = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
         numbers = (points[:, None] ^ own).astype(np.float32)
         numbers += np.float32(0.5)

@@ -75,6 +75,7 @@ class _Embree:
     """The functions of one library, and a device of it."""
 
     def __init__(self, library: str):
+        self.path = library
         try:
             self._library = ctypes.CDLL(library)
             # Keeps Python's lock during a call, which is too short to hand it over.
@@ -307,7 +308,7 @@ class EmbreeCaster:
     chunk = CHUNK
 
     def __init__(self, occluders: Occluders, embree: _Embree):
-        self.description = f"Embree {embree.version}"
+        self.description, self.library = f"Embree {embree.version}", embree.path
         self._embree, self._scenes = embree, []
         for index in occluders.split():
             self._scenes.append(_Scene(embree, occluders, index))
@@ -361,6 +362,8 @@ class Tracer:
 
     def __init__(self, occluders: Occluders, caster):
         self.occluders, self.description = occluders, caster.description
+        # The file with which another process casts the same rays; None where it cannot.
+        self.library = getattr(caster, "library", None)
         self._caster, self._lock = caster, threading.Lock()
         self._has = [len(index) > 0 for index in occluders.split()]
         uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes))

@@ -48,7 +48,7 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
     returns False Cancelled is raised. No child is left when this ends.
     """
     wanted = min(parallel.cores() if workers is None else workers, len(blocks)) - 1
-    if parallel.interpreter() is None or tracer.library is None:
+    if parallel.interpreter() is None or getattr(tracer, "library", None) is None:
         wanted = 0
     queue = _Queue(blocks)
     children = [_Tracing(Errand(task, tracer.occluders, tracer.library), queue) for _ in range(wanted)]

@@ -268,6 +268,17 @@ class _Shape:
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
+    def face_normals(self, side: np.ndarray) -> np.ndarray:
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell, or these where
+        a triangle has no area."""
+        edges = self.corners[:, 1:] - self.corners[:, :1]
+        if self.to_world is not None:
+            edges = edges @ self.to_world.T
+        normal = np.cross(edges[:, 0], edges[:, 1])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal *= np.where(_dot(normal, side) < 0.0, -1.0, 1.0)[:, None]
+        return np.divide(normal, length, out=side.astype(np.float64), where=length > 0.0)
+
     def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
         """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
         (Q, 3), and from the other: `shadow_ray_smooth_surface_offset` of Cycles."""
@@ -430,10 +441,11 @@ class Tracer:
 
         Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
         from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
-        occluders keeps a small distance from its surface.
+        occluders keeps a small distance from its surface. The side of a triangle is that of its own normal: that of
+        the sample is the smooth one where a lobe ends at the smooth horizon.
         """
         position, normal, smooth_normal = (
-            np.ascontiguousarray(values, np.float32)
+            np.array(values, np.float32, order="C")
             for values in (samples.position, samples.geometric_normal, samples.smooth_normal)
         )
         count, chunk = len(position), self._caster.chunk
@@ -448,6 +460,7 @@ class Tracer:
                 shape = _Shape.of(self.occluders, found, here, self._is_applied[number])
                 index = start + found.ray[here]
                 clearance[index] = CLEARANCE * (reach[index] + shape.size)
+                normal[index] = shape.face_normals(normal[index])
                 if shape.normals is not None:
                     lifts = shape.lifts(normal[index])
                     lift[:, index] = lifts

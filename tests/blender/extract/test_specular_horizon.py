@@ -1,7 +1,10 @@
 """Specular lobes end at the horizon at which those of Cycles do."""
 
+import math
 from dataclasses import replace
 
+import bake_scenes
+import bpy
 import pytest
 import scene_parts
 from scene_parts import add_bump, add_sphere, bsdf_material
@@ -44,3 +47,26 @@ def test_lobes_end_where_those_of_cycles_do(tmp_path, mesh, roughness, sides, tu
     # Measured: up to 0.7 %, noise included; the other horizon is wrong by 3 to 47 %.
     assert chosen < 8e-3
     assert 1.5e-2 < max(error(samples.geometric_normal), error(samples.smooth_normal))
+
+
+def add_face(material, tilt):
+    """A small face whose smooth normals are all turned by `tilt` rad towards x, as beside a crease."""
+    face = scene_parts.add_plane(material, size=0.02, name="Face")
+    face.data.polygons.foreach_set("use_smooth", [True])
+    face.data.normals_split_custom_set([(math.sin(tilt), 0.0, math.cos(tilt))] * 4)
+
+
+def test_faces_whose_smooth_normals_point_to_their_other_side_bake_as_in_cycles(tmp_path):
+    """As half of a bent quad does. The view is then raised above the face's own side, not above that of the normals."""
+    scene_parts.empty_scene()
+    add_face(scene_parts.principled(Roughness=0.4, Metallic=1.0)[0], 1.9)
+    scene_parts.add_camera((2.0, 0.0, 1.5))
+    scene_parts.add_area_light(location=(2.0, 0.5, 1.2), rotation=(0.0, 1.0, 0.2))
+    path = scene_parts.save(tmp_path / "face.blend")
+    options = {"techniques": ("reference",), "passes": ("specular",), "error": True, "cycles_samples": 64}
+    for scale in (1.0, -1.0):
+        bpy.data.objects["Face"].scale[1] = scale
+        scene_parts.save(path)
+        layers = bake_scenes.baked(path, tmp_path / f"bake {scale:g}", **options)[1]["Face.exr"]
+        found, expected = (layers[f"{name}.specular"].mean() for name in ("reference", "cycles"))
+        assert expected > 0.0 and abs(found / expected - 1.0) < 0.01

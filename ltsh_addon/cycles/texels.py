@@ -135,8 +135,9 @@ def texel_samples(
         )
         of_block = {name: values[block] for name, values in maps.items()}
         samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
-        pieces.append(end_at_horizons_of_cycles(samples, lights))
-        index.append(texel + start)
+        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
+        pieces.append(samples)
+        index.append(texel[of_sample] + start)
     return joined(pieces), np.concatenate(index)
 
 

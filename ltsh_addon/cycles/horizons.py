@@ -8,6 +8,7 @@ import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
 from ..shading import brdf, polygon
+from .light_tree import light_chances
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
 # Reflected rays stay at least this far above the true surface, or this share of the view's own elevation.
@@ -65,7 +66,7 @@ HEIGHTS = (1.0 / 6.0, 0.5, 5.0 / 6.0)
 SMALLEST_ANGLE = 1e-4
 # Of what lies between the horizons. A sample is split where more than this comes from below either.
 SMALLEST_SHARE = 5e-3
-BLOCK = 4096
+BLOCK = 2048
 
 
 def end_at_horizons_of_cycles(
@@ -115,24 +116,30 @@ def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
 def lobe_chances(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np.ndarray:
     """How likely Cycles chooses directions by the specular and the diffuse lobe of the samples, (2, P): about as their
     albedos are to those of all samples with the same `hit` (P,)."""
-    cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
-    fresnel = samples.specular_f0 + (samples.specular_f90 - samples.specular_f0) * ((1.0 - cosine) ** 5)[:, None]
-    specular = fresnel.mean(axis=1)
-    dielectric = brdf.dielectric_reflectance(cosine, np.maximum(samples.ior, 1.0))
-    specular = np.maximum(specular + samples.dielectric.mean(axis=1) * dielectric, 0.0)
+    specular = _reflectance(samples, np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0))
     diffuse = np.zeros_like(specular) if is_baked else samples.diffuse_albedo.mean(axis=1)
     _, hit = np.unique(hit, return_inverse=True)
     both = np.stack([specular, diffuse])
     return both / np.maximum(np.bincount(hit, weights=both.sum(axis=0))[hit], 1e-12)
 
 
+def _reflectance(samples, cosine) -> np.ndarray:
+    """Mean reflectance (P, ...) of the lobes for cosines (P, ...) of the half angle."""
+    names = ("specular_f0", "specular_f90", "dielectric")
+    values = [getattr(samples, name).mean(axis=1) for name in names] + [np.maximum(samples.ior, 1.0)]
+    f0, f90, weight, ior = (value.reshape(-1, *[1] * (cosine.ndim - 1)) for value in values)
+    schlick = f0 + (f90 - f0) * brdf.schlick_curve(cosine)
+    return np.maximum(schlick + weight * brdf.dielectric_reflectance(cosine, ior), 0.0)
+
+
 def horizon_excess(
-    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray
+    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=light_chances
 ) -> tuple[np.ndarray, np.ndarray]:
     """What only one of the horizons lets through (P,), of directions that a lobe chose and of those that the light
     chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
 
-    `chances` (2, P) as of `lobe_chances`. Where both horizons make no difference the first is 1 and the second 0.
+    `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, see `light_tree.light_chances`. Where
+    both horizons make no difference the first is 1 and the second 0.
     """
     crossed = np.stack([_crosses(samples, light) for light in lights])
     index = np.flatnonzero(crossed.any(axis=0))
@@ -140,10 +147,11 @@ def horizon_excess(
     if len(index) == 0:
         return by_lobe, by_light
     samples, crossed, chances = samples.take(index), crossed[:, index], chances[:, index]
-    chance = light_chances(samples, lights)
+    chance = choose(samples.position, samples.smooth_normal, lights)
     towards, width = _directions(samples)
     lobe = _lobe_density(samples, towards)
-    reflected = lobe * _seen_by_light(samples, towards)
+    half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("phni,pi->phn", towards, samples.view), 0.0))
+    reflected = lobe * _seen_by_light(samples, towards) * _reflectance(samples, half)
     diffuse = np.maximum(np.einsum("phni,pi->phn", towards, samples.diffuse_normal), 0.0) / np.pi
     chosen2 = np.square(chances[0][:, None, None] * lobe + chances[1][:, None, None] * diffuse)
     by_lobe[index] = 0.0
@@ -157,47 +165,6 @@ def horizon_excess(
         by_light[index[rows]] += (excess * weight).sum(axis=(1, 2))
         by_lobe[index[rows]] += (excess * (1.0 - weight)).sum(axis=(1, 2))
     return by_lobe, by_light
-
-
-def light_chances(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.ndarray:
-    """How likely Cycles chooses each of the lights (L, P): the mean of two chances, by the most and by the least that
-    the light may send to the point.
-
-    Both are bounds from the light's rectangle (Conty Estevez and Kulla 2018, "Importance Sampling of Many Lights with
-    Adaptive Tree Splitting", doi:10.1145/3233305). This is the chance in a leaf of Cycles' light tree, and about right
-    where few lights have a deeper one.
-    """
-    most, least = np.moveaxis(np.stack([_light_bounds(samples, light) for light in lights]), 1, 0)
-    seen = most > 0.0
-    by_least = np.where(least.sum(axis=0) > 0.0, least, seen)
-    sums = np.maximum(most.sum(axis=0), 1e-300), np.maximum(by_least.sum(axis=0), 1e-300)
-    return 0.5 * (most / sums[0] + by_least / sums[1])
-
-
-def _light_bounds(samples, light):
-    """Bounds (2, P) of the light at the samples, the upper one first: power, cosines at both ends, squared distance."""
-    offset = light.center - samples.position
-    distance = np.linalg.norm(offset, axis=1)
-    axis = offset / np.maximum(distance, 1e-30)[:, None]
-    corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
-    reach = np.array([np.linalg.norm(corner, axis=1) for corner in corners])
-    along = np.array([(corner * axis).sum(axis=1) for corner in corners])
-    width = np.clip((along / np.maximum(reach, 1e-30)).min(axis=0), -1.0, 1.0)
-    here, there = (axis * samples.smooth_normal).sum(axis=1), -(axis @ light.direction)
-    most = [np.where(cosine >= width, 1.0, _cosine_of_sum(cosine, width, -1.0)) for cosine in (here, there)]
-    least = [_cosine_of_sum(cosine, width, 1.0) for cosine in (here, there)]
-    end = np.cos(0.5 * light.spread)
-    is_seen = (there > 0.0) & (most[0] > 0.0) & (most[1] > end)
-    is_whole = is_seen & (width > 0.0) & (least[0] > 0.0) & (least[1] > end)
-    power = np.abs(light.radiance).mean() * np.linalg.norm(light.area_vector)
-    farthest = np.maximum(reach.max(axis=0), distance)
-    upper = np.where(is_seen, most[0] * most[1], 0.0) * power / np.maximum(distance, 1e-30) ** 2
-    return np.stack([upper, np.where(is_whole, least[0] * least[1], 0.0) * power / np.maximum(farthest, 1e-30) ** 2])
-
-
-def _cosine_of_sum(first, second, sign):
-    """Cosine of the sum of two angles of 0 to pi, or with the sign -1 of their difference, from their cosines."""
-    return first * second - sign * np.sqrt(np.maximum(1.0 - first**2, 0.0) * np.maximum(1.0 - second**2, 0.0))
 
 
 def _solid_angle(position, light) -> np.ndarray:

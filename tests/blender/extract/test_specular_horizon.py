@@ -61,10 +61,10 @@ def add_face(material, tilt):
     face.data.normals_split_custom_set([(math.sin(tilt), 0.0, math.cos(tilt))] * 4)
 
 
-@pytest.mark.parametrize("kind", ["metal", "dielectric"])
-def test_both_horizons_of_a_crease_count_as_much_as_in_cycles(tmp_path, kind):
+@pytest.mark.parametrize("kind, others", [("metal", 0), ("metal", 2), ("dielectric", 0), ("dielectric", 2)])
+def test_both_horizons_of_a_crease_count_as_much_as_in_cycles(tmp_path, kind, others):
     """Seen and baked: Cycles weighs directions that the lobes choose, which in a bake of specular light are the
-    specular ones alone, against those that the light chooses."""
+    specular ones alone, against those that the lights choose, which it chooses by its light tree."""
     scene_parts.empty_scene(8, 8)
     metallic = {"metal": 1.0, "dielectric": 0.0}[kind]
     add_face(scene_parts.principled(Roughness=0.4, Metallic=metallic, Base_Color=(0.8, 0.8, 0.8, 1.0))[0], 0.44)
@@ -73,6 +73,9 @@ def test_both_horizons_of_a_crease_count_as_much_as_in_cycles(tmp_path, kind):
     # 8 degrees below the face.
     place = {"location": (2.97, 0.0, -0.418), "rotation": (0.0, math.pi / 2.0 + 0.14, 0.0)}
     scene_parts.add_area_light(**place, size=1.0, size_y=1.0)
+    for x, y, energy in ((0.0, 1.0, 100.0), (0.5, -2.0, 300.0))[:others]:
+        place = {"location": (x, y, 2.5), "rotation": (-math.atan2(y, 2.5), 0.0, 0.0)}
+        scene_parts.add_area_light(**place, size=1.0, size_y=1.0, energy=energy)
     path = scene_parts.save(tmp_path / "face.blend")
     options = {"techniques": ("reference",), "passes": ("specular",), "error": True, "cycles_samples": 128}
     baked = bake_scenes.baked(path, tmp_path / "bake", **options)[1]["Face.exr"]
@@ -85,11 +88,12 @@ def test_both_horizons_of_a_crease_count_as_much_as_in_cycles(tmp_path, kind):
         return shade(ended, lights, "reference", passes=("specular",), workers=1).specular.sum() / (3 * len(samples))
 
     found, both = total(end_at_horizons_of_cycles(samples, lights)[0]), baked["cycles.specular"].mean()
-    # Noise: 0.1 %. The share is from 48 x 3 directions and without Fresnel: measured up to 1.3 %.
-    assert abs(found / seen - 1.0) < 0.02 and abs(baked["reference.specular"].mean() / both - 1.0) < 0.02
+    print("RATIO", found / seen - 1, baked["reference.specular"].mean() / both - 1)
+    # Noise: 0.1 %. The share is from 48 x 3 directions: measured up to 0.9 %.
+    assert abs(found / seen - 1.0) < 0.015 and abs(baked["reference.specular"].mean() / both - 1.0) < 0.015
     smooth = total(replace(samples, geometric_normal=samples.smooth_normal))
     assert total(samples) < 0.2 * seen and smooth > 1.1 * both
-    # The diffuse lobe chooses most directions of a dielectric, so that it leaves more to the light.
+    # The diffuse lobe chooses most directions of a dielectric, so that it leaves more to the lights.
     assert (seen > 1.1 * both) == (kind == "dielectric")
 
 

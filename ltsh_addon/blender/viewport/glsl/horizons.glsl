@@ -75,7 +75,7 @@ vec2 cosines_of_sums(vec2 first, float second, float sign)
     return first * second - sign * sqrt(max(1.0 - first * first, 0.0) * max(1.0 - second * second, 0.0));
 }
 
-/* The most and the least that the light may send to the pixel, as `horizons._light_bounds`; whether it sends anything. */
+/* The most and the least that the light may send to the pixel, as `light_tree.light_bounds`; whether it sends anything. */
 vec3 bounds(seen_light light, vec3 smooth_normal, float area)
 {
     float far = length(light.offset);
@@ -187,20 +187,16 @@ float seen_by_light(vec3 towards, vec3 towards_eye, vec3 normal, float roughness
 float dielectric_reflectance(float cosine, float ior)
 {
     float inner = sqrt(max(ior * ior - 1.0 + cosine * cosine, 0.0));
-    float straight = (cosine - inner) / (cosine + inner);
-    float along = (ior * ior * cosine - inner) / (ior * ior * cosine + inner);
+    float straight = (cosine - inner) / max(cosine + inner, 1e-30);
+    float along = (ior * ior * cosine - inner) / max(ior * ior * cosine + inner, 1e-30);
     return 0.5 * (straight * straight + along * along);
 }
 
-/* How likely the specular and the diffuse lobe are chosen, as `horizons.lobe_chances` of a single sample. */
-vec2 lobe_chances(ivec2 texel, float cosine)
+/* Mean reflectance for the cosine of the half angle, of mean f0, f90, weight and index of the dielectric lobe. */
+float reflectance(vec4 means, float cosine)
 {
-    vec3 f0 = texelFetch(f0s, texel, 0).xyz;
-    vec4 base = texelFetch(bases, texel, 0);
-    vec3 fresnel = f0 + (texelFetch(f90s, texel, 0).xyz - f0) * pow(1.0 - cosine, 5.0);
-    fresnel += texelFetch(dielectric_weights, texel, 0).xyz * dielectric_reflectance(cosine, max(base.w, 1.0));
-    vec2 both = vec2(max(dot(fresnel, vec3(1.0 / 3.0)), 0.0), dot(base.xyz, vec3(1.0 / 3.0)));
-    return both / max(both.x + both.y, 1e-12);
+    float schlick = means.x + (means.y - means.x) * pow(1.0 - cosine, 5.0);
+    return max(schlick + means.z * dielectric_reflectance(cosine, means.w), 0.0);
 }
 
 void main()
@@ -217,7 +213,13 @@ void main()
     vec3 across = cross(smooth_normal, along);
     vec3 all_bounds = texelFetch(light_bounds, texel, 0).xyz;
     vec3 diffuse_normal = texelFetch(diffuse_normals, texel, 0).xyz;
-    vec2 chances = lobe_chances(texel, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0));
+    vec4 base = texelFetch(bases, texel, 0);
+    vec3 third = vec3(1.0 / 3.0);
+    vec4 means = vec4(dot(texelFetch(f0s, texel, 0).xyz, third), dot(texelFetch(f90s, texel, 0).xyz, third),
+        dot(texelFetch(dielectric_weights, texel, 0).xyz, third), max(base.w, 1.0));
+    /* As `horizons.lobe_chances` of a single sample. */
+    vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
+    chances /= max(chances.x + chances.y, 1e-12);
     int end = has_two_horizons(texel) ? place.y : 0;
     vec2 excess = vec2(0.0);
     for (int i = place.x; i < end; ++i) {
@@ -242,7 +244,8 @@ void main()
             float width = rise * span * cos(elevation) / float(LTSH_HEIGHTS);
             float lobe = lobe_density(towards, towards_eye, bent.xyz, bent.w);
             float chosen = chances.x * lobe + chances.y * max(dot(towards, diffuse_normal), 0.0) / LTSH_PI;
-            float reflected = lobe * seen_by_light(towards, towards_eye, bent.xyz, bent.w);
+            float reflected = lobe * seen_by_light(towards, towards_eye, bent.xyz, bent.w)
+                * reflectance(means, sqrt(max(0.5 + 0.5 * dot(towards, towards_eye), 0.0)));
             float amount = hits(light, towards) ? light.radiance * reflected * width : 0.0;
             float share = density * density / max(density * density + chosen * chosen, 1e-30);
             excess += amount * vec2(1.0 - share, share);

@@ -69,12 +69,11 @@ class Cluster:
         width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
         is_above = (normal * offset).sum(axis=1) + np.abs(normal) @ (0.5 * (self.high - self.low)) > 0.0
         distance = np.maximum(distance, 0.5 * radius)
-        return _bounds(self, (offset, normal), width, distance, distance) * is_above
+        return _bounds(self, offset, normal, width, distance, distance) * is_above
 
 
-def _bounds(cluster, offset_and_normal, width, near, far):
+def _bounds(cluster, offset, normal, width, near, far):
     """Bounds (2, P) of a cluster that reaches a cone of cosine `width` (P,) around the offset."""
-    offset, normal = offset_and_normal
     axis = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-30)[:, None]
     here, there = (axis * normal).sum(axis=1), -(axis @ cluster.axis)
     most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
@@ -140,7 +139,8 @@ def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> 
     width = np.clip((along / np.maximum(reach, 1e-30)).min(axis=0), -1.0, 1.0)
     bounds = _bounds(
         _cluster_of(np.array(_row(light)), 0),
-        (offset, normal),
+        offset,
+        normal,
         width,
         distance,
         np.maximum(reach.max(axis=0), distance),

@@ -92,6 +92,17 @@ def test_chances_of_two_lights_are_those_of_their_irradiance_where_they_are_far_
     assert np.allclose(found[:, 0], expected / expected.sum(), rtol=0.01)
 
 
+@pytest.mark.parametrize("count, loses", [(1, False), (2, False), (9, True), (30, True), (70, False)])
+def test_chances_of_lights_add_up(count, loses):
+    """To 1 where there is one leaf; in a tree one may go down to where no light shines on the point."""
+    generator = np.random.default_rng(count)
+    normal = horizons.unit(generator.normal(size=(50, 3)))
+    lights = tuple(replace(light_at(2.0, 0.2), center=generator.normal(size=3) + (4.0, 0.0, 0.0)) for _ in range(count))
+    sums = light_chances(np.zeros((50, 3)), normal, lights).sum(axis=0)
+    assert sums.max() < 1.0 + 1e-5 and (sums > 0.0).mean() > 0.4
+    assert (sums[sums > 0.0].min() > 1.0 - 1e-5) != loses
+
+
 def test_without_lights_or_differences_nothing_changes():
     samples = samples_near_the_horizon(0.5)
     assert end_at_horizons_of_cycles(samples, ())[0] is samples

@@ -152,6 +152,12 @@ class AreaLight:
         detail = tuple(part.moved(offset) for part in self.detail)
         return replace(self, center=self.center + offset, corners=corners, detail=detail)
 
+    def record(self) -> dict:
+        """This light as JSON has it; AreaLight(**record) reads it back."""
+        values = vars(self).items()
+        record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
+        return {**record, "detail": [part.record() for part in self.detail]}
+
     @property
     def radius(self) -> float:
         """A distance from the center in m that no point of the light exceeds."""

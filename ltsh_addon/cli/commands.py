@@ -10,6 +10,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from ..pipeline.options import BakeOptions, PictureOptions, options_from, table
@@ -33,7 +34,9 @@ from .output import baseline_of, do_job, merge_job, print_json
 from .progress import print_out
 
 DEMO_RESOLUTION = (480, 270)
-DEMO = "Build the example scene, OUT/demo.blend, and do with it what compare does."
+UNSHADOWED = "unshadowed"
+DEMO = """Build the example scene, OUT/demo.blend, and do with it what compare does; then the
+same without shadows, in OUT/unshadowed, which compares the lobes alone."""
 COMPARE = """Shade what the camera sees with several techniques, render the same direct light
 with Cycles, and measure how far apart they are. OUT gets compare.exr (all layers
 in float), compare.png (side by side, signed errors below), report.html and
@@ -118,7 +121,14 @@ def _demo(arguments, bar, open_file) -> int:
     job = job_of(arguments, (arguments.output / "demo.blend",))
     prepare(job.options)
     client.build_demo(job.scenes[0], progress=bar)
-    return _printed(arguments, *do_job(job, arguments, bar))
+    document, code = do_job(job, arguments, bar)
+    if job.options.shadows == "on":
+        alone = replace(job.options, shadows="off", output=arguments.output / UNSHADOWED)
+        if not arguments.json:
+            print_out("\nwithout shadows, which compares the lobes alone:")
+        document[UNSHADOWED], other = do_job(replace(job, options=alone), arguments, bar)
+        code = max(code, other)
+    return _printed(arguments, document, code)
 
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
@@ -168,6 +178,87 @@ def _merge(arguments, bar, open_file) -> int:
         return merge_job(job.options.output, settings, bar, baseline)
 
     return _for_each(read_jobs(arguments.output, job_parsers(), job_of), merge, arguments, bar)
+
+
+RELIGHT = """Write pictures anew with other powers and colors of their lights, without Blender and
+without a ray. OUT is what shade or compare wrote with --keep-visibility."""
+RELIGHT_EXAMPLES = """examples:
+  %(prog)s out/room --light Key --power x2 --color 1,.8,.6
+  %(prog)s out/room --light Key --power x0 --light Fill --power x3 -o out/fill_alone
+
+--power and --color are for the --light before them. A color stands in place of the light's own, whose
+brightest channel counts as 1.
+"""
+
+
+def add_relight(parser) -> None:
+    """`ltsh relight`."""
+    with_examples(parser, RELIGHT, RELIGHT_EXAMPLES)
+    parser.add_argument("folder", type=Path, metavar="OUT", help="the folder that -o of shade or compare named")
+    parser.add_argument(
+        "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
+    )
+    parser.add_argument("--light", dest="changes", action="append", type=_light, required=True, metavar="NAME",
+                        help="as report.json names it; may be given several times")  # fmt: skip
+    parser.add_argument("--power", action=_OfLight, type=from_text(_factor), metavar="xF", help="such as x2 or x.5")
+    parser.add_argument("--color", action=_OfLight, type=from_text(_color), metavar="R,G,B", help="such as 1,.8,.6")
+    add_talk(parser)
+    parser.set_defaults(run=_relight)
+
+
+def _light(name: str) -> dict:
+    return {"name": name}
+
+
+class _OfLight(argparse.Action):
+    """Keeps a value for the light that was named last."""
+
+    def __call__(self, parser, namespace, value, option_string=None):
+        if not namespace.changes:
+            parser.error(f"{option_string}: expected --light NAME before it")
+        if self.dest in namespace.changes[-1]:
+            parser.error(f"{option_string}: given twice for light {namespace.changes[-1]['name']!r}")
+        namespace.changes[-1][self.dest] = value
+
+
+def _factor(text: str) -> float:
+    """x and a number."""
+    number = text.removeprefix("x")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if number == text or not 0.0 <= value < 1e12:
+        raise ValueError(f"power is {text!r}, expected x and a factor, such as x2 or x.5")
+    return value
+
+
+def _color(text: str) -> tuple[float, ...]:
+    """Three numbers."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3 or not all(0.0 <= value < 1e12 for value in values):
+        raise ValueError(f"color is {text!r}, expected red, green and blue such as 1,.8,.6")
+    return values
+
+
+def _relight(arguments, bar, open_file) -> int:
+    from ..pipeline.relight import LightChange, relight
+
+    changes = [LightChange(**change) for change in arguments.changes]
+    report = relight(arguments.folder, changes, arguments.output, bar)
+    bar.finish()
+    output = arguments.output or arguments.folder / "relit"
+    reports = report.get("reports", [report])
+    files = [str(output / name) for one in reports for name in one["files"]]
+    return _printed(arguments, report, 0) if arguments.json else _said(files)
+
+
+def _said(lines: list[str]) -> int:
+    print_out("\n".join(lines))
+    return 0
 
 
 RUN = "Do the jobs of a file, each a shade, compare or bake, one after another."

@@ -9,17 +9,19 @@ import shutil
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from .. import imaging, shading
+from .. import imaging
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples, listed
 from ..shading.parallel import cores
-from . import picture
+from ..visibility import Occluders
+from . import lighting, picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
 from .picture import TaskResult, percent
@@ -73,18 +75,32 @@ def bake_objects(
         names = [record["name"] for record in manifest["objects"]]
         found = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
-        for record, stem in zip(manifest["objects"], found, strict=True):
-            if record["problem"] is None:
-                (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
-                baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"])
-                made = baker.bake(stem, [] if tile is None else [tile], finished, progress)
-                records.append(made.report)
-                files += made.files
-                seconds |= made.seconds
-                shutil.rmtree(folder / record["folder"])
+        with _shadow_tracer(options, manifest, folder) as tracer:
+            for record, stem in zip(manifest["objects"], found, strict=True):
+                if record["problem"] is None:
+                    (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
+                    baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
+                    made = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                    records.append(made.report)
+                    files += made.files
+                    seconds |= made.seconds
+                    shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
     return TaskResult(document, seconds, tuple(files))
+
+
+def _shadow_tracer(options, manifest, folder):
+    """What finds shadows, for a with-statement that gets None without shadows."""
+    if manifest["occluders"] is None:
+        return nullcontext()
+    occluders = Occluders.load(folder / manifest["occluders"])
+    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]))
+
+
+def lights_of(manifest) -> tuple[AreaLight, ...]:
+    """The lights of a bake."""
+    return tuple(AreaLight(**light) for light in manifest["lights"])
 
 
 def _check(options: BakeOptions) -> None:
@@ -134,12 +150,12 @@ def shaded_passes(options) -> set[str]:
 class ObjectBaker:
     """Bakes the tiles of one object, `record` of the `manifest`, block of rows by block of rows from the top."""
 
-    def __init__(self, options, tables, manifest, record, folder):
+    def __init__(self, options, tables, manifest, record, folder, tracer=None):
         from ..cycles import uv
         from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
 
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
-        self.lights = tuple(AreaLight(**light) for light in manifest["lights"])
+        self.lights, self.tracer = lights_of(manifest), tracer
         self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
@@ -262,9 +278,14 @@ class ObjectBaker:
 
         receiver = self.record["receiver"]
         samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
-        layers = {}
+        layers, shares = {}, None
+        if self.tracer is not None:
+            options = self.options
+            passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
+            rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
+            shares = self.tracer.trace(samples, sorted(passes), rays).shares
         for name, table in self.tables.items():
-            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table).items():
+            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
                 if len(self.groups) > 1:
                     for group, part in zip(self.groups, radiance, strict=True):
@@ -290,19 +311,20 @@ class ObjectBaker:
             halves["combined"] = halves["specular"] + halves["diffuse"]
         return {name: halves[name] for name in self.compared}
 
-    def _passes(self, samples: SurfaceSamples, texel, count, table) -> dict[str, np.ndarray]:
+    def _passes(self, samples: SurfaceSamples, texel, count, table, shares) -> dict[str, np.ndarray]:
         """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
         found = {}
         wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
         workers = 1 if self._threads() > 1 else None
         if wanted:
-            shaded = shading.shade(samples, self.lights, table, passes=wanted, workers=workers)
+            shaded = lighting.shade_lights(samples, self.lights, table, wanted, shares, workers=workers).shading
             found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
         if "diffuse_light" in self.options.passes:
             first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
             white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
-            light = shading.shade(white, self.lights, table, passes=("diffuse",), workers=workers).diffuse
-            found["diffuse_light"] = _summed(light, texel[first], count)
+            seen = None if shares is None else {"diffuse": shares["diffuse"][:, first]}
+            lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), seen, workers=workers)
+            found["diffuse_light"] = _summed(lit.shading.diffuse, texel[first], count)
         if "combined" in self.options.passes:
             found["combined"] = found["specular"] + found["diffuse"]
         return {name: found[name] for name in self.options.passes}

@@ -285,6 +285,22 @@ def _sub_samples(meaning: str) -> Any:
     return option("--aa", default=1, type=positive, metavar="N", help=meaning)
 
 
+def _shadows() -> Any:
+    meaning = (
+        "whether surfaces stand in each other's light, in the Cycles reference too; off compares the lobes alone "
+        "(default: %(default)s)"
+    )
+    return option("--shadows", default="on", choices=("on", "off"), help=meaning)
+
+
+def _shadow_rays() -> Any:
+    meaning = (
+        "at most so many per light and point where some are blocked and some are not; shared by the points of a pixel "
+        "or texel (default: %(default)s)"
+    )
+    return option("--shadow-rays", default=64, type=positive, metavar="N", help=meaning)
+
+
 def _scripts() -> Any:
     return flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, which is not done otherwise")
 
@@ -309,6 +325,9 @@ class PictureOptions:
         help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
     )  # fmt: skip
     cycles_samples: int = _cycles_samples("the Cycles reference", 512)
+    shadows: str = _shadows()
+    shadow_rays: int = _shadow_rays()
+    keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
     scripts: bool = _scripts()
     page: str = option(default="report.html", matters=False)  # of a comparison
 
@@ -352,6 +371,8 @@ class BakeOptions:
     name: str | None = _stem(bake_name)  # of the file of the only object, without suffix, below `output`
     error: bool = flag("--error", "beside Cycles' bake: signed errors, also as pictures")
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
+    shadows: str = _shadows()
+    shadow_rays: int = _shadow_rays()
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -28,9 +28,14 @@ from ..scene import (
     Progress,
     SurfaceSamples,
 )
+from . import lighting
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
+# Lights up to which the picture has a layer for the visibility of each.
+MOST_VISIBILITY_LAYERS = 64
+# Follows the name of a technique in layers without shadows beside those with.
+UNSHADOWED = "_unshadowed"
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
 SAMPLE_LAYERS = {
     "position": "XYZ",
@@ -141,13 +146,21 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     samples = options.cycles_samples if with_cycles else 0
     job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples)
     extraction = client.extract(job, progress=progress)
-    results = {name: _evaluate(name, table, extraction, options, progress) for name, table in tables.items()}
+    shadows = None
+    if extraction.occluders is not None:
+        shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
+    results = evaluated(tables, extraction, shadows, options, progress)
 
-    comparison = Comparison(options, extraction, results)
+    comparison = Comparison(options, extraction, results, shadows)
     report = comparison.report()
     files = comparison.write(Path(options.output), report, with_cycles, progress)
+    if options.keep_visibility:
+        files.append(Path(files[0]).with_suffix(lighting.KEPT_SUFFIX).as_posix())
+        lighting.keep_picture(extraction, shadows, options, Path(options.output) / files[-1])
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
+    if shadows is not None:
+        seconds["shadows"] = shadows.seconds
     return TaskResult(report, seconds, tuple(files))
 
 
@@ -158,16 +171,23 @@ class Result:
     shading: shading.Shading
     seconds: dict[str, float]
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
+    unshadowed: shading.Shading | None = None  # where `shading` has shadows
 
 
-def _evaluate(name, table, extraction, options, progress) -> Result:
+def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Result]:
+    """The results of all techniques, of which `tables` (see `prepare`) has the names."""
+    return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
+
+
+def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
     """Shade all samples, or for the reference those of randomly chosen pixels where the image is large."""
     samples, subset = extraction.samples, None
     if name == REFERENCE and len(samples) > options.reference_samples:
         subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
         samples = samples.take(subset)
+    shares = None if shadows is None else shadows.shares_of(subset)
 
-    shaded, seconds = {}, {}
+    lit, seconds = {}, {}
     for index, pass_name in enumerate(options.passes):
 
         def report(fraction, done=index):
@@ -177,9 +197,11 @@ def _evaluate(name, table, extraction, options, progress) -> Result:
         if report(0.0) is False:
             raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
         start = time.perf_counter()
-        shaded[pass_name] = shading.shade(samples, extraction.lights, table, passes=(pass_name,), progress=report)
+        lit[pass_name] = lighting.shade_lights(samples, extraction.lights, table, (pass_name,), shares, progress=report)
         seconds[pass_name] = time.perf_counter() - start
-    return Result(_joined(shaded), seconds, subset)
+    shaded = _joined({pass_name: found.shading for pass_name, found in lit.items()})
+    unshadowed = {pass_name: found.unshadowed for pass_name, found in lit.items()}
+    return Result(shaded, seconds, subset, None if shadows is None else _joined(unshadowed))
 
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
@@ -230,6 +252,7 @@ class Comparison:
     options: PictureOptions
     extraction: Any  # blender.process.client.Extraction, which the core does not import
     results: dict[str, Result]
+    shadows: lighting.Shadows | None = None
 
     @property
     def film(self) -> Film:
@@ -250,7 +273,10 @@ class Comparison:
         }
 
     def _radiance(self, result, pass_name) -> np.ndarray:
-        return self.extraction.exposure * getattr(result.shading, pass_name)
+        return self._exposed(result.shading, pass_name)
+
+    def _exposed(self, shaded: shading.Shading, pass_name) -> np.ndarray:
+        return self.extraction.exposure * getattr(shaded, pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
@@ -286,6 +312,7 @@ class Comparison:
             "versions": versions(extraction.blender_version),
             "tables": dict(zip(self.results, options.techniques, strict=True)),
             "reference": self._reference_facts(),
+            "shadows": None if self.shadows is None else self.shadows.report(),
             "passes": {name: self._pass_report(name) for name in options.passes},
             "problems": list(extraction.problems),
             "warnings": list(extraction.warnings),
@@ -381,6 +408,9 @@ class Comparison:
             if len(groups) > 1:
                 for group, values in zip(_group_names(groups), self._radiance(result, pass_name), strict=True):
                     layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)
+            if result.unshadowed is not None:
+                values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
+                layers[f"{name}{UNSHADOWED}.{pass_name}"] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:
                 continue
@@ -391,6 +421,7 @@ class Comparison:
             for name, result in self.results.items():
                 error = self.images[name, pass_name] - mean
                 layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
+        layers |= self._visibility_layers()
         # Of a surface with several lobes its first.
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)
@@ -399,6 +430,20 @@ class Comparison:
             layers[f"samples.{field}"] = imaging.Layer(film.image(values), letters)
         layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
         return layers
+
+    def _visibility_layers(self) -> dict[str, imaging.Layer]:
+        """The share of each light that is seen, 1 where no surface is; none where there are very many lights."""
+        shadows, lights, found = self.shadows, self.extraction.lights, {}
+        if shadows is None or len(lights) > MOST_VISIBILITY_LAYERS:
+            return found
+        nothing = 1.0 - self.film.coverage()
+        first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
+        film = self.film.take(first)
+        for pass_name in self.options.passes:
+            names = layer_names(light.name for light in lights)
+            for name, share in zip(names, shadows.shares[pass_name], strict=True):
+                found[f"visibility.{pass_name}@{name}"] = imaging.Layer(film.image(share[first]) + nothing, "V")
+        return found
 
     def sheet(self) -> np.ndarray:
         """The comparison sheet (H, W, 3), 8 bit: all light together where it was shaded, then each pass."""
@@ -455,6 +500,16 @@ def _group_names(groups) -> list[str]:
     while ungrouped in groups:
         ungrouped += "_"
     return [group or ungrouped for group in groups]
+
+
+def layer_names(names: Iterable[str]) -> list[str]:
+    """Different names for layers, without the dots that separate their parts."""
+    found: list[str] = []
+    for name in names:
+        plain = name.replace(".", "_")
+        others = (f"{plain}_{number}" for number in itertools.count(2))
+        found.append(next(other for other in itertools.chain([plain], others) if other not in found))
+    return found
 
 
 def _light_report(light) -> dict:

@@ -75,6 +75,7 @@ class _Embree:
     """The functions of one library, and a device of it."""
 
     def __init__(self, library: str):
+        self.path = library
         try:
             self._library = ctypes.CDLL(library)
             # Keeps Python's lock during a call, which is too short to hand it over.
@@ -267,6 +268,19 @@ class _Shape:
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
+    def face_normals(self, side: np.ndarray) -> np.ndarray:
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors `side` (Q, 3) tell.
+
+        Where a triangle has no area it is that vector.
+        """
+        edges = self.corners[:, 1:] - self.corners[:, :1]
+        if self.to_world is not None:
+            edges = edges @ self.to_world.T
+        normal = np.cross(edges[:, 0], edges[:, 1])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal *= np.where(_dot(normal, side) < 0.0, -1.0, 1.0)[:, None]
+        return np.divide(normal, length, out=side.astype(np.float64), where=length > 0.0)
+
     def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
         """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
         (Q, 3), and from the other: `shadow_ray_smooth_surface_offset` of Cycles."""
@@ -307,7 +321,7 @@ class EmbreeCaster:
     chunk = CHUNK
 
     def __init__(self, occluders: Occluders, embree: _Embree):
-        self.description = f"Embree {embree.version}"
+        self.description, self.library = f"Embree {embree.version}", embree.path
         self._embree, self._scenes = embree, []
         for index in occluders.split():
             self._scenes.append(_Scene(embree, occluders, index))
@@ -356,11 +370,13 @@ class Hits:
 class Tracer:
     """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`.
 
-    `caster` is as EmbreeCaster, and `description` says which it is.
+    `caster` is as EmbreeCaster, and `description` says which it is. Other processes can open the file `library`; None:
+    they cannot.
     """
 
     def __init__(self, occluders: Occluders, caster):
         self.occluders, self.description = occluders, caster.description
+        self.library = getattr(caster, "library", None)
         self._caster, self._lock = caster, threading.Lock()
         self._has = [len(index) > 0 for index in occluders.split()]
         uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes))
@@ -431,10 +447,11 @@ class Tracer:
 
         Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
         from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
-        occluders keeps a small distance from its surface.
+        occluders keeps a small distance from its surface. The side of a triangle is that of its own normal: that of
+        the sample is the smooth one where a lobe ends at the smooth horizon.
         """
         position, normal, smooth_normal = (
-            np.ascontiguousarray(values, np.float32)
+            np.array(values, np.float32, order="C")
             for values in (samples.position, samples.geometric_normal, samples.smooth_normal)
         )
         count, chunk = len(position), self._caster.chunk
@@ -451,6 +468,8 @@ class Tracer:
                 clearance[index] = CLEARANCE * (reach[index] + shape.size)
                 if self._thickness[number] > 0.0:
                     clearance[index] += self._thickness_of(number, found.triangle[here])
+                else:
+                    normal[index] = shape.face_normals(normal[index])
                 if shape.normals is not None:
                     lifts = shape.lifts(normal[index])
                     lift[:, index] = lifts

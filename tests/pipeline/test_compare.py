@@ -143,7 +143,7 @@ def check_schema(report, *, pixels, samples, techniques=TECHNIQUES, passes=("spe
         "problems": list, "warnings": list, "exposure": float, "color_space": str,
         "pixel_aspect": float, "pixel_filter": str,
     }  # fmt: skip
-    assert set(report) - {"seconds"} == {*types, "reference", "border"}
+    assert set(report) - {"seconds"} == {*types, "reference", "border", "shadows"}
     assert all(isinstance(report[key], kind) for key, kind in types.items())
     assert set(report["versions"]) == {"ltsh", "blender", "python", "numpy", "OpenEXR"}
     assert set(report["tables"]) == set(techniques) and list(report["passes"]) == list(passes)

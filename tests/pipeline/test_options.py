@@ -15,12 +15,14 @@ SCENE, OUT = Path("room.blend"), Path("out")
 PICTURE = {
     "techniques": ("ltc", "mine.npz"), "passes": ("diffuse",), "resolution": (640, 360), "sub_samples": 4,
     "reference_samples": 7, "cycles_samples": 32, "scripts": True,
+    "shadows": "off", "shadow_rays": 16, "keep_visibility": True,
 }  # fmt: skip
 BAKE = {
     "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "sub_samples": 4, "margin": 3,
     "margin_type": "adjacent", "conservative": True, "view": (-1.0, 2.5, 0.0),
     "techniques": ("reference",), "passes": ("diffuse_light",),
     "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
+    "shadows": "off", "shadow_rays": 16,
 }  # fmt: skip
 OF_A_TASK = {"scene", "output", "frame", "camera", "name"}
 KINDS = pytest.mark.parametrize(
@@ -68,4 +70,4 @@ def test_the_second_blender_gets_the_options_that_it_knows():
     assert (job.scene, job.camera, job.frame, job.sub_samples, job.scripts) == (SCENE, "Side", 3, 4, True)
     assert (job.width, job.cycles_samples) == (1, 0)
     shared = {item.name for item in fields(PictureOptions)} & {item.name for item in fields(client.ExtractOptions)}
-    assert shared == {"scene", "camera", "frame", "sub_samples", "cycles_samples", "scripts"}
+    assert shared == {"scene", "camera", "frame", "sub_samples", "cycles_samples", "scripts", "shadows"}

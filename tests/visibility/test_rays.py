@@ -265,6 +265,25 @@ def test_a_smooth_sphere_is_lit_up_to_its_horizon_as_cycles_lifts_it(libraries):
     assert blocked[0.0] == 1.0 and blocked[0.1] < 0.01 and blocked[1.0] < 0.01, blocked
 
 
+@pytest.mark.parametrize("instances", [1, 2])
+def test_the_side_of_a_triangle_is_that_of_its_own_normal(libraries, instances):
+    """Samples whose specular lobe ends at the smooth horizon have the smooth normal as geometric one."""
+    rng = np.random.default_rng(10)
+    vertices, triangles = sphere(6)
+    mesh = OccluderMesh(vertices, triangles, normals=vertices)
+    matrix = np.concatenate([np.diag([1.5, 0.7, 1.0]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0], [[1], [2], [3]]], 1)
+    matrices = [matrix, np.eye(3, 4) + 20.0 * np.eye(3, 4, k=3)][:instances]
+    with open_tracer(Occluders((mesh,), [0] * instances, matrices), libraries) as tracer:
+        samples = samples_on(mesh, matrix, rng, 2000)
+        bent = replace(samples, geometric_normal=samples.smooth_normal)
+        index, directions = directions_around(samples.smooth_normal, rng, 8)
+        expected, seen_from_face = seen(tracer, samples, index, directions)
+        found, seen_from_smooth = seen(tracer, bent, index, directions)
+    np.testing.assert_allclose(found.geometric_normal, expected.geometric_normal, atol=1e-5)
+    # Rays within rounding of a triangle's plane may take its other side.
+    assert np.mean(seen_from_face != seen_from_smooth) < 1e-3
+
+
 def test_lifted_rays_go_to_the_same_points(libraries):
     rng = np.random.default_rng(9)
     vertices, triangles = sphere(6)

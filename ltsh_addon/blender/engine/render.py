@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ... import shading
+from ...pipeline.lighting import shade_lights, trace_shadows
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
@@ -140,6 +140,8 @@ def _job_of(engine, depsgraph) -> FinalJob:
         technique=settings.technique,
         shown=settings.shown,
         other_techniques=SHIPPED_TABLES if settings.technique_passes else (),
+        shadows="on" if scene.ltsh.shadows else "off",
+        shadow_rays=scene.ltsh.shadow_rays,
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
     )
 
@@ -155,6 +157,8 @@ class FinalJob:
     technique: str
     shown: str  # combined, specular or diffuse
     other_techniques: tuple[str, ...] = ()  # with passes of their own
+    shadows: str = "off"
+    shadow_rays: int = 64  # see `PictureOptions`
     background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
 
     def shaded_as(self) -> dict[str, str]:
@@ -189,12 +193,15 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
         scene_name=job.scene,
         view_layer=job.view_layer,
         emission=True,
+        shadows=job.shadows,
     )
     extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
     names = list(dict.fromkeys(job.shaded_as().values()))
-    share = (1.0 - EXTRACTION_SHARE) / len(names)
+    share, start, shares = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE, None
+    if extraction.occluders is not None:
+        shares = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share)).shares
     images = {
-        name: _images(extraction, name, _part(progress, EXTRACTION_SHARE + index * share, share))
+        name: _images(extraction, name, shares, _part(progress, start + (index + 1) * share, share))
         for index, name in enumerate(names)
     }
     passes = {
@@ -218,19 +225,20 @@ def _part(progress: Progress, start: float, share: float) -> Progress:
     return lambda stage, fraction: progress(stage, start + share * fraction)
 
 
-def _images(extraction, technique: str, progress: Progress) -> dict[str, np.ndarray]:
+def _images(extraction, technique: str, shares, progress: Progress) -> dict[str, np.ndarray]:
     """Radiance (H, W, 3) of each pass times the film's exposure."""
     images = {}
     for index, name in enumerate(PASSES):
         part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
-        shaded = shading.shade(
+        lit = shade_lights(
             extraction.samples,
             extraction.lights,
             technique,
-            passes=(name,),
+            (name,),
+            shares,
             progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
         )
-        image = extraction.film.image(extraction.exposure * shaded.combined)
+        image = extraction.film.image(extraction.exposure * lit.shading.combined)
         images[name] = inside_border(image, extraction.border)
     return images
 

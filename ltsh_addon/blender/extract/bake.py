@@ -22,6 +22,7 @@ from ..materials.aovs import (
     RECEIVER_PROPERTY,
     MaterialLobes,
     give_default_material,
+    let_shadow_rays_through,
     lobes_of,
     objects_without_material,
 )
@@ -29,8 +30,9 @@ from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..render_settings import working_space
 from . import pixels
+from .occluders import collect_occluders
 from .origin import middle_of, move_to_origin
-from .pixels import SEEDS, remove_occlusion
+from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
 NOT_BAKED = -1e9
@@ -300,6 +302,7 @@ class BakeScene:
     camera: str
     view: BakeView
     lights: list
+    origin: np.ndarray  # (3,) m in the file, of the occluders
     warnings: list[str]
     names: list[str]
     meshes: dict[str, ReadMesh]
@@ -367,7 +370,8 @@ def _open(job: dict) -> BakeScene:
     origin = move_to_origin(scene, middle_of(objects[0]), warnings)
     seen_from = job["view"] if isinstance(job["view"], str) else tuple(np.subtract(job["view"], origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
-    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name), origin)
+    has_shadows = job["shadows"] == "on"
+    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name), origin, has_shadows)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
     for material in bpy.data.materials:
@@ -383,9 +387,15 @@ def _open(job: dict) -> BakeScene:
     if view.kind == "point":
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
-    remove_occlusion(scene)
+    if has_shadows:
+        for found in lobes.values():
+            let_shadow_rays_through(found.made_opaque)
+    else:
+        remove_occlusion(scene)
     name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
-    return BakeScene(scene, name, view, lights, warnings, names, meshes, problems, lobes, folder)
+    if has_shadows:
+        inventory.occluders.save(Path(folder.name) / OCCLUDERS)
+    return BakeScene(scene, name, view, lights, origin, warnings, names, meshes, problems, lobes, folder)
 
 
 def _camera(scene, job):
@@ -406,7 +416,7 @@ def _look_from(scene, camera, wanted) -> None:
     bpy.context.view_layer.update()
 
 
-def _inspect(scene, objects, uv_name, folder, origin):
+def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
     """Lights, meshes of objects by name, what is wrong with the others by name, and surfaces without material."""
 
     def visit(depsgraph):
@@ -423,7 +433,10 @@ def _inspect(scene, objects, uv_name, folder, origin):
             except ObjectError as error:
                 problems[ob.name] = str(error)
         bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
-        return collect_lights(depsgraph), meshes, problems, bare
+        inventory = collect_lights(depsgraph)
+        if with_occluders:
+            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out)
+        return inventory, meshes, problems, bare
 
     return with_render_depsgraph(scene, visit)
 
@@ -451,6 +464,8 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     opened = opened_scene(job, progress)
     names = opened.names if isinstance(job["objects"], str) else job["objects"]
     images = SavedImages(folder) if job["look_up_images"] else None
+    if job["shadows"] == "on":
+        shutil.copyfile(Path(opened.folder.name) / OCCLUDERS, folder / OCCLUDERS)
     records = []
     for number, name in enumerate(names):
         record = {"name": name, "problem": opened.problems.get(name), "warnings": []}
@@ -463,7 +478,9 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     return {
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
-        "lights": [pixels.light_record(light) for light in opened.lights],
+        "lights": [light.record() for light in opened.lights],
+        "origin": opened.origin.tolist(),
+        "occluders": OCCLUDERS if job["shadows"] == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,
         "sampled_texels": SAMPLED_TEXELS,

@@ -68,7 +68,6 @@ class _Collector:
                 continue
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
-                self._note("its transform is not finite, it blocks nothing", ob)
                 continue
             if instance.show_self and is_rendered(ob):
                 self._add(instance, matrix)

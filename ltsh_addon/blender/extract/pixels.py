@@ -17,6 +17,7 @@ from ..materials.aovs import (
     declare_aovs,
     give_default_material,
     inject_aovs,
+    let_shadow_rays_through,
     materials_in_use,
     objects_without_material,
     remove_aovs,
@@ -32,6 +33,7 @@ from ..render_settings import (
     without_scripts,
     working_space,
 )
+from .occluders import collect_occluders
 from .origin import move_to_origin
 
 
@@ -53,6 +55,8 @@ def render_pixel_samples(
     return files
 
 
+# File with what stands in the way of light.
+OCCLUDERS = "occluders.npz"
 SEEDS = {"A": 1, "B": 7919}
 FIRST_CHUNK = 16
 CHUNK_SECONDS = 4.0
@@ -80,7 +84,6 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
     progress only about once a minute.
     """
-    remove_occlusion(scene)
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
     samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
@@ -162,7 +165,7 @@ def _reason(error: RuntimeError, path: Path) -> str:
     return text
 
 
-def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInventory:
+def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False) -> LightInventory:
     """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -172,13 +175,16 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str]) -> LightInvent
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
         bare = [] if override else objects_without_material(surfaces)
-        return collect_lights(depsgraph, override), materials_in_use(surfaces, override), bare
+        inventory = collect_lights(depsgraph, override)
+        if with_occluders:
+            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out)
+        return inventory, materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     inventory.origin = origin
     default = give_default_material(bare)
     materials += [default] if default else []
-    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded)
+    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque)
     inventory.receivers.mark()
     inventory.lights = seen_lights(scene, inventory)
     warnings.extend(inventory.warnings)
@@ -208,8 +214,12 @@ def extract(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
     picture = _picture(scene, job)
-    inventory = prepare_scene(scene, view_layer, camera, warnings)
+    has_shadows = job.get("shadows") == "on"
+    inventory = prepare_scene(scene, view_layer, camera, warnings, with_occluders=has_shadows)
     seconds["start"] = time.monotonic() - started
+
+    if has_shadows:
+        inventory.occluders.save(folder / OCCLUDERS)
 
     started = time.monotonic()
     extra_passes = ("emit",) if job.get("emission") else ()
@@ -218,6 +228,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
+        if has_shadows:
+            let_shadow_rays_through(inventory.made_opaque)
+        else:
+            remove_occlusion(scene)
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
     return {
@@ -225,8 +239,9 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [light_record(light) for light in inventory.lights],
+        "lights": [light.record() for light in inventory.lights],
         "origin": inventory.origin.tolist(),
+        "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
         "samples": samples,
@@ -260,9 +275,3 @@ def _picture(scene, job: dict) -> dict:
         "exposure": scene.cycles.film_exposure,
         "color_space": working_space(),
     }
-
-
-def light_record(light) -> dict:
-    """`light` as JSON has it; AreaLight(**record) reads it back."""
-    record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(light).items()}
-    return {**record, "detail": [light_record(part) for part in light.detail]}

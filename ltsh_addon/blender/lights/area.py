@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import bpy
 import numpy as np
@@ -43,6 +44,8 @@ class LightInventory:
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m in the file, of all positions here
     unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
+    occluders: Any = None  # visibility.Occluders, where shadows are wanted
+    made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
 
     def __post_init__(self):
         self._noted = set(self.warnings)

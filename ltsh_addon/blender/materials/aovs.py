@@ -62,6 +62,7 @@ class MaterialLobes:
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
     unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
+    made_opaque: tuple[tuple, ...] = ()  # input sockets, and the socket or number that was there
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
@@ -72,25 +73,33 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
+    made_opaque = []
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
+            made_opaque += [(link.to_socket, found.node.outputs[0]) for link in found.node.outputs[0].links]
             bypass(found.node, live_link(found.other).from_socket)
         else:
+            made_opaque.append((found.clear, live_link(found.clear).from_socket))
             cut(found.clear)
     is_clear = is_seen_through(output, shaders)
     cut(output.inputs["Volume"])
     if is_clear:
+        if live_link(surface) is not None:
+            made_opaque.append((surface, live_link(surface).from_socket))
         _show(surface, CLEAR, 1.0)
     elif not shaders.leaves:
         # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
-        return MaterialLobes((), (), warnings, is_transparent=True, unshaded=unshaded)
+        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque))
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
-            cut(leaf.node.inputs["Alpha"])
-            leaf.node.inputs["Alpha"].default_value = 1.0
+            alpha = leaf.node.inputs["Alpha"]
+            link = live_link(alpha)
+            made_opaque.append((alpha, alpha.default_value if link is None else link.from_socket))
+            cut(alpha)
+            alpha.default_value = 1.0
     leaves, _ = shaded_leaves(shaders)
     weight_of = _Weights().of
     # Every weight before any value: sockets of groups that values come from stay where they are.
@@ -101,7 +110,24 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     unshaded = ""
     if unknown and not leaves:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    return MaterialLobes(tuple(leaves), values, warnings, unshaded=unshaded)
+    return MaterialLobes(tuple(leaves), values, warnings, False, unshaded, tuple(made_opaque))
+
+
+def let_shadow_rays_through(made_opaque) -> None:
+    """Give materials their transparency back (see `MaterialLobes`), but for the rays of the camera."""
+    for target, before in made_opaque:
+        tree = target.id_data
+        is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
+        if target.type != "SHADER":
+            tree.links.new(computed("MAXIMUM", is_camera_ray, before), target)
+            continue
+        now = live_link(target)
+        node = tree.nodes.new("ShaderNodeMixShader")
+        tree.links.new(is_camera_ray, node.inputs[0])
+        tree.links.new(before, node.inputs[1])
+        if now is not None:
+            tree.links.new(now.from_socket, node.inputs[2])
+        tree.links.new(node.outputs[0], target)
 
 
 def _show(surface, node_type: str, level: float) -> None:
@@ -202,14 +228,19 @@ class _Weights:
 
 
 def inject_aovs(
-    materials: list, emitters: frozenset[str] = frozenset(), unshaded: list[str] | None = None
+    materials: list,
+    emitters: frozenset[str] = frozenset(),
+    unshaded: list[str] | None = None,
+    made_opaque: list[tuple] | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; warnings.
 
     Materials light nothing, but for those with a full name in `emitters`. A material that is not shaded at all writes
-    -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry.
+    -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry; `made_opaque` gets what
+    `let_shadow_rays_through` takes.
     """
     unshaded = [] if unshaded is None else unshaded
+    made_opaque = [] if made_opaque is None else made_opaque
     found, warnings = [], []
     for material in materials:
         ensure_nodes(material)
@@ -218,6 +249,7 @@ def inject_aovs(
             material.cycles.emission_sampling = "NONE"
         lobes = lobes_of(material, emitter)
         warnings += lobes.warnings
+        made_opaque += lobes.made_opaque
         if not lobes.is_transparent:
             found.append(lobes)
             _write_hit(material)

@@ -6,7 +6,7 @@ import errno
 import importlib.metadata
 import re
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from ...imaging.exr import read_channels
 from ...reading import check_name
 from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples, listed
 from ...shading.light_polygons import has_lobe, lights_that_reach_nothing
+from ...visibility import Occluders
 from .blender_process import run_child
 
 
@@ -37,6 +38,7 @@ class ExtractOptions:
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
+    shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
 
 
 # Materials, or other reasons, that an error names.
@@ -54,7 +56,8 @@ class Extraction:
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
     the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
-    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded.
+    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded. `occluders` are
+    what stands in the way of light, around `origin` (3,) in m; None without shadows.
     """
 
     lights: tuple[AreaLight, ...]
@@ -73,6 +76,8 @@ class Extraction:
     color_space: ColorSpace = REC709
     emission: np.ndarray | None = None
     problems: tuple[str, ...] = ()
+    occluders: Occluders | None = None
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -107,6 +112,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
             emission=_read_emission(manifest, folder) if options.emission else None,
+            occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
+            origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
         )
 
@@ -214,6 +221,7 @@ class BakeJob:
     scripts: bool = False  # run those of the file
     tile: int | None = None  # the UDIM tile that is wanted, None for all
     sub_samples: int = 1  # points of a texel that the maps are wanted for
+    shadows: str = "off"  # as of `ExtractOptions`
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:

@@ -50,6 +50,7 @@ MOST = 0.99
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
 SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
+SHADOW_SECONDS = 8.0
 REFERENCE_POINTS = 0.15
 
 
@@ -91,6 +92,8 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
         passes=chosen(settings, "passes"),
         resolution=preflight.picture_of(scene),
         sub_samples=settings.anti_aliasing,
+        shadows="on" if settings.shadows else "off",
+        shadow_rays=settings.shadow_rays,
         **samples,
     )
 
@@ -112,6 +115,8 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         passes=chosen(settings, "bake_passes"),
         error=settings.bake_error,
         cycles_samples=settings.cycles_samples,
+        shadows="on" if settings.shadows else "off",
+        shadow_rays=settings.shadow_rays,
     )
 
 
@@ -158,6 +163,7 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
         Step("open scene", OPEN_SECONDS),
         Step("samples", rendered + SAMPLE_SECONDS * points),
         *(Step(f"Cycles {name}", half) for name in ("A", "B") if with_cycles),
+        *([Step("shadows", SHADOW_SECONDS * points)] if options.shadows == "on" else []),
         *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in options.techniques),
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),

@@ -99,6 +99,15 @@ def gray(layout):
     return row
 
 
+def draw_shadows(layout, settings) -> None:
+    """What stands in the way of light."""
+    column = layout.column(align=True)
+    column.prop(settings, "shadows")
+    row = column.row()
+    row.active = settings.shadows
+    row.prop(settings, "shadow_rays")
+
+
 def draw_right(layout, text: str) -> None:
     """Gray text at the right end."""
     side = gray(layout)
@@ -159,6 +168,7 @@ class _Main:
         column = layout.column(align=True)
         column.prop(settings, "anti_aliasing")
         column.prop(settings, "cycles_samples")
+        draw_shadows(layout, settings)
         if not running:
             ready = draw_problems(layout, context, "shade")
             draw_button(layout, context, "ltsh.shade", "RENDER_STILL", ready)
@@ -186,6 +196,7 @@ class _Bake:
         if ob is not None and ob.type == "MESH":
             column.prop_search(settings, "bake_uv_map", ob.data, "uv_layers", icon="GROUP_UVS")
         column.prop(settings, "bake_error")
+        draw_shadows(layout, settings)
         if operators.running_job() is None:
             ready = draw_problems(layout, context, "bake")
             count = len(preflight.bake_objects(context)[0])

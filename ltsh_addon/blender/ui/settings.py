@@ -176,6 +176,17 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         description="Samples per pixel of the Cycles reference; its noise falls with their square root",
         min=2, max=1 << 20, soft_max=8192, default=256,
     )  # fmt: skip
+    shadows: BoolProperty(
+        name="Shadows",
+        description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
+        "well a technique shades alone",
+        default=True,
+    )  # fmt: skip
+    shadow_rays: IntProperty(
+        name="Shadow Rays",
+        description="At most so many per light and pixel or texel, where a light is neither seen whole nor not at all",
+        min=8, max=1 << 16, soft_max=512, default=64,
+    )  # fmt: skip
     output_folder: StringProperty(
         name="Output",
         description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
@@ -240,7 +251,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "passes", "resolution_percentage", "anti_aliasing", "cycles_samples",
-        "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
+        "shadows", "shadow_rays", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):

@@ -242,8 +242,9 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
 
 
 def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
-    """The Cycles reference: {"specular", "diffuse"} -> (2, H, W, 3)."""
+    """The Cycles reference without shadows: {"specular", "diffuse"} -> (2, H, W, 3)."""
     scene, layer = prepared[:2]
+    pixels.remove_occlusion(scene)
     manifest = {
         "reference": pixels.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),
         "passes": render_settings.pass_names(),

@@ -9,7 +9,6 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.blender.extract import pixels
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 LAMBERT = "ShaderNodeBsdfDiffuse"
@@ -112,11 +111,11 @@ def test_light_records_survive_json():
     placed = {"center": [0.1, 0.2, 1.0 / 3.0], "half_u": [0.5, 0, 0], "half_v": [0, 0.25, 0], "direction": [0, 0, -1.0]}
     more = {"group": "Keys", "affects_diffuse": False, "corners": corners, "receivers": (0, 3)}
     light = AreaLight("L\u00e4mpchen", "POLYGON", **placed, radiance=[1e-9, 2.0, 3e9], **more)
-    found = AreaLight(**json.loads(json.dumps(pixels.light_record(light))))
+    found = AreaLight(**json.loads(json.dumps(light.record())))
     for name, value in vars(light).items():
         assert np.array_equal(getattr(found, name), value) and type(getattr(found, name)) is type(value), name
     plain = AreaLight("L", "DISK", **placed, radiance=[1.0, 1.0, 1.0], spread=1.0 / 7.0)
-    found = AreaLight(**json.loads(json.dumps(pixels.light_record(plain))))
+    found = AreaLight(**json.loads(json.dumps(plain.record())))
     assert found.corners is None and found.receivers is None and found.spread == 1.0 / 7.0
 
 

@@ -7,5 +7,7 @@ settings.passes = {"specular", "diffuse"}
 settings.resolution_percentage = 100
 settings.anti_aliasing = 16
 settings.cycles_samples = 2048
+settings.shadows = True
+settings.shadow_rays = 256
 settings.bake_size = "2048"
 settings.bake_error = True

@@ -7,5 +7,7 @@ settings.passes = {"specular", "diffuse"}
 settings.resolution_percentage = 100
 settings.anti_aliasing = 4
 settings.cycles_samples = 256
+settings.shadows = True
+settings.shadow_rays = 64
 settings.bake_size = "1024"
 settings.bake_error = False

@@ -1,0 +1,231 @@
+"""From samples, lights and occluders to radiance: what pictures and bakes have in common.
+
+radiance = closed form x the share of the light that the sample sees. The shares are the same for every technique.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import shading, visibility
+from ..files import replacing
+from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
+
+# Of the files of `keep_picture`.
+KEPT_SUFFIX = ".samples.npz"
+# Pairs of a sample and a light whose radiance is kept at a time.
+MOST_PAIRS = 1 << 25
+# Of one sample, however many a pixel has.
+FEWEST_RAYS = 8
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """The shares of the lights that samples see, and how they were found."""
+
+    shares: dict[str, np.ndarray]  # (L, P) by pass, in [0, 1]
+    noise: dict[str, float]  # estimated, relative to the pass
+    rays: int
+    tracer: str  # what traced them
+    seconds: float = 0.0
+
+    def shares_of(self, index: np.ndarray | None) -> dict[str, np.ndarray]:
+        """Those (L, Q) of the samples at `index` (Q,); None: of all."""
+        return self.shares if index is None else {name: values[:, index] for name, values in self.shares.items()}
+
+    def report(self) -> dict:
+        """For report.json."""
+        return {"rays": self.rays, "noise": self.noise, "tracer": self.tracer}
+
+
+def rays_of_point(rays: int, points: int) -> int:
+    """Of `rays` those of one of the `points` of a pixel or texel."""
+    return max(FEWEST_RAYS, rays // points)
+
+
+class ShadowTracer:
+    """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
+
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+        self._origin, self._lights = origin, [light.moved(-origin) for light in lights]
+        from ..blender.process.blender_process import embree_libraries
+
+        self._tracer = visibility.open_tracer(occluders, embree_libraries())
+
+    def __enter__(self):
+        self._tracer.__enter__()
+        return self
+
+    def __exit__(self, *error):
+        return self._tracer.__exit__(*error)
+
+    def trace(
+        self,
+        samples: SurfaceSamples,
+        passes: Sequence[str],
+        rays: int,
+        *,
+        film: Film | None = None,
+        progress: Progress | None = None,
+    ) -> Shadows:
+        """The shares of all lights that `samples` see; `film` as of `visibility.visible_shares`."""
+        start = time.perf_counter()
+        samples = replace(samples, position=samples.position - self._origin)
+        found = visibility.visible_shares(
+            samples, self._lights, self._tracer, passes=passes, rays=rays, film=film, progress=progress
+        )
+        shares = {name: getattr(found, name) for name in passes}
+        noise = {name: found.noise(name) for name in passes}
+        return Shadows(shares, noise, found.rays, self._tracer.description, time.perf_counter() - start)
+
+
+def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
+    """The shares of the lights of an `Extraction` that its samples see."""
+    with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
+        rays = rays_of_point(rays, extraction.film.sub_samples)
+        return tracer.trace(extraction.samples, passes, rays, film=extraction.film, progress=progress)
+
+
+@dataclass(frozen=True)
+class Lit:
+    """Radiance of one technique with shadows, and without where there are any."""
+
+    shading: shading.Shading
+    unshadowed: shading.Shading | None = None
+
+
+def shade_lights(
+    samples: SurfaceSamples,
+    lights: Sequence[AreaLight],
+    table: str | shading.LookupTable,
+    passes: Sequence[str],
+    shares: dict[str, np.ndarray] | None = None,
+    *,
+    workers: int | None = None,
+    progress: Callable[[float], bool | None] | None = None,
+) -> Lit:
+    """Radiance of `samples` (P) under `lights` (L), of which they see `shares` (L, P) by pass; None: everything.
+
+    Light by light, so that a sample that sees all of its lights gets the same bits as without shadows.
+    """
+    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
+    shape = len(groups), len(samples), 3
+    plain = {name: np.zeros(shape, np.float32) for name in passes}
+    seen = {name: np.zeros(shape, np.float32) for name in passes} if shares is not None else {}
+    error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
+    for first in range(0, len(lights), most):
+        part = lights[first : first + most]
+        start, share = first / len(lights), len(part) / len(lights)
+
+        def report(fraction, start=start, share=share):
+            return None if progress is None else progress(start + fraction * share)
+
+        own = tuple(_in_group(light, str(number)) for number, light in enumerate(part))
+        found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
+        if found.quadrature_error is not None:
+            error = found.quadrature_error if error is None else error + found.quadrature_error
+        for number, light in enumerate(part):
+            group = groups.index(light.group)
+            for name in passes:
+                radiance = getattr(found, name)[number]
+                plain[name][group] += radiance
+                if shares is not None:
+                    seen[name][group] += shares[name][first + number][:, None] * radiance
+    unshadowed = _shading(groups, plain, error)
+    return Lit(unshadowed) if shares is None else Lit(_shading(groups, seen, error), unshadowed)
+
+
+def _in_group(light: AreaLight, group: str) -> AreaLight:
+    return replace(light, group=group, detail=tuple(_in_group(part, group) for part in light.detail))
+
+
+def _shading(groups, radiance, error) -> shading.Shading:
+    return shading.Shading(groups, radiance.get("specular"), radiance.get("diffuse"), error)
+
+
+@dataclass(frozen=True)
+class KeptPicture:
+    """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is."""
+
+    extraction: Any  # blender.process.client.Extraction, without reference and occluders
+    shadows: Shadows | None
+    options: dict  # fields of PictureOptions
+    had_cycles: bool
+
+    @classmethod
+    def load(cls, path: Path) -> KeptPicture:
+        """Raises OSError, and ValueError where the file is not what `keep_picture` writes."""
+        try:
+            with np.load(path) as data:
+                arrays = {name: data[name] for name in data.files}
+            document = json.loads(str(arrays.pop("document")))
+            return cls._of(document, arrays)
+        except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            problem = f"is no file of --keep-visibility, or not whole ({error_line(error)})"
+            raise ValueError(f"{path}: {problem}; run the picture again") from error
+
+    @classmethod
+    def _of(cls, document, arrays) -> KeptPicture:
+        from ..blender.process.client import UNCHANGED, Extraction
+
+        found = document["extraction"]
+        border, space = found["border"], found["color_space"]
+        extraction = Extraction(
+            **{name: found[name] for name in UNCHANGED},
+            lights=tuple(AreaLight(**light) for light in found["lights"]),
+            samples=SurfaceSamples(**{item.name: arrays[f"samples.{item.name}"] for item in fields(SurfaceSamples)}),
+            film=Film(pixel=arrays["film.pixel"], first=arrays.get("film.first"), **found["film"]),
+            warnings=tuple(found["warnings"]),
+            problems=tuple(found["problems"]),
+            reference=None,
+            border=None if border is None else Border(**border),
+            color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
+        )
+        shadows = document["shadows"]
+        if shadows is not None:
+            shares = {name: arrays[f"shares.{name}"] for name in shadows["noise"]}
+            shadows = Shadows(shares, shadows["noise"], shadows["rays"], shadows["tracer"])
+        options = document["options"]
+        options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
+        return cls(extraction, shadows, {**options, "scene": Path(options["scene"])}, document["had_cycles"])
+
+
+KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
+
+
+def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> None:
+    """Write the .npz that `KeptPicture.load` reads, at once or not at all. Raises OSError."""
+    from ..blender.process.client import UNCHANGED
+
+    film, space = extraction.film, extraction.color_space
+    document = {
+        "extraction": {
+            **{name: getattr(extraction, name) for name in UNCHANGED},
+            "lights": [light.record() for light in extraction.lights],
+            "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
+            "warnings": extraction.warnings,
+            "problems": extraction.problems,
+            "border": None if extraction.border is None else vars(extraction.border),
+            "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
+        },
+        "shadows": None if shadows is None else shadows.report(),
+        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
+        "had_cycles": extraction.reference is not None,
+    }
+    arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
+    arrays["film.pixel"] = film.pixel
+    if film.first is not None:
+        arrays["film.first"] = film.first
+    if shadows is not None:
+        arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, document=json.dumps(document), **arrays)

@@ -1,0 +1,571 @@
+"""The share of each light that each sample sees: `visible_shares`.
+
+The ratio estimator (Heitz, Hill and McGuire 2018, "Combining analytic direct illumination and stochastic shadows",
+doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w), V the transmittance of rays to the
+light, w what the pass makes of the light along them, over the density of the rays. The same rays serve both passes.
+
+A few probes go to every pair of a sample and a light. Those that all arrive, or are all blocked, settle it, unless a
+neighbor in the picture found otherwise. The pairs that are left take as many rays as they are worth by their light.
+Nothing hangs on where a sample stands in a picture or a block but which samples are its neighbors there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples
+from ..shading import light_cone
+from ..shading.brdf import dielectric_reflectance, schlick_curve
+from ..shading.light_polygons import has_lobe
+from . import crew
+from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .filter import ShareFilter
+
+# Rays of the first look at a pair, and between two looks at the memory.
+PROBES = 8
+MOST_RAYS = 1024
+# Rays of a block: its arrays stay in the cache.
+BLOCK_RAYS = 1 << 15
+# Samples of a block that one process takes at a time. Fewer pairs of samples and lights than that take no longer than a
+# process takes to start.
+BLOCK_SAMPLES = 1 << 14
+PAIRS_WORTH_A_CHILD = 300_000
+# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both count
+# alike, as at first, when the specular one counts more, and when the diffuse one does.
+EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
+# Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
+# stratified rays falls with their number to the power -0.8.
+WORTH_POWER = 0.75
+# Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
+TYPICAL_SHARE = 0.25
+LEVELS = (16, 32, 64, 128, 256, 512)
+# Samples that tell what is typical, and pairs of them and a light.
+TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20
+# How often neighbors of mixed pairs that turn out mixed pass that on.
+ROUNDS = 4
+# Rays end this share of their length before the light.
+END = np.float32(1.0 - 1e-4)
+_ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
+_MIN_ALPHA = np.float32(1e-5)
+_FARTHEST = np.float32(FARTHEST)
+# Of unit vectors after a warp.
+_LENGTHS = np.float32(1e-11), np.float32(4.0)
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """Shares of L lights that P samples see by pass, in [0, 1]; None for a pass that was not asked for.
+
+    Exactly 1 where nothing is in the way, and where no light arrives anyway; exactly 0 where all is blocked.
+    """
+
+    specular: np.ndarray | None  # (L, P) float32
+    diffuse: np.ndarray | None
+    # By pass, for the light of all lights that each sample reflects, about: (P,) radiance, and its standard deviation
+    radiance: dict[str, np.ndarray]
+    deviation: dict[str, np.ndarray]
+    rays: int  # that were traced
+    mixed: np.ndarray  # (L, P) bool: pairs of which some rays arrived and some did not
+
+    def noise(self, name: str, film: Film | None = None) -> float:
+        """Estimated relative L2 error of a pass, by the two halves of the rays: of samples, or of pixels of a film."""
+        light, variance = self.radiance[name], np.square(self.deviation[name])
+        if film is not None:
+            # The errors of the samples of a pixel do not depend on each other.
+            light, variance = film.image(light), film.image(variance) / film.sub_samples
+        power = np.square(light, dtype=np.float64).sum()
+        return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
+
+
+def visible_shares(
+    samples: SurfaceSamples,
+    lights: Sequence[AreaLight],
+    tracer,
+    *,
+    passes: Sequence[str] = PASSES,
+    rays: int = 128,
+    film: Film | None = None,
+    smooth: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> Visibility:
+    """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
+
+    `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
+    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
+    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may
+    return False to stop: Cancelled is raised.
+    """
+    if not PROBES <= rays <= MOST_RAYS:
+        raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
+    lights, passes = tuple(lights), tuple(passes)
+    typical = typical_radiance(samples, lights, passes)
+    task = ShadowTask(lights, passes, rays // PROBES * PROBES, smooth, typical)
+    shape = len(lights), len(samples)
+    shares = {name: np.ones(shape, np.float32) for name in passes}
+    radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
+    mixed, traced = np.zeros(shape, bool), 0
+    blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
+    parts = ((samples.take(block), None if film is None else film.take(block)) for block in blocks)
+    wanted = 1 if shape[0] * shape[1] < PAIRS_WORTH_A_CHILD else workers
+    for number, found in crew.run(task, tracer, list(parts), wanted, progress):
+        block = blocks[number]
+        for name in passes:
+            shares[name][:, block] = getattr(found, name)
+            radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
+        mixed[:, block] = found.mixed
+        traced += found.rays
+    return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+@dataclass(frozen=True)
+class ShadowTask:
+    """What to do with every block of samples."""
+
+    lights: tuple[AreaLight, ...]
+    passes: tuple[str, ...]
+    rays: int
+    smooth: bool
+    typical: dict[str, float]
+
+    def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
+        """Those of a block, all in this thread."""
+        shape = len(self.lights), len(samples)
+        shares = {name: np.ones(shape, np.float32) for name in self.passes}
+        radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
+        mixed, traced = np.zeros(shape, bool), 0
+        surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
+        share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
+        for number, light in enumerate(self.lights):
+            pairs = Pairs(surface, light)
+            pairs.trace(self.rays, neighbors, self.typical)
+            traced += pairs.traced
+            index = pairs.index
+            mixed[number, index] = pairs.visible & pairs.blocked
+            for name in self.passes:
+                share, noise = pairs.found(name)
+                if share_filter is not None:
+                    chosen = mixed[number, index] & pairs.wanted[name]
+                    share, factor = share_filter.filtered(name, index, share, pairs.count, chosen, noise)
+                    noise *= factor
+                unshadowed = pairs.unshadowed(name)
+                shares[name][number, index] = share
+                radiance[name][index] += unshadowed * share
+                variance[name][index] += np.square(unshadowed * noise)
+        deviation = {name: np.sqrt(values) for name, values in variance.items()}
+        return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect of all `lights` without shadows, from some of them."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(lights), 1)), 1)
+    surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
+    radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
+    for light in lights:
+        pairs = Pairs(surface, light)
+        pairs.weigh()
+        for name in passes:
+            radiance[name][pairs.index] += pairs.unshadowed(name)
+    return {name: float(np.sqrt(np.square(values).mean())) if len(values) else 0.0 for name, values in radiance.items()}
+
+
+@dataclass(frozen=True)
+class Neighbors:
+    """Which samples are close to each other: those of a pixel and of the pixels around it."""
+
+    pixel: np.ndarray  # (P,)
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, film: Film | None, count: int) -> Neighbors:
+        """Those of a film; without one, samples before and after each other."""
+        if film is None:
+            return cls(np.arange(count), count, 1)
+        # Of a part of a picture the rows that it has.
+        top = int(film.pixel.min(initial=film.width * film.height)) // film.width
+        height = int(film.pixel.max(initial=0)) // film.width + 1 - top
+        return cls(film.pixel - top * film.width, film.width, max(height, 0))
+
+    def any_around(self, index: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Mask (Q,) of the samples `index` (Q,) around which `mask` (Q,) is true for one of them."""
+        pixel = self.pixel[index]
+        marked = np.zeros(self.width * self.height, bool)
+        marked[pixel[mask]] = True
+        grid = np.pad(marked.reshape(self.height, self.width), 1)
+        grid = grid[1:-1] | grid[:-2] | grid[2:]
+        return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()[pixel]
+
+
+class Surface:
+    """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
+
+    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
+        self.tracer, self.starts = tracer, tracer and tracer.starts(samples)
+        self.position = np.ascontiguousarray(samples.position.T)
+        self.receiver = samples.receiver
+        self.seeds = seeds_of(samples.position)
+        self._known: list[np.ndarray] = []
+        self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)
+        self.geometric_normal = self._rows(samples.geometric_normal)
+        self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
+        self.bump_alpha2 = samples.bump_alpha2.astype(np.float32)
+        self.alpha = np.maximum(np.square(samples.roughness.astype(np.float32)), _MIN_ALPHA)
+        names = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo")
+        terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
+        self.f0, f90, self.dip, self.dielectric, self.albedo = terms
+        self.rise = f90 - self.f0
+        self.ior = np.maximum(samples.ior.astype(np.float32), _ONE)
+        diffuse, specular = has_lobe(samples)
+        specular &= dot(self.normal, self.view) > 0.0
+        self.lobes = {"specular": specular & ("specular" in passes), "diffuse": diffuse & ("diffuse" in passes)}
+
+    def _rows(self, vectors):
+        # Normals that stand for each other are the same array.
+        found = np.ascontiguousarray(vectors.T, dtype=np.float32)
+        same = next((known for known in self._known if np.array_equal(known, found)), None)
+        if same is None:
+            self._known.append(found)
+        return found if same is None else same
+
+    def horizons(self, name: str) -> tuple[np.ndarray, ...]:
+        """The normals (3, P) below whose horizons the lobe of a pass is 0."""
+        if name == "diffuse":
+            return _different(self.diffuse_normal, self.smooth_normal)
+        return _different(self.normal, self.geometric_normal)
+
+
+def _different(first, second):
+    return (first,) if first is second else (first, second)
+
+
+class Pairs:
+    """The samples that a light may reach, and what their rays have found so far."""
+
+    def __init__(self, surface: Surface, light: AreaLight):
+        self.surface, self.light = surface, light
+        self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
+        self.emitter = Emitter(light)
+        offset = (light.center[:, None] - surface.position).astype(np.float32)
+        ahead = dot(light.direction.astype(np.float32), offset) < 0.0
+        if light.is_focused:
+            ahead &= light_cone.may_reach(light, surface.position)
+        if light.receivers is not None:
+            ahead &= light.receives(surface.receiver)
+        radius, self.wanted, above = np.float32(1.001 * light.radius), {}, {}
+        for name, lobe in surface.lobes.items():
+            self.wanted[name] = lobe & ahead & getattr(light, f"affects_{name}")
+            for normal in surface.horizons(name):
+                if id(normal) not in above:
+                    above[id(normal)] = dot(normal, offset) > -radius
+                self.wanted[name] &= above[id(normal)]
+        self.index = np.flatnonzero(self.wanted["specular"] | self.wanted["diffuse"])
+        self.wanted = {name: wanted[self.index] for name, wanted in self.wanted.items()}
+        count = len(self.index)
+        # Of the weights, and of those of the light that arrives, by pass and half of the rays
+        self.weights, self.arriving = np.zeros((2, 2, 2, count), np.float32)
+        self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
+        self.count = np.zeros(count, np.int32)
+        self.traced = 0
+
+    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float]) -> None:
+        """Probes for all pairs, and up to `rays` for those that need them; `typical` as from `typical_radiance`."""
+        if self.mask == 0 or not self.light.area_vector.any():
+            return
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
+        self._leave_out_unlit()
+        number, choice = self._plan(rays, typical)
+        for _ in range(ROUNDS):
+            chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
+            chosen |= self._unmet()
+            chosen &= self.count < number
+            if not chosen.any():
+                break
+            for last in np.unique(number[chosen]):
+                for split in range(3):
+                    members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                    self._add_rays(members, PROBES, int(last), split)
+        self._aim_at_corners()
+
+    def weigh(self) -> None:
+        """Weights alone, without a ray."""
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
+
+    def _plan(self, rays, typical):
+        """How many rays (Q,) the pairs are worth, and which of SPLITS (Q,), by what they reflect without shadows."""
+        worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
+        most = np.maximum(worth["specular"], worth["diffuse"])
+        wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
+        levels = [level for level in LEVELS if level < rays] + [rays]
+        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
+        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
+        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
+        return number, choice
+
+    def _unmet(self):
+        """Mask (Q,) of the pairs with a lobe that no ray met so far."""
+        unmet = np.zeros(len(self.index), bool)
+        for number, name in enumerate(PASSES):
+            unmet |= self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0)
+        return unmet
+
+    def _corner_heights(self, name, members):
+        """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
+        surface, index = self.surface, self.index[members]
+        center = self.light.center[:, None] - surface.position[:, index]
+        offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
+        heights = [dot(offset, normal[:, None, index]) for normal in surface.horizons(name)]
+        return np.minimum.reduce(heights), offset
+
+    def _leave_out_unlit(self):
+        """Forget lobes for which all of the light is below the horizon."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
+
+    def _aim_at_corners(self):
+        """For lobes that no ray met, which see but a corner of the light: a ray to the corner that is highest."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            if len(unmet) == 0:
+                continue
+            heights, offset = self._corner_heights(name, unmet)
+            toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
+            distance = np.sqrt(dot(toward, toward))
+            toward /= np.maximum(distance, _TINY)
+            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
+            found = self._transmittance(*(rows[..., 0, :] for rows in aimed))
+            # Next to no light: it counts in no sum of samples.
+            self.weights[number][:, unmet] = _TINY
+            self.arriving[number][:, unmet] = found * _TINY
+
+    def _transmittance(self, origins, directions, distances):
+        """Of rays: origins and directions (3, R), distances (R,)."""
+        self.traced += len(distances)
+        masks = np.broadcast_to(self.mask, distances.shape)
+        return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
+
+    def _add_rays(self, members, first, last, split, trace=True):
+        """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
+        diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
+        for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
+            chosen = members[chosen]
+            for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
+                block = chosen[start : start + BLOCK_RAYS // PROBES]
+                lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
+                view = View(self.surface, self.index[block], self.emitter, lobes)
+                step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
+                for number in range(first, last, step):
+                    rays = Rays(
+                        number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
+                    )
+                    self._add_block(block, view, rays, trace)
+        self.count[members] = last
+
+    def _add_block(self, block, view, rays, trace):
+        """Some rays for the pairs `block` (B,) of a view."""
+        directions, distance, weights = view.rays(rays)
+        arriving = np.zeros(distance.shape, np.float32)
+        if trace:
+            met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+            flat = np.flatnonzero(met)
+            aimed = self.surface.starts.aimed(view.index, directions, distance)
+            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in aimed))
+            sums = arriving.sum(axis=0)
+            self.visible[block] |= sums > 0.0
+            self.blocked[block] |= sums < met.sum(axis=0)
+        for name, weight in weights.items():
+            number = PASSES.index(name)
+            for sums in (self.weights[number], self.arriving[number]):
+                halves = sums[:, block]
+                rays.add_to(halves, weight)
+                sums[:, block] = halves
+                weight *= arriving
+
+    def unshadowed(self, name: str) -> np.ndarray:
+        """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""
+        scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
+        scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
+        return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
+
+    def found(self, name: str):
+        """Shares (Q,) of a pass, and their standard deviations, about."""
+        weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
+        whole = weights.sum(axis=0)
+        share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
+        # Probes alone have no second half.
+        halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
+        return share, 0.5 * np.abs(halves[0] - halves[1])
+
+
+def _taken(rows, flat):
+    """Values (3, R) or (R,) of rows (3, S, Q) or (S, Q) at places in the flat (S, Q)."""
+    return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays `first` to `last` of each pair, PROBES and again PROBES; of each of these some are chosen by the lobe.
+
+    `probes` and `later` say how many of the first PROBES, and of all later ones, are chosen evenly.
+    """
+
+    first: int
+    last: int
+    total: int
+    probes: int
+    later: int
+
+    @property
+    def looks(self) -> int:
+        """How many times PROBES rays these are."""
+        return (self.last - self.first) // PROBES
+
+    @property
+    def evenly(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions evenly."""
+        return tuple(self.probes + self.later * (n // PROBES - 1) if n else 0 for n in (self.first, self.last))
+
+    @property
+    def by_lobe(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions by the lobe."""
+        return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
+
+    def add_to(self, halves, weight):
+        """Add weights (S, Q) to the sums (2, Q) of the first and the second half of the total, one after another."""
+        start, stop = self.evenly
+        parts = np.zeros((self.looks, weight.shape[1]), np.float32)
+        for rows in (weight[: stop - start], weight[stop - start :]):
+            if len(rows):
+                parts += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
+        for number, part in enumerate(parts, self.first // PROBES):
+            halves[int(2 * number * PROBES >= self.total)] += part
+
+
+class View:
+    """A light seen from a block of samples: arrays (Q,) and (3, Q)."""
+
+    def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter, lobes: tuple[str, ...]):
+        self.index, self.emitter, self.lobes = index, emitter, lobes
+        light = emitter.light
+        offset = light.center[:, None] - np.take(surface.position, index, axis=1)
+        self.height = (-dot(light.direction, offset)).astype(np.float32)
+        self.offset = offset.astype(np.float32)
+        corners = emitter.corners_from(self.offset, self.height)
+        self.quads = SphericalQuads(corners)
+        self.is_seen = self.quads.is_seen
+        self.seeds = surface.seeds[index]
+        if "diffuse" in lobes:
+            self.horizons = [np.take(normal, index, axis=1) for normal in surface.horizons("diffuse")]
+            self.bump_alpha2 = surface.bump_alpha2[index]
+        if "specular" in lobes:
+            normal, view = np.take(surface.normal, index, axis=1), np.take(surface.view, index, axis=1)
+            self.geometric_normal = np.take(surface.geometric_normal, index, axis=1)
+            self.has_own_horizon = surface.geometric_normal is not surface.normal
+            self.cosine, self.sine, rows = frames(normal, view)
+            self.alpha = surface.alpha[index]
+            self.warps = Warps(rows, self.cosine, self.sine, self.alpha)
+            self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
+            self.is_seen = self.is_seen & self.warped_quads.is_seen
+            self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
+            self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
+
+    def rays(self, rays: Rays):
+        """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
+        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
+        shape = (evenly + by_lobe, len(self.index))
+        directions = np.empty((3, *shape), np.float32)
+        if evenly:
+            points = unit_points(self.seeds, 0, *rays.evenly)
+            self.quads.directions(*points, out=directions[:, :evenly])
+        density = np.float32(evenly / shape[0]) / self.quads.solid_angle
+        if by_lobe:
+            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
+            points = unit_points(self.seeds, 1, *rays.by_lobe)
+            length[evenly:] = self.warps.unwarped(self.warped_quads.directions(*points, out=local[:, evenly:]))
+            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
+            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
+            length[:evenly] = self.warps.lengths(local[:, :evenly])
+            scale = np.float32(by_lobe / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
+            scale *= self.is_seen
+            np.clip(length, *_LENGTHS, out=length)
+            density = density + scale / (length * length * length)
+        light = self.emitter.light
+        falling = dot(directions, -light.direction.astype(np.float32))
+        distance = np.minimum(self.height / np.maximum(falling, _TINY), _FARTHEST)
+        falls = falling > 0.0
+        falls &= self.is_seen
+        factor = falls / density
+        brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
+        if brightness is not None:
+            factor *= brightness
+        weights = {}
+        if "specular" in self.lobes:
+            weights["specular"] = self._specular(directions, local)
+            weights["specular"] *= factor
+        if "diffuse" in self.lobes:
+            weights["diffuse"] = self._diffuse(directions)
+            weights["diffuse"] *= factor
+        return directions, distance, weights
+
+    def _diffuse(self, directions):
+        """The cosine (S, Q), shadowed where a bump map has another horizon."""
+        cosine = dot(directions, self.horizons[0])
+        np.maximum(cosine, _ZERO, out=cosine)
+        if len(self.horizons) == 1:
+            return cosine
+        above = dot(directions, self.horizons[1])
+        np.maximum(above, _ZERO, out=above)
+        squared = above * above
+        slope = np.sqrt(squared + self.bump_alpha2 * (_ONE - squared))
+        slope += above
+        np.maximum(slope, _TINY, out=slope)
+        above /= slope
+        above *= np.float32(2.0)
+        cosine *= above
+        return cosine
+
+    def _specular(self, directions, local):
+        """GGX BRDF with its Fresnel factor times cosine times 2 pi (S, Q); see `shading.brdf.ggx_brdf_cosine`."""
+        half_x, half_z = local[0] + self.sine, local[2] + self.cosine
+        alpha2 = self.alpha * self.alpha
+        half_x *= half_x
+        half_x += local[1] * local[1]
+        half_z *= half_z
+        squared = half_x + half_z
+        half_z *= alpha2
+        half_x += half_z
+        ratio = np.divide(squared, half_x, out=half_x)
+        mu = np.maximum(local[2], _ZERO, out=half_z)
+        slope = mu * mu
+        slope *= _ONE - alpha2
+        slope += alpha2
+        np.sqrt(slope, out=slope)
+        slope *= self.cosine
+        slope += mu * np.sqrt(self.cosine * self.cosine * (_ONE - alpha2) + alpha2)
+        ratio *= ratio
+        ratio *= alpha2
+        ratio *= mu
+        ratio /= slope
+        ratio *= self._reflectance(squared)
+        if self.has_own_horizon:
+            ratio *= dot(directions, self.geometric_normal) > 0.0
+        return ratio
+
+    def _reflectance(self, squared):
+        """The Fresnel factor for squared lengths (S, Q) of unit view plus unit light, which are lost."""
+        cosine = np.sqrt(squared, out=squared)
+        cosine *= np.float32(0.5)
+        np.minimum(cosine, _ONE, out=cosine)
+        result = schlick_curve(cosine)
+        if self.dip.any():
+            result *= self.rise - self.dip * (cosine * (_ONE - cosine))
+        else:
+            result *= self.rise
+        result += self.f0
+        if self.dielectric.any():
+            result += self.dielectric * dielectric_reflectance(cosine, self.ior)
+        return np.maximum(result, _ZERO, out=result)

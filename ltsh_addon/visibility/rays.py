@@ -269,8 +269,8 @@ class _Shape:
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
     def face_normals(self, side: np.ndarray) -> np.ndarray:
-        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell, or these where
-        a triangle has no area."""
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell; these where a
+        triangle has no area."""
         edges = self.corners[:, 1:] - self.corners[:, :1]
         if self.to_world is not None:
             edges = edges @ self.to_world.T

@@ -89,13 +89,17 @@ def _within(index, size, extension):
 
 @dataclass(frozen=True)
 class OccluderMesh:
-    """Triangles in the space of an object. `normals` are those of smooth shading, at vertices (V, 3) or at corners
-    (T, 3, 3); left out: it is flat."""
+    """Triangles in the space of an object.
+
+    `normals` are those of smooth shading, at vertices (V, 3) or at corners (T, 3, 3); left out: it is flat. Triangles
+    that stand for a hair or a point have a `thickness` (T,): what is shaded is no farther from them.
+    """
 
     vertices: np.ndarray  # (V, 3) float32
     triangles: np.ndarray  # (T, 3) uint32
     transparency: Transparency | None = None  # None: it blocks
     normals: np.ndarray | None = None
+    thickness: np.ndarray | None = None
 
     def __post_init__(self):
         vertices = np.ascontiguousarray(self.vertices, np.float32)
@@ -111,6 +115,11 @@ class OccluderMesh:
             if normals.shape not in (vertices.shape, (len(triangles), 3, 3)):
                 raise ValueError(f"mesh: normals {normals.shape}, expected {vertices.shape} or {len(triangles), 3, 3}")
             object.__setattr__(self, "normals", normals)
+        if self.thickness is not None:
+            thickness = np.ascontiguousarray(self.thickness, np.float32)
+            if thickness.shape != (len(triangles),):
+                raise ValueError(f"mesh: thickness {thickness.shape}, expected {(len(triangles),)}")
+            object.__setattr__(self, "thickness", thickness)
         uv = None if self.transparency is None else self.transparency.uv
         if uv is not None and uv.shape != (len(triangles), 3, 2):
             raise ValueError(f"mesh: uv {uv.shape}, expected {len(triangles), 3, 2}")
@@ -176,8 +185,9 @@ class Occluders:
         for number, mesh in enumerate(self.meshes):
             clear = mesh.transparency
             arrays |= {f"vertices{number}": mesh.vertices, f"triangles{number}": mesh.triangles}
-            if mesh.normals is not None:
-                arrays[f"normals{number}"] = mesh.normals
+            for name in ("normals", "thickness"):
+                if getattr(mesh, name) is not None:
+                    arrays[f"{name}{number}"] = getattr(mesh, name)
             if clear is None:
                 about.append(None)
                 continue
@@ -208,8 +218,9 @@ class Occluders:
                 image = record.pop("image", None)
                 pixels = None if image is None else arrays[f"image{image}"]
                 clear = Transparency(**record, image=pixels, uv=arrays.get(f"uv{number}"))
-            normals = arrays.get(f"normals{number}")
-            meshes.append(OccluderMesh(arrays[f"vertices{number}"], arrays[f"triangles{number}"], clear, normals))
+            shape = (arrays[f"{name}{number}"] for name in ("vertices", "triangles"))
+            more = (arrays.get(f"{name}{number}") for name in ("normals", "thickness"))
+            meshes.append(OccluderMesh(*shape, clear, *more))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
         own = {name: head[name] for name in ("transparent_surfaces", "light_masks")}
         return cls(tuple(meshes), **instances, **own)

@@ -269,8 +269,10 @@ class _Shape:
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
     def face_normals(self, side: np.ndarray) -> np.ndarray:
-        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell; these where a
-        triangle has no area."""
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors `side` (Q, 3) tell.
+
+        Where a triangle has no area it is that vector.
+        """
         edges = self.corners[:, 1:] - self.corners[:, :1]
         if self.to_world is not None:
             edges = edges @ self.to_world.T
@@ -379,6 +381,10 @@ class Tracer:
         self._has = [len(index) > 0 for index in occluders.split()]
         uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes))
         self._is_applied = uses[occluders.mesh] == 1
+        self._thickness = np.zeros(len(occluders.mesh))  # the largest of each instance, in m
+        thick = [mesh.thickness is not None and len(mesh.triangles) > 0 for mesh in occluders.meshes]
+        for number in np.flatnonzero(np.array(thick, bool)[occluders.mesh]):
+            self._thickness[number] = self._thickness_of(number, slice(None)).max()
 
     def __enter__(self) -> Tracer:
         return self
@@ -454,23 +460,49 @@ class Tracer:
         lift, terminator = np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32)
         for start in range(0, count, chunk):
             part = slice(start, start + chunk)
-            found = self._triangles_at(position[part], normal[part])
+            found = self._triangles_at(position[part], normal[part], (NEARBY * (1.0 + reach[part])).astype(np.float32))
             for number in np.unique(found.instance):
                 here = found.instance == number
                 shape = _Shape.of(self.occluders, found, here, self._is_applied[number])
                 index = start + found.ray[here]
                 clearance[index] = CLEARANCE * (reach[index] + shape.size)
-                normal[index] = shape.face_normals(normal[index])
+                if self._thickness[number] > 0.0:
+                    clearance[index] += self._thickness_of(number, found.triangle[here])
+                else:
+                    normal[index] = shape.face_normals(normal[index])
                 if shape.normals is not None:
                     lifts = shape.lifts(normal[index])
                     lift[:, index] = lifts
                     terminator[index] = self.occluders.terminators[number] * np.any(lifts, axis=(0, 2))
         return Starts(position, normal, smooth_normal, clearance, lift, terminator)
 
-    def _triangles_at(self, position, normal) -> Hits:
-        """Which triangles samples lie on, as if rays had met them."""
+    def _thickness_of(self, instance, triangle) -> np.ndarray:
+        """World-space thickness (Q,) of triangles of an instance that has one, in m."""
+        thickness = self.occluders.meshes[self.occluders.mesh[instance]].thickness
+        scale = np.linalg.norm(self.occluders.matrices[instance][:, :3], axis=0).max()
+        return thickness[triangle] * np.float32(scale)
+
+    def _triangles_at(self, position, normal, reach) -> Hits:
+        """Which triangles samples lie on, within `reach` (P,) m or their thickness, as if rays had met them."""
+        found = self._nearest(position, normal, reach)
+        thickest = np.float32(self._thickness.max(initial=0.0))
+        if thickest == 0.0:
+            return found
+        rest = np.ones(len(position), bool)
+        rest[found.ray] = False
+        rest = np.flatnonzero(rest)
+        wider = self._nearest(position[rest], normal[rest], np.full(len(rest), thickest))
+        within = np.zeros(len(wider.ray), bool)
+        for number in np.unique(wider.instance[self._thickness[wider.instance] > 0.0]):
+            here = np.flatnonzero(wider.instance == number)
+            within[here] = wider.distance[here] <= self._thickness_of(number, wider.triangle[here])
+        wider = Hits(rest[wider.ray], *(getattr(wider, field.name) for field in fields(Hits)[1:]))
+        joined = zip(*((getattr(hits, field.name) for field in fields(Hits)) for hits in (found, wider)), strict=True)
+        return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
+
+    def _nearest(self, position, normal, reach) -> Hits:
+        """The triangles nearest to samples along their normals, up to `reach`; `distance` is how near."""
         count = len(position)
-        reach = (NEARBY * (1.0 + np.abs(position).max(axis=1, initial=0.0))).astype(np.float32)
         origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
         off = np.full(count, np.inf, np.float32)
         best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))

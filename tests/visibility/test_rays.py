@@ -124,12 +124,15 @@ def test_a_ray_ends_after_as_many_transparent_surfaces_as_cycles_allows(librarie
 def test_occluders_come_back_from_their_file(tmp_path):
     rng = np.random.default_rng(11)
     occluders = random_occluders(rng)
+    hair = OccluderMesh(np.eye(3), [[0, 1, 2]], normals=rng.normal(size=(1, 3, 3)), thickness=[0.5])
+    occluders = replace(occluders, meshes=(*occluders.meshes, hair))
     occluders.save(tmp_path / "occluders.npz")
     back = Occluders.load(tmp_path / "occluders.npz")
     for name in ("mesh", "matrices", "masks", "terminators", "transparent_surfaces", "light_masks"):
         assert np.array_equal(getattr(back, name), getattr(occluders, name))
     for mesh, other in zip(occluders.meshes, back.meshes, strict=True):
         assert np.array_equal(mesh.vertices, other.vertices) and np.array_equal(mesh.triangles, other.triangles)
+        assert np.array_equal(mesh.normals, other.normals) and np.array_equal(mesh.thickness, other.thickness)
         if mesh.transparency is None:
             assert other.transparency is None
             continue

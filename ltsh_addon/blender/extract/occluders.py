@@ -28,6 +28,8 @@ NAMED = 3
 # Beyond, hair and points are left out: hair would take some 0.7 GiB.
 MOST_PIECES = 1_000_000
 TUBE_SIDES = 3
+# How far a ball of radius 1 is from its flat faces and their corners, at most.
+BALL_THICKNESS = 0.08
 # Radius of points without one, in m, as in Cycles.
 POINT_RADIUS = 0.01
 
@@ -442,7 +444,9 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
     one, two = np.arange(sides), (np.arange(sides) + 1) % sides
     low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
     triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
-    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency)
+    # What is shaded is a ribbon through the middle, or a round tube; it bends where these pieces are straight.
+    thickness = np.repeat(1.3 * np.maximum(out[ends], out[ends - 1]), 2 * sides)
+    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency, thickness=thickness)
 
 
 def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
@@ -462,7 +466,9 @@ def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
     places[:, range(3), range(3)] = radii[:, None]
     places[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
     places[:, 3, 3] = 1.0
-    return [OccluderMesh(*_ball(), _constant_transparency(clear, ob, note))], places
+    vertices, triangles = _ball()
+    transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
+    return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], places
 
 
 @cache

@@ -444,32 +444,9 @@ def test_what_is_not_as_in_cycles_is_named(name):
 
 def test_points_have_the_shadow_of_balls(tmp_path):
     start()
-    cloud = hidden(scene_parts.link(bpy.data.objects.new("Points", point_cloud(60))))
+    cloud = hidden(scene_parts.link(bpy.data.objects.new("Points", scene_parts.point_cloud(60))))
     cloud.rotation_euler = (0.1, 0.2, 0.3)
     assert_mean_shadow(tmp_path, "balls", 0.01)
-
-
-def point_cloud(count):
-    rng = np.random.default_rng(0)
-    cloud = bpy.data.pointclouds.new("Points")
-    if hasattr(cloud, "resize"):
-        cloud.resize(count)
-    else:
-        bpy.data.pointclouds.remove(cloud)
-        mesh = bpy.data.meshes.new("Seeds")
-        mesh.from_pydata([(0.0, 0.0, 0.0)] * count, [], [])
-        seeds = scene_parts.link(bpy.data.objects.new("Seeds", mesh))
-        bpy.context.view_layer.objects.active = seeds
-        seeds.select_set(True)
-        bpy.ops.object.convert(target="POINTCLOUD")
-        cloud = bpy.context.object.data
-        bpy.data.objects.remove(bpy.context.object)
-    places = rng.uniform(-1, 1, (count, 3)) * [1.5, 1.0, 0.3] + [0, 0, 1]
-    cloud.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
-    if "radius" not in cloud.attributes:
-        cloud.attributes.new("radius", "FLOAT", "POINT")
-    cloud.attributes["radius"].data.foreach_set("value", rng.uniform(0.05, 0.2, count).astype(np.float32))
-    return cloud
 
 
 def assert_mean_shadow(folder, note, tolerance):
@@ -484,23 +461,9 @@ def assert_mean_shadow(folder, note, tolerance):
     return occluders
 
 
-def hair_curves(count, points=6):
-    rng = np.random.default_rng(1)
-    curves = bpy.data.hair_curves.new("Hair")
-    curves.add_curves([points] * count)
-    roots = rng.uniform(-1, 1, (count, 1, 3)) * [1.5, 1.0, 0.2] + [0, 0, 1]
-    along = np.linspace(0, 1, points)[None, :, None]
-    places = roots + along * rng.uniform(-1, 1, (count, 1, 3)) + 0.2 * along**2 * rng.uniform(-1, 1, (count, 1, 3))
-    curves.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
-    if "radius" not in curves.attributes:
-        curves.attributes.new("radius", "FLOAT", "POINT")
-    curves.attributes["radius"].data.foreach_set("value", np.full(count * points, 0.06, np.float32))
-    return curves
-
-
 def test_hair_curves_have_the_shadow_of_tubes(tmp_path):
     start()
-    hidden(scene_parts.link(bpy.data.objects.new("Hair", hair_curves(25))))
+    hidden(scene_parts.link(bpy.data.objects.new("Hair", scene_parts.hair_curves(25))))
     assert_mean_shadow(tmp_path, "tubes", 0.015)
 
 

@@ -204,7 +204,7 @@ def _inside(outline, s, t):
 
 
 def _picture(light, center, axes):
-    """Brightness (_PICTURE^2,) of a textured light by the places of its patches, 1 at most."""
+    """Brightness (_PICTURE^2,) of a textured light by the places of its patches, as a share of its mean."""
     place = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
     s, t = np.meshgrid(place, place)
     picture = np.zeros(s.shape)
@@ -214,7 +214,7 @@ def _picture(light, center, axes):
         else:
             covered = _inside((patch.polygon() - light.center - center) @ np.linalg.pinv(axes), s, t)
         picture[covered] = np.abs(patch.radiance).mean()
-    return (picture / max(picture.max(), 1e-30)).ravel().astype(np.float32)
+    return (picture / max(np.abs(light.radiance).mean(), 1e-30)).ravel().astype(np.float32)
 
 
 class SphericalQuads:
@@ -226,16 +226,17 @@ class SphericalQuads:
 
     def __init__(self, corners: np.ndarray):
         unit = corners / np.maximum(np.sqrt(dot(corners, corners)), _TINY)
-        self.apex, self.far, self.near = unit[:, 0], unit[:, 2], (unit[:, 1], unit[:, 3])
-        self.apex_far = dot(self.apex, self.far)
-        chord = self.far - self.apex
+        self.apex, far, self.near = unit[:, 0], unit[:, 2], (unit[:, 1], unit[:, 3])
+        # By sums and differences: corners may be close to each other, or nearly opposite.
+        self.both, chord = self.apex + far, far - self.apex
+        self.gap = np.float32(0.5) * dot(self.both, self.both)
         self.terms, angles = [], []
         for near in self.near:
-            # By differences: all corners may be close together.
             volume = np.abs(dot(np.cross(near - self.apex, chord, axis=0), self.apex))
-            apex_near, near_far = dot(self.apex, near), dot(near, self.far)
-            self.terms.append((volume, apex_near, near_far))
-            angles.append(2.0 * np.arctan2(volume, self.apex_far + near_far + 1.0 + apex_near))
+            near_both = dot(near, self.both)
+            both = self.apex + near
+            self.terms.append((volume, np.float32(0.5) * dot(both, both), near_both))
+            angles.append(2.0 * np.arctan2(volume, self.gap + near_both))
         self.first, self.solid_angle = angles[0], angles[0] + angles[1]
         self.is_seen = self.solid_angle > _LEAST_SOLID_ANGLE
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
@@ -246,52 +247,49 @@ class SphericalQuads:
         is_second = x > self.first
         x -= np.where(is_second, self.first, _ZERO)
         x *= np.float32(0.5)
-        volume, apex_near, near_far = (np.where(is_second, b, a) for a, b in zip(*self.terms, strict=True))
+        volume, near_gap, near_both = (np.where(is_second, b, a) for a, b in zip(*self.terms, strict=True))
         cosine, sine = np.cos(x), np.sin(x, out=x)
-        # The third corner of the part of the triangle that has the solid angle: `apex` and `far` times these.
-        cosine *= volume
-        cosine -= (self.apex_far + near_far) * sine
-        on_apex, on_far = cosine, sine
-        on_far *= _ONE + apex_near
-        scale = on_far * self.apex_far
+        # The third corner of the part of the triangle that has the solid angle: `apex` and `both` times these.
+        on_apex = np.multiply(cosine, volume, out=volume)
+        on_apex -= (self.gap + near_both) * sine
+        on_both = sine
+        on_both *= near_gap
+        scale = on_both * self.gap
+        squared = on_apex + on_both
+        squared *= scale
+        squared *= np.float32(2.0)
+        squared += on_apex * on_apex
         scale += on_apex
-        squared = on_apex * scale
-        along = on_apex * self.apex_far
-        along += on_far
-        along *= on_far
-        squared += along
-        np.maximum(squared, _TINY, out=squared)
-        scale /= squared
         scale *= np.float32(2.0)
+        scale /= np.maximum(squared, _TINY, out=squared)
         on_apex *= scale
         on_apex -= _ONE
-        on_far *= scale
+        on_both *= scale
         # Between the corner `near` and that one.
-        apex_near *= on_apex
-        near_far *= on_far
-        apex_near += near_far
-        cosine = np.clip(apex_near, -_ONE, _ONE, out=apex_near)
+        near_gap -= _ONE
+        near_gap *= on_apex
+        near_both *= on_both
+        near_gap += near_both
+        cosine = np.clip(near_gap, -_ONE, _ONE, out=near_gap)
         height = cosine - _ONE
         height *= y
         height += _ONE
-        cosine_plus = np.maximum(cosine + _ONE, _TINY)
         share = height + _ONE
         share *= y
-        share /= cosine_plus
+        share /= np.maximum(cosine + _ONE, _TINY)
         np.sqrt(share, out=share)
         on_apex *= share
-        on_far *= share
+        on_both *= share
         cosine *= share
         height -= cosine
         for k in range(3):
             near = np.where(is_second, self.near[1][k], self.near[0][k])
             np.multiply(near, height, out=out[k])
             out[k] += on_apex * self.apex[k]
-            out[k] += on_far * self.far[k]
-        # Rounding leaves 1e-3 where two corners are nearly opposite.
+            out[k] += on_both * self.both[k]
+        # Rounding leaves a little.
         length = np.sqrt(dot(out, out))
-        np.maximum(length, _TINY, out=length)
-        out /= length
+        out /= np.maximum(length, _TINY, out=length)
         return out
 
 

@@ -7,7 +7,7 @@ import pytest
 import random_surfaces
 
 from ltsh_addon import shading
-from ltsh_addon.scene import PASSES, AreaLight, Film, SurfaceSamples
+from ltsh_addon.scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import ratio
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
@@ -88,8 +88,8 @@ def panel(**changes):
 def test_weights_are_the_light_that_is_reflected(surface, kind):
     """Without occluders the mean of the weights is what the quadrature integrates, whatever the surface and light."""
     random = np.random.default_rng(5)
-    samples = random_surfaces.samples(surface, 24, random)
-    lights = [random_surfaces.light(kind, number, random) for number in range(4)]
+    samples = random_surfaces.samples(surface, 16, random)
+    lights = [random_surfaces.light(kind, number, random) for number in range(3)]
     found = ratio.visible_shares(samples, lights, OPEN, rays=8)
     for name in PASSES:
         assert (getattr(found, name) == 1.0).all()
@@ -108,22 +108,20 @@ def test_weights_are_the_light_that_is_reflected(surface, kind):
             # 1024 points in two or three strata each; a tenth of the pairs see a sliver of the light.
             error = np.abs(radiance - lit) / np.maximum(lit, 1e-3 * max(whole.max(), 1e-30))
             bad = np.count_nonzero(error > 0.03)
-            assert bad <= 0.1 * len(error) + 1, (light.name, name, np.sort(error)[-5:])
+            # Of lights of 10 m x 1 km, single precision loses some percent.
+            assert bad <= (0.3 if kind == "huge" else 0.1) * len(error) + 1, (light.name, name, np.sort(error)[-5:])
 
 
 def test_behind_a_wall_nothing_is_left():
     random = np.random.default_rng(6)
     for surface, kind in KINDS:
-        samples = random_surfaces.samples(surface, 50, random)
-        lights = [random_surfaces.light(kind, number, random) for number in range(2)]
-        found = ratio.visible_shares(samples, lights, WALL)
+        samples, light = random_surfaces.samples(surface, 40, random), random_surfaces.light(kind, 0, random)
+        found = ratio.visible_shares(samples, [light], WALL)
+        whole = shading.shade(samples, [light], "ltsh4", workers=1)
         for name in PASSES:
-            light = np.stack(
-                [getattr(shading.shade(samples, [light], "ltsh4", workers=1), name)[0] for light in lights]
-            )
-            share = getattr(found, name)
+            share, radiance = getattr(found, name)[0], getattr(whole, name)[0]
             assert ((share == 0.0) | (share == 1.0)).all()
-            assert (light[share == 1.0] <= 1e-6 * light.max()).all(), (surface, kind, name)
+            assert (radiance[share == 1.0] <= 1e-6 * radiance.max()).all(), (surface, kind, name)
 
 
 def brute_force(samples, light, passed, side):
@@ -199,3 +197,175 @@ def test_bump_mapped_lobes_have_the_shares_of_a_quadrature():
     for name in PASSES:
         error = np.abs(pairs.found(name)[0] - expected[name][pairs.index])[pairs.visible & pairs.blocked]
         assert len(error) > 30 and np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.04, name
+
+
+def test_a_textured_light_counts_by_its_radiance():
+    """A panel of which the left half is dark and the right one bright, behind a screen that ends at its middle."""
+    whole = panel(radiance=np.full(3, 2.0))
+    halves = [
+        dataclasses.replace(whole, center=whole.center + side * 0.5 * whole.half_u, half_u=0.5 * whole.half_u,
+                            radiance=np.full(3, bright))
+        for side, bright in ((-1.0, 1.0), (1.0, 3.0))
+    ]  # fmt: skip
+    light = dataclasses.replace(whole, detail=tuple(halves))
+    samples, _ = floor(8)
+    expected = shading.shade(samples, [light], "reference", dtype=np.float64, workers=1)
+    parts = [shading.shade(samples, [half], "reference", dtype=np.float64, workers=1) for half in halves]
+    tracer = Tracer(lambda origins, directions, distances: (origins + distances[:, None] * directions)[:, 0] > 0.0)
+    pairs = with_all_rays(samples, light, tracer)
+    for name in PASSES:
+        lit = getattr(expected, name)[0, :, 0]
+        np.testing.assert_allclose(pairs.unshadowed(name), lit, rtol=0.02, atol=0.01 * lit.max())
+        share = getattr(parts[1], name)[0, :, 0] / sum(getattr(part, name)[0, :, 0] for part in parts)
+        # The picture of the light has 128 columns.
+        np.testing.assert_allclose(pairs.found(name)[0], share, atol=0.02)
+
+
+def test_a_half_plane_leaves_the_form_factor_of_what_it_does_not_hide():
+    """Lambert's formula for the part of a panel beside the edge x = 0 of a screen at y = 1."""
+    samples, _ = floor(10)
+    light = panel()
+    tracer = Tracer(lambda origins, directions, _: (origins + directions * crossing(origins, directions))[:, 0] < 0.0)
+
+    def crossing(origins, directions):
+        return ((1.0 - origins[:, 1]) / np.where(directions[:, 1] > 0.0, directions[:, 1], np.inf))[:, None]
+
+    behind = samples.take(samples.position[:, 1] < 1.0)
+    pairs = with_all_rays(behind, light, tracer)
+    shares = pairs.found("diffuse")[0]
+    for number, position in enumerate(behind.position[pairs.index]):
+        # The plane through the point and the edge: x (1 - y) + (y - py) px ... of the vertical line x = 0, y = 1.
+        edge = np.array([0.0, 1.0, 0.0]) - position
+        normal = np.cross(edge, [0.0, 0.0, 1.0])
+        corners = light.polygon() - position
+        left = clipped(corners, normal * np.sign(normal @ [-1.0, 0.0, 0.0]))
+        expected = lambert(left) / lambert(corners)
+        assert shares[number] == pytest.approx(expected, abs=0.01), position
+
+
+def clipped(corners, normal):
+    """The part of a polygon (V, 3) where normal . x >= 0."""
+    found = []
+    for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        a, b = one @ normal, other @ normal
+        if a >= 0.0:
+            found.append(one)
+        if a * b < 0.0:
+            found.append(one + a / (a - b) * (other - one))
+    return np.array(found)
+
+
+def lambert(corners):
+    """Form factor of a polygon (V, 3) above the floor (Lambert 1760)."""
+    if len(corners) < 3:
+        return 0.0
+    unit = random_surfaces.unit(corners)
+    following = np.roll(unit, -1, axis=0)
+    across = np.cross(unit, following)
+    length = np.linalg.norm(across, axis=1)
+    angle = np.arctan2(length, (unit * following).sum(axis=1))
+    return abs((angle * across[:, 2] / length).sum()) / (2.0 * np.pi)
+
+
+THREE_SPHERES = past_spheres(((0.0, 1.0, 0.5), 0.5), ((-1.2, -0.5, 0.3), 0.3), ((1.0, -1.0, 0.2), 0.2))
+
+
+def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
+    samples, film = floor(48)
+    lights = [panel(), panel(name="Low", center=np.array([0.5, 2.0, 0.6]))]
+    pairs = [with_all_rays(samples, light, THREE_SPHERES) for light in lights]
+    for rays, limit in ((32, 0.06), (128, 0.025)):
+        found = ratio.visible_shares(samples, lights, THREE_SPHERES, rays=rays, film=film)
+        # Most pairs are settled by the probes, or not worth all rays.
+        assert found.rays < 0.45 * rays * sum(len(exact.index) for exact in pairs)
+        for name in PASSES:
+            error, light = np.zeros(len(samples)), np.zeros(len(samples))
+            for number, exact in enumerate(pairs):
+                radiance, share = exact.unshadowed(name), exact.found(name)[0]
+                error[exact.index] += (getattr(found, name)[number, exact.index] - share) * radiance
+                light[exact.index] += share * radiance
+            real = np.sqrt(np.square(error).sum() / np.square(light).sum())
+            assert real < limit, (rays, name)
+            assert 0.6 < found.noise(name) / real < 2.5, (rays, name, found.noise(name), real)
+
+
+def test_a_wire_that_probes_miss_casts_all_of_its_shadow():
+    """Neighbors of pairs that found something in the way are asked again: in the mean nothing is lost."""
+    samples, film = floor(64)
+    wire = past_spheres(*(((0.3, 1.0, z), 0.012) for z in np.arange(0.02, 1.5, 0.02)))
+    light = panel()
+    found = ratio.visible_shares(samples, [light], wire, rays=64, film=film)
+    exact = with_all_rays(samples.take(slice(None, None, 3)), light, wire)
+    expected = 1.0 - exact.found("diffuse")[0]
+    lost = 1.0 - found.diffuse[0, ::3][exact.index]
+    in_shadow = expected > 0.002
+    assert 0.005 < expected[in_shadow].mean() < 0.1
+    assert lost[in_shadow].mean() == pytest.approx(expected[in_shadow].mean(), rel=0.1)
+    # What the wire does not touch is untouched.
+    assert (lost[expected == 0.0] == 0.0).mean() > 0.995
+
+
+def test_a_sample_does_not_depend_on_its_block():
+    samples, film = floor(24)
+    lights = [panel(), panel(name="Disk", shape="ELLIPSE")]
+    whole = ratio.visible_shares(samples, lights, THREE_SPHERES, rays=8, film=film)
+    for part in (slice(100, 339), np.arange(575, -1, -7)):
+        found = ratio.visible_shares(samples.take(part), lights, THREE_SPHERES, rays=8, film=film.take(part))
+        for name in PASSES:
+            np.testing.assert_array_equal(getattr(found, name), getattr(whole, name)[:, part])
+
+
+@pytest.mark.parametrize("film_rows", (1, 4))
+def test_degenerate_input_gives_shares(film_rows):
+    """Samples in and on lights, without a lobe, looked at along and from behind; lights without an area."""
+    light = panel()
+    place = np.array(
+        [light.center, light.center + 1e-9 * light.direction, light.center + 5.0 * light.half_u, [0, 0, 0]]
+    )
+    view = random_surfaces.unit(np.array([[0, 0, 1], [1e-9, 0, 1], [1, 0, 0], [0, 0, -1], [0.5, 0.5, 1e-8]], float))
+    index = np.indices((4, 5)).reshape(2, -1)
+    count = index.shape[1]
+    up, gray = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (count, 3)), np.full((count, 3), 0.5)
+    roughness = np.resize([0.0, 1e-4, 1.0], count)
+    values = (np.full(count, 0.5), np.ones(count), np.where(np.arange(count)[:, None] % 4, gray, 0.0))
+    samples = SurfaceSamples(place[index[0]], view[index[1]], up, up, roughness, gray, gray, *values)
+    film = Film(count // film_rows, film_rows, np.arange(count))
+    lights = [
+        light, panel(half_u=np.zeros(3)), panel(half_v=1e-12 * light.half_v), panel(shape="ELLIPSE", spread=1e-3),
+        panel(half_u=1e6 * light.half_u), panel(center=np.array([0.0, 0.0, 1e9])), panel(radiance=np.zeros(3)),
+        panel(shape="POLYGON", corners=light.center + np.outer([0.0, 1.0, 2.0], light.half_u)),
+    ]  # fmt: skip
+    for tracer in (OPEN, WALL, THREE_SPHERES):
+        found = ratio.visible_shares(samples, lights, tracer, film=film, smooth=True)
+        for name in PASSES:
+            share = getattr(found, name)
+            assert ((share >= 0.0) & (share <= 1.0)).all()
+            assert tracer is not OPEN or (share == 1.0).all()
+            assert np.isfinite(found.noise(name))
+
+
+def test_pairs_without_light_are_not_traced():
+    samples, _ = floor(6)
+    for light in (panel(receivers=()), panel(receivers=(7,)), panel(affects_diffuse=False, affects_specular=False)):
+        tracer = Tracer(WALL.passed)
+        found = ratio.visible_shares(samples, [light], tracer)
+        assert tracer.rays == found.rays == 0
+        assert (found.specular == 1.0).all() and (found.diffuse == 1.0).all()
+    unblocked = Tracer(WALL.passed)
+    unblocked.mask_of = lambda name: 0
+    assert (ratio.visible_shares(samples, [panel()], unblocked).diffuse == 1.0).all() and unblocked.rays == 0
+    only = ratio.visible_shares(samples, [panel(affects_specular=False)], WALL, passes=("diffuse",))
+    assert only.specular is None and (only.diffuse == 0.0).all()
+    half = ratio.visible_shares(samples, [panel(affects_specular=False)], WALL)
+    assert (half.specular == 1.0).all() and (half.diffuse == 0.0).all()
+
+
+def test_the_number_of_rays_has_limits():
+    for rays in (7, 1025):
+        with pytest.raises(ValueError, match=f"shadow rays are {rays}, expected 8 to 1024"):
+            ratio.visible_shares(*([floor(2)[0], [panel()]]), OPEN, rays=rays)
+
+
+def test_tracing_can_be_stopped():
+    with pytest.raises(Cancelled):
+        ratio.visible_shares(floor(4)[0], [panel()], OPEN, progress=lambda stage, share: False)

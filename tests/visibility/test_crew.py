@@ -1,0 +1,73 @@
+"""Processes that trace shadow rays: the same bytes for any number, and for those that fail."""
+
+import logging
+
+import numpy as np
+import pytest
+from occluder_scenes import sphere
+from test_ratio import floor, panel
+
+from ltsh_addon.blender.process.blender_process import embree_libraries
+from ltsh_addon.scene import PASSES, Cancelled
+from ltsh_addon.shading import parallel, worker
+from ltsh_addon.visibility import OccluderMesh, Occluders, crew, open_tracer, ratio
+
+
+@pytest.fixture
+def scene(monkeypatch):
+    """A ball above the floor in blocks of 200 samples, and the processes that were started."""
+    monkeypatch.setattr(ratio, "BLOCK_SAMPLES", 200)
+    monkeypatch.setattr(ratio, "PAIRS_WORTH_A_CHILD", 0)
+    started, popen = [], parallel.subprocess.Popen
+
+    def counted(arguments, **options):
+        process = popen(arguments, **options)
+        if worker.__file__ in arguments:  # numpy's tests start programs, too
+            started.append(process)
+        return process
+
+    monkeypatch.setattr(parallel.subprocess, "Popen", counted)
+    vertices, triangles = sphere(12)
+    mesh = OccluderMesh(0.5 * vertices + [0.0, 1.0, 0.7], triangles)
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), list(embree_libraries())) as tracer:
+        samples, film = floor(40)
+
+        def shares(**options):
+            return ratio.visible_shares(samples, [panel()], tracer, rays=32, film=film, **options)
+
+        yield shares, started
+
+
+def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
+    shares, started = scene
+    alone = shares(workers=1)
+    assert not started and 0.1 < alone.mixed.mean() < 0.9
+    # This process leaves most to the children.
+    done = crew._Queue.done
+    by = []
+    monkeypatch.setattr(crew._Queue, "done", lambda self, number, found: (by.append(number), done(self, number, found)))
+    for workers in (2, 3):
+        found = shares(workers=workers)
+        for name in PASSES:
+            np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+            assert found.noise(name) == alone.noise(name)
+        assert found.rays == alone.rays
+    assert len(started) == 3 and all(process.poll() is not None for process in started)
+    assert sorted(by) == sorted(2 * list(range(8)))
+
+
+def test_what_a_child_does_not_do_is_done_here(scene, monkeypatch, caplog):
+    shares, started = scene
+    alone = shares(workers=1)
+    monkeypatch.setattr(parallel, "interpreter", lambda: "/bin/false")
+    with caplog.at_level(logging.WARNING):
+        found = shares(workers=2)
+    assert len(started) == 1 and "worker process ended early" in caplog.text
+    np.testing.assert_array_equal(found.specular, alone.specular)
+
+
+def test_a_stop_leaves_no_process(scene):
+    shares, started = scene
+    with pytest.raises(Cancelled):
+        shares(workers=2, progress=lambda stage, share: share < 0.2)
+    assert started and all(process.poll() is not None for process in started)

@@ -140,15 +140,6 @@ class LookupTable:
         """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
 
-    def head_on_reflectance(self, ior: np.ndarray) -> np.ndarray:
-        """F0 (P,) of dielectrics of relative `ior` (P,), clamped to the table's range: what they reflect at least.
-
-        Integrals of a dielectric's lobe are not below F0 times those for F = 1: in the tail of a lobe, where small
-        errors of the fit may be larger than the lobe, there would be black spots else.
-        """
-        ior = np.clip(ior, self.fresnel_ior[0], self.fresnel_ior[-1])
-        return ((ior - 1.0) / (ior + 1.0)) ** 2
-
 
 def warp_entries(cosine, alpha, a, b, c, sine=None):
     """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast. In single precision the sine does not

@@ -73,7 +73,8 @@ class TailLimits:
 
         In the tail the first, for F = 1, is brought between the least and the greatest integrand over the area, of
         those at the center and the corners, times the area; not for profiled lights. The others are at most the
-        greatest reflectance there times the first, that of a dielectric at least the least of all times it.
+        greatest reflectance there times the first; elsewhere at most it. That of a dielectric is at least the reflectance
+        head on times it.
         scratch(name, shape) gives an array whose content does not matter.
         """
         rows = self.rows[:, part] if isinstance(part, slice) else np.take(self.rows, part, axis=1)
@@ -96,7 +97,10 @@ class TailLimits:
             if self.head_on is not None:
                 np.minimum(found[-1], dielectric_reflectance(far, rows[8]) * found[0], out=found[-1])
             integrals[:, chosen] = found
+        if self.schlick:
+            np.minimum(integrals[1], integrals[0], out=integrals[1])
         if self.head_on is not None:
+            np.minimum(integrals[-1], integrals[0], out=integrals[-1])
             np.maximum(integrals[-1], self.head_on[part] * integrals[0], out=integrals[-1])
 
 

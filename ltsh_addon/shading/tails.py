@@ -48,7 +48,7 @@ class LightExtent:
 class TailLimits:
     """Limits for the lobes of Q samples."""
 
-    rows: np.ndarray  # (9 or 12, Q) normal, view, their product, alpha^2, ior, normal of a second horizon if there is one
+    rows: np.ndarray  # (9, Q) normal, view, their product, alpha^2, ior; (12, Q) with the normal of a second horizon
     needed: np.ndarray  # (Q,) mask of the lobes that are not accurate in their tails
     head_on: np.ndarray | None  # (Q,) the least reflectance, where the last integral is that of a dielectric
     schlick: bool  # whether the second integral is that of Schlick's curve
@@ -73,8 +73,8 @@ class TailLimits:
 
         In the tail the first, for F = 1, is brought between the least and the greatest integrand over the area, of
         those at the center and the corners, times the area; not for profiled lights. The others are at most the
-        greatest reflectance there times the first; elsewhere at most it. That of a dielectric is at least the reflectance
-        head on times it.
+        greatest reflectance there times the first, and nowhere more than the first. That of a dielectric is at least
+        its reflectance head on times the first.
         scratch(name, shape) gives an array whose content does not matter.
         """
         rows = self.rows[:, part] if isinstance(part, slice) else np.take(self.rows, part, axis=1)
@@ -116,8 +116,8 @@ def _is_tail(cosine, center, extent):
 
 
 class _LightPoints:
-    """The centers and corners of lights as seen from samples: (5, Q) heights over the horizons, products with the views,
-    squared distances."""
+    """The centers and corners of lights as seen from samples: (5, Q) heights over the horizons, products with the
+    views, squared distances."""
 
     def __init__(self, rows, center, extent, scratch):
         self.rows, self.offset, self.extent, self.scratch = rows, center[3:], extent, scratch

@@ -11,8 +11,9 @@ from ltsh_addon import shading
 
 
 def bounds(view, roughness, light):
-    """(least, greatest) integral for F = 1 at a point in the origin, normal z, or None: the lobe or the light has none."""
-    points = [light.center + s * light.half_u + t * light.half_v for s, t in ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))]
+    """(least, greatest) integral for F = 1 at the origin, normal z; None for lobes and lights without limits."""
+    signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+    points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
     distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
     mirrored = np.array([-view[0], -view[1], view[2]])
     angle = np.arccos(np.clip(mirrored @ light.center / distance, -1.0, 1.0))

@@ -14,7 +14,6 @@ Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg)
 One coefficient vector per Fresnel curve shares the warp: a lobe is linear in its coefficients, so that a reflectance
 sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f c_f. Curves 0, 1 and 2 are 1 and
 (1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals); `dielectric_weights` gives w_f for dielectrics.
-Head on, at c = 1, all curves but the first are 0.
 """
 
 from __future__ import annotations

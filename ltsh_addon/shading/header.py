@@ -55,7 +55,6 @@ def core_text() -> str:
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "FOUR_PI": float_literal(4.0 * np.pi),
         "NEAR_SQUARED": float_literal(tails.NEAR_RADII**2),
-        "ACCURATE_FROM": float_literal(tails.ACCURATE_FROM),
         "ARC_NODES": "\n".join(_arc_node_lines()),
     }
     return filled(_text("core.h"), values)

@@ -17,8 +17,6 @@ from .polygon import dot
 
 # Of the sphere that the mirrored view ray must miss, in units of that around the light.
 NEAR_RADII = 2.0
-# Where roughness + n.v / 2 is larger, fitted lobes are accurate in their tails: limits would change few of them by 5 %.
-ACCURATE_FROM = 0.8
 
 
 @dataclass(frozen=True)
@@ -49,7 +47,6 @@ class TailLimits:
     """Limits for the lobes of Q samples."""
 
     rows: np.ndarray  # (9, Q) normal, view, their product, alpha^2, ior; (12, Q) with the normal of a second horizon
-    needed: np.ndarray  # (Q,) mask of the lobes that are not accurate in their tails
     head_on: np.ndarray | None  # (Q,) the least reflectance, where the last integral is that of a dielectric
     schlick: bool  # whether the second integral is that of Schlick's curve
 
@@ -63,10 +60,9 @@ class TailLimits:
         ior = np.maximum(samples.ior[index], 1.0)
         second = () if geometric is None else geometric
         cosine = dot(normal, view)
-        needed = samples.roughness[index] + 0.5 * cosine < ACCURATE_FROM
         rows = np.stack([*normal, *view, cosine, alpha * alpha, ior, *second], dtype=dtype, casting="same_kind")
         head_on = (((ior - 1.0) / (ior + 1.0)) ** 2).astype(dtype) if dielectric else None
-        return cls(rows, needed, head_on, schlick)
+        return cls(rows, head_on, schlick)
 
     def apply(self, integrals, part, offset, light, scratch) -> None:
         """Limit integrals (F, Q') over lights whose centers are at `offset` (3, Q') from the samples `part`.
@@ -83,7 +79,7 @@ class TailLimits:
         for number, vectors in enumerate((rows[:3], rows[3:6], offset)):
             _dot(vectors, offset, center[number], scratch)
         center[3:] = offset
-        chosen = np.nonzero(_is_tail(rows[6], center, extent) & self.needed[part] & (integrals[0] > 0.0))[0]
+        chosen = np.nonzero(_is_tail(rows[6], center, extent) & (integrals[0] > 0.0))[0]
         if len(chosen):
             rows, center = np.take(rows, chosen, axis=1), np.take(center, chosen, axis=1)
             found = np.take(integrals, chosen, axis=1)

@@ -11,13 +11,13 @@ from ltsh_addon import shading
 
 
 def bounds(view, roughness, light):
-    """(least, greatest) integral for F = 1 at the origin, normal z; None for lobes and lights without limits."""
+    """(least, greatest) integral for F = 1 at the origin, normal z; None for lights without limits."""
     signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
     points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
     distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
     mirrored = np.array([-view[0], -view[1], view[2]])
     angle = np.arccos(np.clip(mirrored @ light.center / distance, -1.0, 1.0))
-    if roughness + 0.5 * view[2] >= 0.8 or distance <= 2.0 * radius or angle <= np.arcsin(2.0 * radius / distance):
+    if distance <= 2.0 * radius or angle <= np.arcsin(2.0 * radius / distance):
         return None
     area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v))
     values = []

@@ -411,7 +411,7 @@ LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
     limits.most = 1e30f;
     limits.cosine = 0.0f;
     float squared = mirrored < 0.0f ? 0.0f : mirrored * mirrored;
-    if (squared >= beyond || beyond <= 0.0f || roughness + 0.5f * mu >= @ACCURATE_FROM@) {
+    if (squared >= beyond || beyond <= 0.0f) {
         return limits;
     }
     float alpha = ltsh_larger(roughness * roughness, @MIN_ALPHA@);

@@ -101,10 +101,10 @@ def visible_shares(
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    lights, passes = tuple(lights), tuple(passes)
-    typical = typical_radiance(samples, lights, passes)
-    task = ShadowTask(lights, passes, rays // PROBES * PROBES, smooth, typical)
-    shape = len(lights), len(samples)
+    emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
+    typical = typical_radiance(samples, emitters, passes)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, smooth, typical)
+    shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
@@ -125,7 +125,7 @@ def visible_shares(
 class ShadowTask:
     """What to do with every block of samples."""
 
-    lights: tuple[AreaLight, ...]
+    emitters: tuple[Emitter, ...]
     passes: tuple[str, ...]
     rays: int
     smooth: bool
@@ -133,14 +133,14 @@ class ShadowTask:
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
-        shape = len(self.lights), len(samples)
+        shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
         share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
-        for number, light in enumerate(self.lights):
-            pairs = Pairs(surface, light)
+        for number, emitter in enumerate(self.emitters):
+            pairs = Pairs(surface, emitter)
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
@@ -159,13 +159,13 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
-    """By pass, the root mean square of what samples reflect of all `lights` without shadows, from some of them."""
-    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(lights), 1)), 1)
+def typical_radiance(samples: SurfaceSamples, emitters: Sequence[Emitter], passes: Sequence[str]) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect of all lights without shadows, from some of them."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(emitters), 1)), 1)
     surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
     radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
-    for light in lights:
-        pairs = Pairs(surface, light)
+    for emitter in emitters:
+        pairs = Pairs(surface, emitter)
         pairs.weigh()
         for name in passes:
             radiance[name][pairs.index] += pairs.unshadowed(name)
@@ -245,10 +245,10 @@ def _different(first, second):
 class Pairs:
     """The samples that a light may reach, and what their rays have found so far."""
 
-    def __init__(self, surface: Surface, light: AreaLight):
-        self.surface, self.light = surface, light
+    def __init__(self, surface: Surface, emitter: Emitter):
+        light = emitter.light
+        self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
-        self.emitter = Emitter(light)
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
         if light.is_focused:

@@ -9,6 +9,7 @@ import random_surfaces
 from ltsh_addon import shading
 from ltsh_addon.scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import ratio
+from ltsh_addon.visibility.directions import Emitter
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light) for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS)
@@ -166,7 +167,7 @@ def textbook_ggx(cosine_h, cosine_i, cosine_o, alpha):
 
 def with_all_rays(samples, light, tracer):
     """The pairs of a light after as many rays as there can be, for each."""
-    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), light)
+    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), Emitter(light))
     pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
     return pairs
 

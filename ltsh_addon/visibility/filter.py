@@ -91,7 +91,7 @@ class ShareFilter:
         spread = np.maximum(mean * (1.0 - mean), _LEAST_VARIANCE)
         # What the stratification leaves of the variance of independent rays
         power = spread / rays**VARIANCE_POWER
-        factor = np.float32(np.square(noise[chosen]).mean() / power.mean())
+        factor = np.float32(max(np.square(noise[chosen]).mean() / power.mean(), 1e-6))
         own_variance = factor * power
         total, weights, squares = own.copy(), np.ones_like(own), own_variance.copy()
         for there, near in zip(self._neighbors, self._nearness[name], strict=True):

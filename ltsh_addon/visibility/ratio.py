@@ -295,7 +295,7 @@ class Pairs:
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
 
     def _plan(self, rays, typical):
-        """How many rays (Q,) the pairs are worth, and which of SPLITS (Q,), by what they reflect without shadows."""
+        """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = np.maximum(worth["specular"], worth["diffuse"])
         wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
@@ -349,7 +349,7 @@ class Pairs:
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last, split, trace=True):
-        """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
+        """Rays `first` to `last` for the pairs `members` (M,); `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
             chosen = members[chosen]
@@ -396,9 +396,10 @@ class Pairs:
         weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
         share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
-        # Probes alone have no second half.
         halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
-        return share, 0.5 * np.abs(halves[0] - halves[1])
+        # Probes alone have no second half: as of independent rays.
+        usual = np.sqrt(share * (_ONE - share) / np.maximum(self.count, 1).astype(np.float32))
+        return share, np.where((weights > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
 
 
 def _taken(rows, flat):

@@ -221,7 +221,7 @@ class SphericalQuads:
         self.gap = np.float32(0.5) * dot(self.both, self.both)
         self.terms, angles = [], []
         for near in self.near:
-            volume = np.abs(dot(np.cross(near - self.apex, chord, axis=0), self.apex))
+            volume = np.abs(dot(_cross(near - self.apex, chord), self.apex))
             near_both = dot(near, self.both)
             both = self.apex + near
             self.terms.append((volume, np.float32(0.5) * dot(both, both), near_both))
@@ -349,7 +349,7 @@ def frames(normal: np.ndarray, view: np.ndarray):
     tangent -= dot(tangent, normal) / squared * normal
     tangent /= np.sqrt(dot(tangent, tangent))
     normal = normal / np.sqrt(squared)
-    rows = np.stack([tangent, np.cross(normal, tangent, axis=0), normal])
+    rows = np.stack([tangent, _cross(normal, tangent), normal])
     return np.clip(dot(normal, view), _ZERO, _ONE), sine, rows
 
 
@@ -358,4 +358,4 @@ def dot(a, b):
 
 
 def _cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -22,7 +22,6 @@ from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.light_polygons import has_lobe
 from . import crew
 from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
-from .filter import ShareFilter
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -86,24 +85,22 @@ def visible_shares(
     tracer,
     *,
     passes: Sequence[str] = PASSES,
-    rays: int = 128,
+    rays: int = 256,
     film: Film | None = None,
-    smooth: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
-    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
-    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may
-    return False to stop: Cancelled is raised.
+    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
+    returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
+    process. `progress` may return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
     emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
     typical = typical_radiance(samples, emitters, passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, smooth, typical)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical)
     shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
@@ -128,7 +125,6 @@ class ShadowTask:
     emitters: tuple[Emitter, ...]
     passes: tuple[str, ...]
     rays: int
-    smooth: bool
     typical: dict[str, float]
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
@@ -138,7 +134,6 @@ class ShadowTask:
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
-        share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
         for number, emitter in enumerate(self.emitters):
             pairs = Pairs(surface, emitter)
             pairs.trace(self.rays, neighbors, self.typical)
@@ -147,10 +142,6 @@ class ShadowTask:
             mixed[number, index] = pairs.visible & pairs.blocked
             for name in self.passes:
                 share, noise = pairs.found(name)
-                if share_filter is not None:
-                    chosen = mixed[number, index] & pairs.wanted[name]
-                    share, factor = share_filter.filtered(name, index, share, pairs.count, chosen, noise)
-                    noise *= factor
                 unshadowed = pairs.unshadowed(name)
                 shares[name][number, index] = share
                 radiance[name][index] += unshadowed * share

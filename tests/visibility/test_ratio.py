@@ -337,7 +337,7 @@ def test_degenerate_input_gives_shares(film_rows):
         panel(shape="POLYGON", corners=light.center + np.outer([0.0, 1.0, 2.0], light.half_u)),
     ]  # fmt: skip
     for tracer in (OPEN, WALL, THREE_SPHERES):
-        found = ratio.visible_shares(samples, lights, tracer, film=film, smooth=True)
+        found = ratio.visible_shares(samples, lights, tracer, film=film)
         for name in PASSES:
             share = getattr(found, name)
             assert ((share >= 0.0) & (share <= 1.0)).all()

@@ -307,7 +307,7 @@ def _shadow_rays() -> Any:
         "at most so many per light and point where some are blocked and some are not; shared by the points of a pixel "
         "or texel (default: %(default)s)"
     )
-    return option("--shadow-rays", default=64, type=shadow_rays, metavar="N", help=meaning)
+    return option("--shadow-rays", default=256, type=shadow_rays, metavar="N", help=meaning)
 
 
 def _scripts() -> Any:

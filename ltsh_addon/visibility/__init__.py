@@ -1,4 +1,8 @@
-"""Which share of a light is seen: occluders, rays through them, and what they leave of each light."""
+"""Which share of a light is seen: occluders, rays through them, and what they leave of each light.
+
+`occluders` is what stands in the way, `rays` traces it. `directions` chooses where rays go, `ratio` makes shares of
+what they meet (`visible_shares`), and `crew` does all of it on several cores.
+"""
 
 from __future__ import annotations
 

@@ -6,7 +6,6 @@ Embree is called with Python's lock held, so that threads would not help. Childr
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -17,7 +16,6 @@ from ..shading import parallel
 from .occluders import Occluders
 from .rays import open_tracer
 
-_logger = logging.getLogger(__name__)
 _STAGE = "shadows"
 
 

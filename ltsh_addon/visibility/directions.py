@@ -92,110 +92,95 @@ def mixed_bits(values):
 
 
 class Emitter:
-    """What directions need of a light, the same for all points."""
+    """What directions need of a light, the same for all points: a quadrilateral, and how bright the light is in it.
+
+    It is the light itself where that is a rectangle without a texture, a triangle or a convex quadrilateral; else
+    center + s axes[0] + t axes[1], |s|, |t| <= 1, around it.
+    """
 
     def __init__(self, light: AreaLight):
         self.light = light
         self.outline = light.polygon(_ROUND_CORNERS) - light.center
-        self.direction = light.direction
-        corners = self.outline if light.shape == "POLYGON" else None
-        if corners is not None and len(corners) > 4:
-            pieces = convex_pieces(corners)
-            corners = pieces[0] if len(pieces) == 1 and len(pieces[0]) <= 4 else corners
-        self.mask = None
-        if corners is not None and len(corners) <= 4 and len(convex_pieces(corners)) == 1:
-            self.axes, self.corners = None, corners[[0, 1, 2, -1]]
-        else:
-            self.center, self.axes = _frame(light)
-            self.corners = None
-            self.mask = _mask(light, self.center, self.axes)
         self.profile = light_cone.Profile.of(light) if light.is_profiled else None
+        self.corners = self._own_corners()
+        self.center, self.axes = _parallelogram(light) if self.corners is None else (None, None)
+        self._picture = self._edge = None
+        if self.corners is None and light.detail:
+            self._picture = _picture(light, self._places)
+        elif self.corners is None and light.shape == "POLYGON":
+            self._edge = self._places(light.corners - light.center).astype(np.float32)
 
-    def corners_from(self, offset: list[np.ndarray], height: np.ndarray) -> np.ndarray:
-        """Corners (3, 4, Q) of the quadrilateral from points; offset: three (Q,) to the center of the light, height
-        (Q,) of the points over its plane."""
+    def _own_corners(self) -> np.ndarray | None:
+        """Corners (4, 3) of a polygon that has no more, from the center of the light; a triangle repeats the last."""
+        if self.light.shape != "POLYGON" or self.light.detail:
+            return None
+        pieces = convex_pieces(self.outline)
+        return pieces[0][[0, 1, 2, -1]] if len(pieces) == 1 and len(pieces[0]) <= 4 else None
+
+    def _places(self, offset: np.ndarray) -> np.ndarray:
+        """Numbers s, t (..., 2) of points of the light's plane, (..., 3) from its center."""
+        return (offset - self.center) @ np.linalg.pinv(self.axes)
+
+    def corners_from(self, offset: np.ndarray, height: np.ndarray) -> np.ndarray:
+        """Corners (3, 4, Q) of the quadrilateral from points with the center of the light at offset (3, Q), at height
+        (Q,) over its plane."""
         if self.corners is not None:
-            corners = self.corners.astype(np.float32)
-            return np.stack([np.stack([offset[k] + corner[k] for corner in corners]) for k in range(3)])
-        u, v = self.axes.astype(np.float32)
-        middle = [offset[k] + np.float32(self.center[k]) for k in range(3)]
-        ranges = self._ranges(middle, height)
-        corners = [
-            [middle[k] + ranges[0][i] * u[k] + ranges[1][j] * v[k] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
-            for k in range(3)
-        ]
-        return np.array(corners)
+            return offset[:, None] + self.corners.T.astype(np.float32)[:, :, None]
+        u, v = self.axes.astype(np.float32)[:, :, None]
+        middle = offset + self.center.astype(np.float32)[:, None]
+        (low_s, high_s), (low_t, high_t) = self._ranges(middle, height)
+        ends = ((low_s, low_t), (high_s, low_t), (high_s, high_t), (low_s, high_t))
+        return np.stack([middle + s * u + t * v for s, t in ends], axis=1)
 
     def _ranges(self, middle, height):
         """From where to where along both axes the quadrilateral reaches: as far as the cone of a spread."""
-        one = np.float32(1.0)
-        if not self.light.is_focused or abs(self.axes[0] @ self.axes[1]) > 1e-6 * np.prod(_lengths(self.axes)):
-            return ((-one, one), (-one, one))
+        squares = (self.axes * self.axes).sum(axis=1)
+        if not self.light.is_focused or abs(self.axes[0] @ self.axes[1]) > 1e-6 * squares.max():
+            return ((-_ONE, _ONE), (-_ONE, _ONE))
         ranges = []
-        for axis in self.axes:
-            squared = axis @ axis
-            foot = -sum(middle[k] * np.float32(axis[k] / squared) for k in range(3))
-            reach = np.float32(self.profile.tangent / np.sqrt(squared)) * height
-            ranges.append((np.clip(foot - reach, -one, one), np.clip(foot + reach, -one, one)))
+        for axis, squared in zip(self.axes, squares, strict=True):
+            foot = -dot(middle, (axis / max(squared, 1e-30)).astype(np.float32))
+            reach = np.float32(self.profile.tangent / max(np.sqrt(squared), 1e-15)) * height
+            ranges.append((np.clip(foot - reach, -_ONE, _ONE), np.clip(foot + reach, -_ONE, _ONE)))
         return ranges
 
-    def brightness(self, towards, distance, offset, height):
-        """Factors (S, Q) of the radiance along directions that meet the light's plane at `distance`; None: all 1."""
+    def brightness(self, towards: np.ndarray, distance: np.ndarray, offset: np.ndarray, height: np.ndarray):
+        """Factors (S, Q) of the mean radiance along directions (3, S, Q) that meet the light's plane at `distance`
+        (S, Q), the others as for `corners_from`; None: all 1."""
         factor = None
         if self.profile is not None:
-            radius = np.sqrt(np.maximum(distance * distance - height * height, 0.0))
+            radius = np.sqrt(np.maximum(distance * distance - height * height, _ZERO))
             factor = self.profile.at(radius, np.maximum(height, _TINY)).astype(np.float32)
-        if self.mask is not None:
-            places = []
-            for axis in np.linalg.pinv(self.axes).T.astype(np.float32):
-                start = sum((offset[k] + np.float32(self.center[k])) * axis[k] for k in range(3))
-                places.append(sum(towards[k] * axis[k] for k in range(3)) * distance - start)
-            inside = self.mask(*places)
-            factor = inside if factor is None else factor * inside
-        return factor
+        if self._picture is None and self._edge is None and not self.light.is_round:
+            return factor
+        along = np.linalg.pinv(self.axes).T.astype(np.float32)
+        start = offset + self.center.astype(np.float32)[:, None]
+        s, t = (dot(towards, axis) * distance - dot(start, axis) for axis in along)
+        if self._picture is not None:
+            own = self._picture[_cells(t), _cells(s)]
+        else:
+            own = _inside(self._edge, s, t) if self._edge is not None else s * s + t * t <= _ONE
+        return own if factor is None else factor * own
 
 
-def _lengths(axes):
-    return np.sqrt((axes * axes).sum(axis=1))
-
-
-def _frame(light):
-    """Center, seen from that of the light, and half axes (2, 3) of a parallelogram around the light."""
+def _parallelogram(light: AreaLight):
+    """Center, seen from that of the light, and half axes (2, 3) of a parallelogram around it: of a polygon the smallest
+    rectangle along an edge."""
     if light.shape != "POLYGON":
         return np.zeros(3), np.stack([light.half_u, light.half_v])
-    outline = light.polygon() - light.center
-    first = outline[1] - outline[0]
-    best = None
-    for first in np.roll(outline, -1, axis=0) - outline:
-        if not first.any():
-            continue
-        axes = np.stack([first / np.linalg.norm(first), np.cross(light.direction, first) / np.linalg.norm(first)])
-        flat = outline @ axes.T
-        low, high = flat.min(axis=0), flat.max(axis=0)
-        if best is None or np.prod(high - low) < best[0]:
-            best = np.prod(high - low), 0.5 * (low + high) @ axes, 0.5 * (high - low)[:, None] * axes
+    outline, best = light.corners - light.center, (np.inf, np.zeros(3), np.zeros((2, 3)))
+    for edge in np.roll(outline, -1, axis=0) - outline:
+        if edge.any():
+            axes = np.stack([edge, np.cross(light.direction, edge)]) / np.linalg.norm(edge)
+            flat = outline @ axes.T
+            low, high = flat.min(axis=0), flat.max(axis=0)
+            found = np.prod(high - low), 0.5 * (low + high) @ axes, 0.5 * (high - low)[:, None] * axes
+            best = min(best, found, key=lambda each: each[0])
     return best[1:]
 
 
-def _mask(light, center, axes):
-    """Function of places s, t in the parallelogram: the share of the light's radiance there; None: everywhere 1."""
-    if light.detail:
-        picture = _picture(light, center, axes)
-
-        def shown(s, t):
-            column, row = (np.clip((0.5 + 0.5 * x) * _PICTURE, 0, _PICTURE - 1).astype(np.int32) for x in (s, t))
-            return picture.take(row * _PICTURE + column)
-
-        return shown
-    if light.is_round:
-        return lambda s, t: s * s + t * t <= np.float32(1.0)
-    if light.shape == "POLYGON":
-        outline = ((light.polygon() - light.center - center) @ np.linalg.pinv(axes)).astype(np.float32)
-        return lambda s, t: _inside(outline, s, t)
-    return None
-
-
 def _inside(outline, s, t):
+    """Mask of the places s, t in a polygon (V, 2)."""
     inside = np.zeros(s.shape, bool)
     for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if y0 != y1:
@@ -203,18 +188,22 @@ def _inside(outline, s, t):
     return inside
 
 
-def _picture(light, center, axes):
-    """Brightness (_PICTURE^2,) of a textured light by the places of its patches, as a share of its mean."""
-    place = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
-    s, t = np.meshgrid(place, place)
-    picture = np.zeros(s.shape)
+def _cells(place):
+    """Rows or columns of the picture of a light at places from -1 to 1."""
+    return np.clip((0.5 * _PICTURE) * (place + _ONE), 0, _PICTURE - 1).astype(np.intp)
+
+
+def _picture(light, places_of):
+    """Brightness (_PICTURE, _PICTURE) of a textured light by the places of its patches, as a share of its mean."""
+    grid = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
+    picture = np.zeros((_PICTURE, _PICTURE), np.float32)
+    mean = max(np.abs(light.radiance).mean(), 1e-30)
     for patch in light.patches:
-        if patch.is_round:
-            covered = s * s + t * t <= 1.0
-        else:
-            covered = _inside((patch.polygon() - light.center - center) @ np.linalg.pinv(axes), s, t)
-        picture[covered] = np.abs(patch.radiance).mean()
-    return (picture / max(np.abs(light.radiance).mean(), 1e-30)).ravel().astype(np.float32)
+        outline = places_of(patch.polygon() - light.center)
+        columns, rows = (slice(*np.searchsorted(grid, (axis.min(), axis.max()))) for axis in outline.T)
+        part = picture[rows, columns]
+        part[_inside(outline, *np.meshgrid(grid[columns], grid[rows]))] = np.abs(patch.radiance).mean() / mean
+    return picture
 
 
 class SphericalQuads:
@@ -232,7 +221,7 @@ class SphericalQuads:
         self.gap = np.float32(0.5) * dot(self.both, self.both)
         self.terms, angles = [], []
         for near in self.near:
-            volume = np.abs(dot(np.cross(near - self.apex, chord, axis=0), self.apex))
+            volume = np.abs(dot(_cross(near - self.apex, chord), self.apex))
             near_both = dot(near, self.both)
             both = self.apex + near
             self.terms.append((volume, np.float32(0.5) * dot(both, both), near_both))
@@ -360,7 +349,7 @@ def frames(normal: np.ndarray, view: np.ndarray):
     tangent -= dot(tangent, normal) / squared * normal
     tangent /= np.sqrt(dot(tangent, tangent))
     normal = normal / np.sqrt(squared)
-    rows = np.stack([tangent, np.cross(normal, tangent, axis=0), normal])
+    rows = np.stack([tangent, _cross(normal, tangent), normal])
     return np.clip(dot(normal, view), _ZERO, _ONE), sine, rows
 
 
@@ -369,4 +358,4 @@ def dot(a, b):
 
 
 def _cross(a, b):
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

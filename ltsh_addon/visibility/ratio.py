@@ -22,7 +22,6 @@ from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.light_polygons import has_lobe
 from . import crew
 from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
-from .filter import ShareFilter
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -86,25 +85,23 @@ def visible_shares(
     tracer,
     *,
     passes: Sequence[str] = PASSES,
-    rays: int = 128,
+    rays: int = 256,
     film: Film | None = None,
-    smooth: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
-    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
-    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may
-    return False to stop: Cancelled is raised.
+    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
+    returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
+    process. `progress` may return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    lights, passes = tuple(lights), tuple(passes)
-    typical = typical_radiance(samples, lights, passes)
-    task = ShadowTask(lights, passes, rays // PROBES * PROBES, smooth, typical)
-    shape = len(lights), len(samples)
+    emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
+    typical = typical_radiance(samples, emitters, passes)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical)
+    shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
@@ -125,32 +122,26 @@ def visible_shares(
 class ShadowTask:
     """What to do with every block of samples."""
 
-    lights: tuple[AreaLight, ...]
+    emitters: tuple[Emitter, ...]
     passes: tuple[str, ...]
     rays: int
-    smooth: bool
     typical: dict[str, float]
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
-        shape = len(self.lights), len(samples)
+        shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
-        share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
-        for number, light in enumerate(self.lights):
-            pairs = Pairs(surface, light)
+        for number, emitter in enumerate(self.emitters):
+            pairs = Pairs(surface, emitter)
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
             mixed[number, index] = pairs.visible & pairs.blocked
             for name in self.passes:
                 share, noise = pairs.found(name)
-                if share_filter is not None:
-                    chosen = mixed[number, index] & pairs.wanted[name]
-                    share, factor = share_filter.filtered(name, index, share, pairs.count, chosen, noise)
-                    noise *= factor
                 unshadowed = pairs.unshadowed(name)
                 shares[name][number, index] = share
                 radiance[name][index] += unshadowed * share
@@ -159,13 +150,13 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
-    """By pass, the root mean square of what samples reflect of all `lights` without shadows, from some of them."""
-    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(lights), 1)), 1)
+def typical_radiance(samples: SurfaceSamples, emitters: Sequence[Emitter], passes: Sequence[str]) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect of all lights without shadows, from some of them."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(emitters), 1)), 1)
     surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
     radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
-    for light in lights:
-        pairs = Pairs(surface, light)
+    for emitter in emitters:
+        pairs = Pairs(surface, emitter)
         pairs.weigh()
         for name in passes:
             radiance[name][pairs.index] += pairs.unshadowed(name)
@@ -245,10 +236,10 @@ def _different(first, second):
 class Pairs:
     """The samples that a light may reach, and what their rays have found so far."""
 
-    def __init__(self, surface: Surface, light: AreaLight):
-        self.surface, self.light = surface, light
+    def __init__(self, surface: Surface, emitter: Emitter):
+        light = emitter.light
+        self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
-        self.emitter = Emitter(light)
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
         if light.is_focused:
@@ -295,7 +286,7 @@ class Pairs:
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
 
     def _plan(self, rays, typical):
-        """How many rays (Q,) the pairs are worth, and which of SPLITS (Q,), by what they reflect without shadows."""
+        """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = np.maximum(worth["specular"], worth["diffuse"])
         wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
@@ -349,7 +340,7 @@ class Pairs:
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last, split, trace=True):
-        """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
+        """Rays `first` to `last` for the pairs `members` (M,); `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
             chosen = members[chosen]
@@ -396,9 +387,10 @@ class Pairs:
         weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
         share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
-        # Probes alone have no second half.
         halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
-        return share, 0.5 * np.abs(halves[0] - halves[1])
+        # Probes alone have no second half: as of independent rays.
+        usual = np.sqrt(share * (_ONE - share) / np.maximum(self.count, 1).astype(np.float32))
+        return share, np.where((weights > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
 
 
 def _taken(rows, flat):

@@ -158,7 +158,7 @@ class FinalJob:
     shown: str  # combined, specular or diffuse
     other_techniques: tuple[str, ...] = ()  # with passes of their own
     shadows: str = "off"
-    shadow_rays: int = 64  # see `PictureOptions`
+    shadow_rays: int = 256  # see `PictureOptions`
     background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
 
     def shaded_as(self) -> dict[str, str]:

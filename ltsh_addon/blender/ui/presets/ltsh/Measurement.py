@@ -8,6 +8,6 @@ settings.resolution_percentage = 100
 settings.anti_aliasing = 16
 settings.cycles_samples = 2048
 settings.shadows = True
-settings.shadow_rays = 256
+settings.shadow_rays = 1024
 settings.bake_size = "2048"
 settings.bake_error = True

@@ -268,18 +268,24 @@ class _Shape:
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
-    def face_normals(self, side: np.ndarray) -> np.ndarray:
-        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors `side` (Q, 3) tell.
+    def face_normals(self, geometric_normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
+        """Unit normals (Q, 3) of the triangles in world space: on the side of `geometric_normal` (Q, 3) where they are
+        flat, else of the side that has `smooth_normal` (Q, 3), which may point to the other side of its triangle.
 
-        Where a triangle has no area it is that vector.
+        Where a triangle has no area it is the former.
         """
         edges = self.corners[:, 1:] - self.corners[:, :1]
         if self.to_world is not None:
             edges = edges @ self.to_world.T
         normal = np.cross(edges[:, 0], edges[:, 1])
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        normal *= np.where(_dot(normal, side) < 0.0, -1.0, 1.0)[:, None]
-        return np.divide(normal, length, out=side.astype(np.float64), where=length > 0.0)
+        if self.normals is None:
+            facing = _dot(normal, geometric_normal)
+        else:
+            own = np.einsum("qc,qck->qk", self.shares, self.normals)
+            facing = _dot(own if self.to_world is None else own @ _cofactors(self.to_world).T, smooth_normal)
+        normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
+        return np.divide(normal, length, out=geometric_normal.astype(np.float64), where=length > 0.0)
 
     def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
         """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
@@ -447,8 +453,8 @@ class Tracer:
 
         Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
         from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
-        occluders keeps a small distance from its surface. The side of a triangle is that of its own normal: that of
-        the sample is the smooth one where a lobe ends at the smooth horizon.
+        occluders keeps a small distance from its surface. Triangles have their own normals here: that of a sample is
+        the smooth one where a lobe ends at the smooth horizon.
         """
         position, normal, smooth_normal = (
             np.array(values, np.float32, order="C")
@@ -469,7 +475,7 @@ class Tracer:
                 if self._thickness[number] > 0.0:
                     clearance[index] += self._thickness_of(number, found.triangle[here])
                 else:
-                    normal[index] = shape.face_normals(normal[index])
+                    normal[index] = shape.face_normals(normal[index], smooth_normal[index])
                 if shape.normals is not None:
                     lifts = shape.lifts(normal[index])
                     lift[:, index] = lifts

@@ -113,10 +113,11 @@ def samples_on(mesh, matrix, rng, count, facets=None):
     corners = mesh.vertices[named] @ matrix[:, :3].T + matrix[:, 3]
     position = np.einsum("pc,pck->pk", shares, corners)
     geometric = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    geometric /= np.linalg.norm(geometric, axis=1)[:, None]
+    geometric *= np.sign(np.linalg.det(matrix[:, :3])) / np.linalg.norm(geometric, axis=1)[:, None]
     smooth = geometric
     if mesh.normals is not None:
-        smooth = np.einsum("pc,pck->pk", shares, mesh.normals[named]) @ matrix[:, :3].T
+        normals = mesh.normals[named] if mesh.normals.ndim == 2 else mesh.normals[triangle]
+        smooth = np.einsum("pc,pck->pk", shares, normals) @ np.linalg.inv(matrix[:, :3])
         smooth /= np.linalg.norm(smooth, axis=1)[:, None]
     return surface_samples(*(values.astype(np.float32) for values in (position, geometric, smooth)))
 

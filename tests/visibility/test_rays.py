@@ -266,22 +266,31 @@ def test_a_smooth_sphere_is_lit_up_to_its_horizon_as_cycles_lifts_it(libraries):
 
 
 @pytest.mark.parametrize("instances", [1, 2])
-def test_the_side_of_a_triangle_is_that_of_its_own_normal(libraries, instances):
-    """Samples whose specular lobe ends at the smooth horizon have the smooth normal as geometric one."""
+@pytest.mark.parametrize("tilt", [0.3, 2.0])
+def test_triangles_have_the_sides_that_their_smooth_normals_have_in_the_mesh(libraries, instances, tilt):
+    """Smooth normals are `tilt` rad off those of the triangles, on the other side where a quad is bent. Samples whose
+    specular lobe ends at the smooth horizon have the smooth normal as geometric one."""
     rng = np.random.default_rng(10)
     vertices, triangles = sphere(6)
-    mesh = OccluderMesh(vertices, triangles, normals=vertices)
-    matrix = np.concatenate([np.diag([1.5, 0.7, 1.0]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0], [[1], [2], [3]]], 1)
-    matrices = [matrix, np.eye(3, 4) + 20.0 * np.eye(3, 4, k=3)][:instances]
-    with open_tracer(Occluders((mesh,), [0] * instances, matrices), libraries) as tracer:
-        samples = samples_on(mesh, matrix, rng, 2000)
-        bent = replace(samples, geometric_normal=samples.smooth_normal)
-        index, directions = directions_around(samples.smooth_normal, rng, 8)
-        expected, seen_from_face = seen(tracer, samples, index, directions)
-        found, seen_from_smooth = seen(tracer, bent, index, directions)
-    np.testing.assert_allclose(found.geometric_normal, expected.geometric_normal, atol=1e-5)
-    # Rays within rounding of a triangle's plane may take its other side.
-    assert np.mean(seen_from_face != seen_from_smooth) < 1e-3
+    edges = vertices[triangles[:, 1:]] - vertices[triangles[:, :1]]
+    flat = np.cross(edges[:, 0], edges[:, 1])
+    along = edges[:, 0] / np.linalg.norm(edges[:, 0], axis=1)[:, None]
+    tilted = np.cos(tilt) * flat / np.linalg.norm(flat, axis=1)[:, None] + np.sin(tilt) * along
+    mesh = OccluderMesh(vertices, triangles, normals=np.repeat(tilted[:, None], 3, axis=1))
+    for mirror in (1.0, -1.0):
+        matrix = np.diag([1.5, 0.7, mirror]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        matrix = np.concatenate([matrix, [[1], [2], [3]]], 1)
+        matrices = [matrix, np.eye(3, 4) + 20.0 * np.eye(3, 4, k=3)][:instances]
+        with open_tracer(Occluders((mesh,), [0] * instances, matrices), libraries) as tracer:
+            samples = samples_on(mesh, matrix, rng, 2000)
+            ended = replace(samples, geometric_normal=samples.smooth_normal)
+            index, directions = directions_around(samples.smooth_normal, rng, 8)
+            expected, seen_from_face = seen(tracer, samples, index, directions)
+            found, seen_from_smooth = seen(tracer, ended, index, directions)
+        for starts in (expected, found):
+            np.testing.assert_allclose(starts.geometric_normal, samples.geometric_normal, atol=1e-5)
+        # Rays within rounding of a triangle's plane may take its other side.
+        assert np.mean(seen_from_face != seen_from_smooth) < 1e-3
 
 
 def test_lifted_rays_go_to_the_same_points(libraries):

@@ -125,6 +125,11 @@ def is_surface(instance) -> bool:
     return instance.object.type in SURFACE_TYPES and instance.show_self
 
 
+def is_rendered(ob) -> bool:
+    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
+    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
+
+
 def owner_of(instance):
     """The object that brings the instance into the scene: itself, or what instances it."""
     return instance.parent if instance.is_instance and instance.parent else instance.object

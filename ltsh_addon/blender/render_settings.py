@@ -17,7 +17,10 @@ from .evaluated import SURFACE_TYPES
 DEFAULTS = {
     "film_exposure": 1.0,
     "is_portal": False,
+    "transparent_max_bounces": 8,
     "use_bump_map_correction": True,
+    "use_camera_cull": False,
+    "use_distance_cull": False,
     "use_multiple_importance_sampling": True,
 }
 

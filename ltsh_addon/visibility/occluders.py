@@ -121,7 +121,7 @@ class Occluders:
     space. An instance blocks rays that have a bit of its `masks` (I,) uint32; left out: all.
 
     `terminators` (I,) are as `shadow_terminator_geometry_offset` of Cycles; left out: its default.
-    A ray through more than `transparent_surfaces` ends.
+    A ray through more than `transparent_surfaces` ends. `light_masks` are the masks of rays to lights, by their names.
     """
 
     meshes: tuple[OccluderMesh, ...]
@@ -130,7 +130,7 @@ class Occluders:
     masks: np.ndarray | None = None
     terminators: np.ndarray | None = None
     transparent_surfaces: int = TRANSPARENT_SURFACES
-    warnings: tuple[str, ...] = field(default=())
+    light_masks: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
         mesh = np.asarray(self.mesh, np.int64)
@@ -150,7 +150,10 @@ class Occluders:
         if count and (mesh.min() < 0 or mesh.max() >= len(self.meshes)):
             raise ValueError(f"occluders: an instance names mesh {mesh.max()}, expected 0 to {len(self.meshes) - 1}")
         object.__setattr__(self, "meshes", tuple(self.meshes))
-        object.__setattr__(self, "warnings", tuple(self.warnings))
+
+    def mask_of(self, light: str) -> int:
+        """Mask of the rays to the light of that name; 0: nothing is in its way."""
+        return self.light_masks.get(light, 1)
 
     @property
     def triangle_count(self) -> int:
@@ -178,7 +181,7 @@ class Occluders:
                 arrays[f"uv{number}"] = clear.uv
             about.append(record)
         arrays |= {f"image{number}": image for number, image in enumerate(images.values())}
-        head = {"meshes": about, "transparent_surfaces": self.transparent_surfaces, "warnings": self.warnings}
+        head = {"meshes": about, **{name: getattr(self, name) for name in ("transparent_surfaces", "light_masks")}}
         arrays["about"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -201,5 +204,5 @@ class Occluders:
             normals = arrays.get(f"normals{number}")
             meshes.append(OccluderMesh(arrays[f"vertices{number}"], arrays[f"triangles{number}"], clear, normals))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
-        own = {name: head[name] for name in ("transparent_surfaces", "warnings")}
+        own = {name: head[name] for name in ("transparent_surfaces", "light_masks")}
         return cls(tuple(meshes), **instances, **own)

@@ -348,9 +348,9 @@ class Tracer:
                     self._attenuate(shares[part], *rays)
         return shares
 
-    def mask_of(self, name: str) -> int:
-        """The mask of the rays to the light `name`."""
-        return ALL_RAYS
+    def mask_of(self, light: str) -> int:
+        """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
+        return self.occluders.mask_of(light)
 
     def starts(self, samples: SurfaceSamples) -> Starts:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.

@@ -40,7 +40,10 @@ def test_the_demo_is_built_and_compared(capsys, child, out):
     assert child.built == [out / "demo.blend"] and child.asked[0].scene == out / "demo.blend"
     assert (child.asked[0].width, child.asked[0].height, child.asked[0].cycles_samples) == (480, 270, 10)
     names = {path.name for path in out.iterdir()}
-    assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html", "timing.json", ".ltsh"}
+    assert names == {"demo.blend", "compare.exr", "compare.png", "report.json", "report.html", "timing.json", ".ltsh",
+                     "unshadowed"}  # fmt: skip
+    assert [options.shadows for options in child.asked] == ["on", "off"]
+    assert {path.name for path in (out / "unshadowed").iterdir()} == names - {"demo.blend", "unshadowed"}
 
 
 @pytest.mark.parametrize("quiet", [[], ["--quiet"]])

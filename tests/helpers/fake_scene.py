@@ -9,6 +9,7 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import Job
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ltsh_addon.visibility import OccluderMesh, Occluders
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
 # Of both halves of the Cycles image around the true one; the factor of A is 1 + NOISE, of B 1 - NOISE.
@@ -76,11 +77,19 @@ def halves(points, some_lights, some_film) -> dict[str, np.ndarray]:
     return reference
 
 
+def wall(height: float, left: float = -9.0) -> Occluders:
+    """A level rectangle from `left` to the right."""
+    corners = [(left, -9.0, height), (9.0, -9.0, height), (9.0, 9.0, height), (left, 9.0, height)]
+    mesh = OccluderMesh(np.array(corners), np.array([(0, 1, 2), (0, 2, 3)]))
+    return Occluders((mesh,), np.zeros(1, int), np.eye(4)[None, :3])
+
+
 class FakeChild:
     """Stands in for `client.extract` and `client.build_demo`; `asked` and `built` tell how they were called."""
 
-    def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None):
+    def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None, wall=None, change=None):
         self.groups, self.empty, self.error = groups, empty, error
+        self.wall, self.change = wall, change  # an occluder (see `wall`), and what becomes of the lights
         self.asked: list[client.ExtractOptions] = []
         self.built: list = []
 
@@ -99,6 +108,7 @@ class FakeChild:
             raise self.error
         some_film = Film(WIDTH, HEIGHT, np.zeros(0, dtype=np.int64)) if self.empty else film()
         points, some_lights = samples(len(some_film.pixel)), lights(self.groups)
+        some_lights = some_lights if self.change is None else self.change(some_lights)
         for stage in ("samples", "Cycles A", "Cycles B"):
             if progress is not None and progress(stage, 1.0) is False:
                 raise Cancelled(f"cancelled at {stage}")
@@ -112,6 +122,7 @@ class FakeChild:
             frame=options.frame if options.frame is not None else 7,
             camera=options.camera or "Camera",
             seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
+            occluders=self.wall if options.shadows == "on" else None,
         )
 
 

@@ -73,7 +73,7 @@ def random_occluders(rng):
     mesh = rng.integers(0, 4, 6)
     matrices = np.concatenate([rng.normal(size=(6, 3, 3)), rng.uniform(-3, 3, (6, 3, 1))], axis=2)
     masks = rng.choice([1, 2, 3, rays.ALL_RAYS], 6)
-    return Occluders(tuple(meshes), mesh, matrices, masks)
+    return Occluders(tuple(meshes), mesh, matrices, masks, light_masks={"Key": 1, "Fill": 6})
 
 
 def random_rays(rng, count):
@@ -178,7 +178,7 @@ def test_occluders_come_back_from_their_file(tmp_path):
     occluders = random_occluders(rng)
     occluders.save(tmp_path / "occluders.npz")
     back = Occluders.load(tmp_path / "occluders.npz")
-    for name in ("mesh", "matrices", "masks", "terminators", "transparent_surfaces", "warnings"):
+    for name in ("mesh", "matrices", "masks", "terminators", "transparent_surfaces", "light_masks"):
         assert np.array_equal(getattr(back, name), getattr(occluders, name))
     for mesh, other in zip(occluders.meshes, back.meshes, strict=True):
         assert np.array_equal(mesh.vertices, other.vertices) and np.array_equal(mesh.triangles, other.triangles)

@@ -435,7 +435,7 @@ def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
         bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
         inventory = collect_lights(depsgraph)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn)
+            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out)
         return inventory, meshes, problems, bare
 
     return with_render_depsgraph(scene, visit)

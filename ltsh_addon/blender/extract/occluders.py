@@ -1,26 +1,480 @@
-"""temporary"""
+"""What blocks light in an evaluated scene (runs in the child).
+
+As in Cycles: what shadow rays see, whoever sees it besides, and however bright it is. Holdouts block. Hair becomes
+tubes and points become balls of flat faces, of the same mean width.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-from ..evaluated import is_surface, read_values
-from ...visibility import OccluderMesh, Occluders
+
+from ...scene import FARTHEST, listed
+from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
+from ..evaluated import SURFACE_TYPES, is_rendered, mesh_key, owner_of, read_values
+from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
+from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
+from ..materials.values import Value, combined, constant, is_gray, is_srgb, product, value_at
+from ..render_settings import cycles_setting
+
+# The place of what is not points.
+AS_IT_IS = np.eye(4)[None]
+# Names of a kind in a warning.
+NAMED = 3
+# Beyond, hair and points are left out: hair would take some 0.7 GiB.
+MOST_PIECES = 1_000_000
+TUBE_SIDES = 3
+# Radius of points without one, in m, as in Cycles.
+POINT_RADIUS = 0.01
 
 
-def collect_occluders(depsgraph, override, warn):
-    meshes, number, matrices = [], [], []
-    for instance in depsgraph.object_instances:
-        if not is_surface(instance):
-            continue
+def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occluders:
+    """What blocks shadow rays in a render of `depsgraph`, but for objects of full names `left_out`.
+
+    `override` is what replaces all materials; `warn(text)` takes what is not as in Cycles. Call it before materials are
+    changed.
+    """
+    return _Collector(depsgraph, override, left_out).collect(warn)
+
+
+class _Collector:
+    def __init__(self, depsgraph, override, left_out):
+        self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
+        self._blockers = Blockers([instance.object.original for instance in depsgraph.object_instances])
+        self._meshes: list[OccluderMesh] = []
+        # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
+        self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
+        self._instances: list[tuple] = []  # (mesh, matrices (N, 3, 4), mask, terminator)
+        self._materials: dict[str, _Clear | None] = {}
+        self._images: dict[tuple, np.ndarray] = {}
+        # Kinds of what is not as in Cycles, with names.
+        self._notes: dict[str, dict[str, None]] = {}
+
+    def collect(self, warn) -> Occluders:
+        for instance in self._depsgraph.object_instances:
+            ob = instance.object
+            if ob.type == "VOLUME" and instance.show_self:
+                self._note("volumes cast no shadows here", ob)
+            if ob.type not in SURFACE_TYPES or ob.original.name_full in self._left_out:
+                continue
+            if not (ob.visible_shadow and owner_of(instance).visible_shadow):
+                continue
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
+                self._note("its transform is not finite, it blocks nothing", ob)
+                continue
+            if instance.show_self and is_rendered(ob):
+                self._add(instance, matrix)
+            if instance.show_particles and not instance.is_instance and ob.particle_systems:
+                self._add_hair(instance)
+        for kind, names in self._notes.items():
+            warn(f"shadows: {kind}: {listed(map(repr, names), NAMED)}")
+        if self._blockers.unnumbered:
+            warn(
+                f"shadows: all objects block lights {listed(map(repr, self._blockers.unnumbered), NAMED)}: more than "
+                f"{MOST_BLOCKER_SETS} blocker collections are not told apart"
+            )
+        free = [name for name, mask in self._blockers.light_masks.items() if mask == 0]
+        if free:
+            warn(
+                f"shadows: lights {listed(map(repr, free), NAMED)} cast none; Cycles still blocks some of their light "
+                "in sharp reflections, unless their multiple importance sampling is off"
+            )
+        return self._joined()
+
+    def _joined(self) -> Occluders:
+        counts = [len(matrices) for _, matrices, _, _ in self._instances]
+        mesh, masks, terminators = (
+            np.repeat([instance[row] for instance in self._instances], counts) for row in (0, 2, 3)
+        )
+        matrices = [matrices for _, matrices, _, _ in self._instances]
+        return Occluders(
+            tuple(self._meshes),
+            mesh.astype(np.int64),
+            np.concatenate(matrices) if matrices else np.zeros((0, 3, 4)),
+            masks.astype(np.uint32),
+            terminators,
+            int(cycles_setting(self._depsgraph.scene, "transparent_max_bounces")),
+            {name: mask for name, mask in self._blockers.light_masks.items() if mask != OTHER_LIGHTS},
+        )
+
+    def _note(self, kind: str, block) -> None:
+        self._notes.setdefault(kind, {})[block.original.name if block.original else block.name] = None
+
+    def _place(self, instance, matrix, numbers, places=AS_IT_IS) -> None:
+        mask = self._blockers.mask_of(instance)
+        terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
+        self._instances += [(number, (matrix @ places)[:, :3], mask, terminator) for number in numbers]
+
+    # -- surfaces --
+
+    def _add(self, instance, matrix) -> None:
         ob = instance.object
-        mesh = ob.to_mesh()
-        if mesh is None:
-            continue
+        materials = [slot.material for slot in ob.material_slots] or [None]
+        if self._override:
+            materials = [self._override] * len(materials)
+        if self._simplified(ob):
+            self._note("camera or distance culling is on, but it blocks everywhere", ob)
+        key = (*mesh_key(instance), tuple(material.name_full if material else "" for material in materials))
+        if key not in self._parts:
+            clear = [self._clear_of(material) for material in materials]
+            places = AS_IT_IS
+            if ob.type == "CURVES":
+                meshes = _tubes_of_curves(ob, clear[0], self._note)
+            elif ob.type == "POINTCLOUD":
+                meshes, places = _balls(ob, clear[0], self._note)
+            else:
+                meshes = _split(ob, clear, self._image)
+                if any(material is not None and _is_displaced(material) for material in materials):
+                    self._note("displacement is not in shadows, the surface blocks where it is without", ob)
+            self._parts[key] = self._number(meshes), places
+        self._place(instance, matrix, *self._parts[key])
+
+    def _number(self, meshes) -> list[int]:
+        """Numbers of the `meshes`, which are kept."""
+        first = len(self._meshes)
+        self._meshes += [mesh for mesh in meshes if len(mesh.triangles)]
+        return list(range(first, len(self._meshes)))
+
+    def _simplified(self, ob) -> bool:
+        scene, names = self._depsgraph.scene, ("use_camera_cull", "use_distance_cull")
+        return scene.render.use_simplify and any(
+            cycles_setting(scene, name) and cycles_setting(ob, name) for name in names
+        )
+
+    def _clear_of(self, material) -> _Clear | None:
+        """What a material lets through; None where it blocks."""
+        if material is None:
+            return None
+        if material.name_full not in self._materials:
+            self._materials[material.name_full] = self._read(material.original)
+        return self._materials[material.name_full]
+
+    def _read(self, material):
+        surface = surface_of(material)
+        if surface is None or not getattr(material, "use_transparent_shadow", True):
+            return None
+        output = surface.node
+        if live_link(surface) is None:
+            if live_link(output.inputs["Volume"]) is None:
+                return None
+            self._note("volumes cast no shadows here", material)
+            return _Clear(constant(1.0))
+        value = _share_at(surface)
+        if value is None:
+            self._note("it is transparent in a way that is not read here, and blocks as if it were opaque", material)
+            return None
+        if not is_gray(value):
+            self._note("colored transparency counts by its mean, shadows are gray", material)
+            value = value.mapped(np.full((3, 3), 1.0 / 3.0))
+        if value.is_constant:
+            share = float(np.clip(value.offset[0], 0.0, 1.0))
+            return _Clear(constant(share)) if share > 0.0 else None
+        image = self._image(value)
+        if image is None:
+            self._note("only Cycles knows the colors of its image, it blocks as if it were opaque", material)
+            return None
+        return _Clear(value) if image.max() > 0.0 else None
+
+    def _image(self, value: Value) -> np.ndarray | None:
+        """Shares (H, W) of the light that the image of `value` lets through."""
+        use = value.image
+        key = (use.image.session_uid, value.matrix[0].tobytes(), value.offset[0].tobytes())
+        if key not in self._images:
+            self._images[key] = _shares_of_image(value)
+        return self._images[key]
+
+    # -- hair of particle systems --
+
+    def _add_hair(self, instance) -> None:
+        ob = instance.object
+        for modifier in ob.modifiers:
+            system = modifier.particle_system if modifier.type == "PARTICLE_SYSTEM" else None
+            if system is None or not modifier.show_render:
+                continue
+            settings = system.settings
+            if settings.type != "HAIR" or settings.render_type != "PATH":
+                continue
+            count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
+            if count * steps > MOST_PIECES:
+                self._note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+                continue
+            self._note("hair blocks as tubes of three flat sides", ob)
+            slot = min(settings.material, len(ob.material_slots)) - 1
+            material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
+            meshes = [_tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
+            # Particles are in world space.
+            self._place(instance, np.eye(4), self._number(meshes))
+
+
+# -- what materials let through ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Clear:
+    """Share of light that a material lets through."""
+
+    value: Value
+
+    def transparency(self, uv_of, image_of) -> Transparency:
+        """For triangles; `uv_of(name)` are their corners on a UV map, `image_of(value)` the shares of an image."""
+        if self.value.is_constant:
+            return Transparency(float(self.value.offset[0]))
+        use = self.value.image
+        mapping = np.array(use.mapping, np.float32)
+        uv = uv_of(use.uv_map) @ mapping[:, :2].T + mapping[:, 2]
+        interpolation = "Closest" if use.closest else "Linear"
+        return Transparency(1.0, image_of(self.value), uv.astype(np.float32), use.extension, interpolation)
+
+
+def _share_at(socket, groups: tuple = ()) -> Value | None:
+    """Share of light that the shader at the input `socket` lets through, as shadow rays see it; None: unknown."""
+    source = source_of(socket, groups)
+    if source is None or source.node is None:
+        return constant(0.0)
+    node, groups = source.node, source.groups
+    if node.bl_idname == CLEAR:
+        return value_at(node.inputs["Color"], groups)
+    if node.bl_idname == PRINCIPLED:
+        alpha = value_at(node.inputs["Alpha"], groups)
+        return combined(constant(1.0), alpha, 1.0, -1.0)
+    if node.bl_idname not in (MIX, ADD):
+        return constant(0.0)
+    parts = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
+    if node.bl_idname == ADD:
+        return combined(*parts, 1.0, 1.0)
+    if all(part is not None and part.is_constant and not part.offset.any() for part in parts):
+        return parts[0]  # whatever the factor is
+    factor = _factor_at(node.inputs[0], groups)
+    if factor is None:
+        return None
+    if factor.is_constant:
+        share = float(np.clip(factor.offset[0], 0.0, 1.0))
+        # What is not there need not be known.
+        if share in (0.0, 1.0):
+            return parts[int(share)]
+        return combined(*parts, 1.0 - share, share)
+    first, second = parts
+    if first is None or second is None or not (first.is_constant and second.is_constant):
+        return None
+    return combined(first, product(factor, constant(second.offset - first.offset)), 1.0, 1.0)
+
+
+def _factor_at(socket, groups) -> Value | None:
+    """The factor of a Mix Shader node; shadow rays are of one kind alone."""
+    source = source_of(socket, groups)
+    if source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeLightPath":
+        name = source.socket.name
+        return constant(float(name == "Is Shadow Ray")) if name.startswith("Is ") else None
+    return value_at(socket, groups)
+
+
+def _shares_of_image(value: Value) -> np.ndarray | None:
+    image = value.image.image
+    colors_count = bool(np.any(value.matrix[:, :3]))
+    srgb = is_srgb(image)
+    if not all(image.size) or (colors_count and srgb is None):
+        return None
+    width, height = image.size
+    pixels = np.empty(width * height * 4, np.float32)
+    image.pixels.foreach_get(pixels)
+    pixels = pixels.reshape(height, width, 4)
+    if image.alpha_mode == "NONE":
+        pixels[..., 3] = 1.0
+    if colors_count and image.alpha_mode != "CHANNEL_PACKED" and (pixels[..., 3] != 1.0).any():
+        return None  # Cycles multiplies colors by alpha, unless both are used
+    if colors_count and srgb:
+        colors = pixels[..., :3]
+        pixels[..., :3] = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    shares = pixels @ value.matrix[0].astype(np.float32) + np.float32(value.offset[0])
+    return np.clip(shares, 0.0, 1.0)
+
+
+def _is_displaced(material) -> bool:
+    surface = surface_of(material)
+    if surface is None or live_link(surface.node.inputs["Displacement"]) is None:
+        return False
+    return getattr(material, "displacement_method", "BUMP") != "BUMP"
+
+
+# -- shapes --------------------------------------------------------------------------------------------------------
+
+
+def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
+    """The faces of `ob` that block, and those of each slot that let light through."""
+    mesh = ob.to_mesh()
+    if mesh is None:
+        return []
+    try:
         mesh.calc_loop_triangles()
-        n = len(mesh.loop_triangles)
-        if n:
-            v = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-            t = read_values(mesh.loop_triangles, "vertices", (n, 3), np.int32)
-            number.append(len(meshes))
-            meshes.append(OccluderMesh(v, t))
-            matrices.append(np.array(instance.matrix_world, dtype=np.float64)[:3])
+        count = len(mesh.loop_triangles)
+        if not count:
+            return []
+        loops, triangles = (
+            read_values(mesh.loop_triangles, name, (count, 3), np.int32) for name in ("loops", "vertices")
+        )
+        slots = np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, len(clear) - 1)
+        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+        normals = None
+        if mesh.normals_domain == "POINT":
+            normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
+        elif mesh.normals_domain == "CORNER":
+            normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)[loops]
+
+        def uv_of(name):
+            layers = mesh.uv_layers
+            layer = layers.get(name) if name else next((other for other in layers if other.active_render), None)
+            if layer is None:
+                return np.zeros((count, 3, 2), np.float32)
+            return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
+
+        found = []
+        blocking = np.array([part is None for part in clear])
+        for slot in [None, *(np.flatnonzero(~blocking))]:
+            here = blocking[slots] if slot is None else slots == slot
+            if not here.any():
+                continue
+            transparency = None
+            if slot is not None:
+                transparency = clear[slot].transparency(lambda name, here=here: uv_of(name)[here], image_of)
+                if transparency.share == 1.0 and transparency.image is None:
+                    continue
+            found.append(_part(vertices, triangles, normals, here, transparency))
+        return found
+    finally:
         ob.to_mesh_clear()
-    return Occluders(tuple(meshes), np.array(number), np.array(matrices))
+
+
+def _part(vertices, triangles, normals, here, transparency) -> OccluderMesh:
+    if here.all():
+        return OccluderMesh(vertices, triangles, transparency, normals)
+    used, named = np.unique(triangles[here], return_inverse=True)
+    if normals is not None:
+        normals = normals[used] if normals.ndim == 2 else normals[here]
+    return OccluderMesh(vertices[used], named.reshape(-1, 3), transparency, normals)
+
+
+def _tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
+    """Hair curves through their points."""
+    curves = ob.data
+    points = len(curves.points)
+    if points > MOST_PIECES:
+        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        return []
+    if not points:
+        return []
+    note("hair blocks as tubes of three flat sides", ob)
+    places = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
+    radii = np.full(points, POINT_RADIUS, np.float32)
+    if "radius" in curves.attributes:
+        radii = read_values(curves.attributes["radius"].data, "value", (points,), np.float32)
+    first = read_values(curves.curves, "first_point_index", (len(curves.curves),), np.int32)
+    return [_tubes(places, radii, first, _constant_transparency(clear, ob, note))]
+
+
+def _tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
+    """Hair of a particle system, in world space."""
+    settings = system.settings
+    along = np.linspace(0.0, 1.0, steps)
+    root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
+    shape = settings.shape
+    power = 1.0 + shape if shape < 0.0 else 1.0 / max(1.0 - shape, 1e-6)
+    radius = tip + (root - tip) * (1.0 - along) ** power
+    if settings.use_close_tip:
+        radius[-1] = 0.0
+    places = np.array(
+        [system.co_hair(object=ob, particle_no=number, step=step) for number in range(count) for step in range(steps)],
+        np.float32,
+    ).reshape(-1, 3)
+    radii = np.tile(radius, count).astype(np.float32)
+    return _tubes(places, radii, np.arange(count) * steps, _constant_transparency(clear))
+
+
+def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
+    """Of hair and points, which have no UV maps."""
+    if clear is None:
+        return None
+    if clear.value.is_constant:
+        return Transparency(float(clear.value.offset[0]))
+    if note is not None:
+        note("an image on hair or points is not read here, they block as if they were opaque", ob)
+    return None
+
+
+def _tubes(places, radii, first, transparency) -> OccluderMesh:
+    """Tubes around the curves that begin at the points `first`, of the mean width of round ones."""
+    points, sides = len(places), TUBE_SIDES
+    starts = np.ones(points, bool)
+    starts[first] = False
+    ends = np.flatnonzero(starts)  # of the pieces, each begins at the point before
+    along = np.zeros((points, 3))
+    along[ends] += places[ends] - places[ends - 1]
+    along[ends - 1] += places[ends] - places[ends - 1]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
+    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+    x = np.cross(along, axis)
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
+    y = np.cross(along, x)
+    # A convex outline is as wide, in the mean over all directions, as its length over pi.
+    out = radii.astype(np.float64) * math.pi / (sides * math.sin(math.pi / sides))
+    angle = 2.0 * math.pi * np.arange(sides) / sides
+    ring = np.cos(angle)[:, None] * x[:, None] + np.sin(angle)[:, None] * y[:, None]
+    vertices = (places[:, None] + out[:, None, None] * ring).reshape(-1, 3)
+    one, two = np.arange(sides), (np.arange(sides) + 1) % sides
+    low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
+    triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
+    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency)
+
+
+def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
+    """A ball, and the places (N, 4, 4) that it has in a point cloud."""
+    cloud = ob.data
+    count = len(cloud.points)
+    if count > MOST_PIECES:
+        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        count = 0
+    if not count:
+        return [], AS_IT_IS
+    note("points block as balls of 80 flat faces", ob)
+    radii = np.full(count, POINT_RADIUS, np.float32)
+    if "radius" in cloud.attributes:
+        radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
+    places = np.zeros((count, 4, 4))
+    places[:, range(3), range(3)] = radii[:, None]
+    places[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
+    places[:, 3, 3] = 1.0
+    return [OccluderMesh(*_ball(), _constant_transparency(clear, ob, note))], places
+
+
+@cache
+def _ball():
+    """A ball of 80 triangles, whose mean shadow is that of a round one of radius 1: vertices, triangles."""
+    golden = (1.0 + math.sqrt(5.0)) / 2.0
+    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    corners = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
+    apart = np.linalg.norm(corners[:, None] - corners, axis=-1)
+    near = np.abs(apart - 2.0) < 1e-9
+    faces = [
+        (a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]
+    ]
+    vertices, triangles, middles = list(corners), [], {}
+    for face in faces:
+        between = []
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            pair = tuple(sorted((face[a], face[b])))
+            if pair not in middles:
+                middles[pair] = len(vertices)
+                vertices.append(0.5 * (corners[pair[0]] + corners[pair[1]]))
+            between.append(middles[pair])
+        ab, bc, ca = between
+        triangles += [(face[0], ab, ca), (face[1], bc, ab), (face[2], ca, bc), (ab, bc, ca)]
+    vertices = np.array(vertices)
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    triangles = np.array(triangles)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    # The mean shadow of what is convex is a quarter of its surface.
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return vertices * math.sqrt(4.0 * math.pi / area), triangles

@@ -177,7 +177,7 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occlud
         bare = [] if override else objects_without_material(surfaces)
         inventory = collect_lights(depsgraph, override)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn)
+            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out)
         return inventory, materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)

@@ -12,7 +12,7 @@ from ...cycles import planar_polygons
 from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import AreaLight
-from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, read_values, surface_instancer
+from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, live_link, material_output
 from .emission import NO_FACTOR, PIXELS, Emission, Falloff, Studio, emission_of, falloff_left_out
 from .linking import Receivers
@@ -65,7 +65,7 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type not in SURFACE_TYPES or not instance.show_self or not _is_rendered(ob):
+        if ob.type not in SURFACE_TYPES or not instance.show_self or not is_rendered(ob):
             continue
         traits = EmitterTraits.of(instance)
         slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
@@ -84,11 +84,6 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
                 if instancer is not None:
                     found[key].instancers[instancer.original.name_full] = instancer
     return [light for light in found.values() if light is not None and light.placements]
-
-
-def _is_rendered(ob) -> bool:
-    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
-    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
 
 
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:

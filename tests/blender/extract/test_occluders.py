@@ -1,0 +1,573 @@
+"""What blocks light, against the shadows of Cycles under a light so small that a point is lit or not."""
+
+import math
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts
+from material_scenes import Build
+
+from ltsh_addon.blender.evaluated import with_render_depsgraph
+from ltsh_addon.blender.extract.occluders import collect_occluders
+from ltsh_addon.blender.process.blender_process import embree_libraries
+from ltsh_addon.blender.render_settings import enable_passes, pass_names, pinned_pixel_filter, render_exr
+from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.visibility import Occluders, open_tracer
+
+SIZE = (48, 32)
+WIDTH = 6.0
+LIGHT = np.array([1.2, 0.9, 4.0])
+LIGHT_SIZE = 2e-3
+
+
+def start():
+    """An empty scene: a white floor seen from above, lit by a light that is nearly a point."""
+    scene = scene_parts.empty_scene(*SIZE)
+    scene_parts.add_top_camera(WIDTH)
+    scene.camera.location.z = 9.0
+    floor = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(1.0, 1.0, 1.0, 1.0))[0]
+    scene_parts.add_plane(floor, size=8.0, name="Floor")
+    add_light("Key", LIGHT)
+    return scene
+
+
+def add_light(name, place, **settings):
+    settings = {"shape": "SQUARE", "size": LIGHT_SIZE, "energy": 1000.0, **settings}
+    return scene_parts.add_area_light(name, place, (0.0, 0.0, 0.0), **settings)
+
+
+def hidden(ob):
+    """`ob`, which the camera does not see."""
+    ob.visible_camera = False
+    return ob
+
+
+def floor_points():
+    """Centers (N, 3) of the pixels on the floor, row 0 on top."""
+    width, height = SIZE
+    step = WIDTH / width
+    x = (np.arange(width) + 0.5) * step - 0.5 * WIDTH
+    y = 0.5 * height * step - (np.arange(height) + 0.5) * step
+    return np.stack([*np.meshgrid(x, y), np.zeros((height, width))], axis=-1).reshape(-1, 3)
+
+
+def seen_by_cycles(folder, light=LIGHT):
+    """Share (N,) of the light that reaches the floor in Cycles."""
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.samples, cycles.max_bounces, cycles.use_adaptive_sampling, cycles.use_denoising = 1, 0, False, False
+    cycles.light_sampling_threshold = cycles.sample_clamp_direct = 0.0
+    enable_passes(bpy.context.view_layer, ("combined", "diffuse_direct"))
+    with pinned_pixel_filter(scene):
+        render_exr(scene, folder / "cycles.exr")
+    channels, wanted = read_channels(folder / "cycles.exr"), f"{pass_names()['diffuse_light']}.R"
+    found = next(values for name, values in channels.items() if name.endswith(wanted)).ravel()
+    power = 1000.0 / math.pi  # times cosine over pi, twice: at the light, whose area takes its radiance, and the floor
+    to_light = light - floor_points()
+    distance = np.linalg.norm(to_light, axis=-1)
+    return found / (power * (to_light[:, 2] / distance) ** 2 / distance**2 / math.pi)
+
+
+def collected():
+    """The occluders of the open scene and the warnings about them."""
+    warnings = []
+    scene = bpy.context.scene
+    override = bpy.context.view_layer.material_override
+    occluders = with_render_depsgraph(scene, lambda depsgraph: collect_occluders(depsgraph, override, warnings.append))
+    return occluders, warnings
+
+
+def seen_by_rays(occluders, light=LIGHT, name="Key"):
+    """Share (N,) of light that reaches the floor, and a mask of the points where the size of the light, the place in
+    the pixel or single precision does not matter."""
+    points = floor_points()
+    with open_tracer(occluders, embree_libraries()) as tracer:
+        shares = []
+        for x, y in ((0, 0), (3, 0), (-3, 0), (0, 3), (0, -3)):
+            origins = points + [x * LIGHT_SIZE, y * LIGHT_SIZE, 1e-5]
+            directions = light - origins
+            distances = np.linalg.norm(directions, axis=1)
+            directions /= distances[:, None]
+            masks = np.full(len(points), tracer.mask_of(name), np.uint32)
+            shares.append(tracer.transmittance(origins, directions, distances, masks))
+    return shares[0], np.ptp(shares, axis=0) < 0.02
+
+
+def assert_as_cycles(folder, note="", least=0.03, most_doubtful=0.35):
+    """The occluders, whose shadow is that of Cycles; `note` is all that is warned of."""
+    expected = seen_by_cycles(folder)
+    occluders, warnings = collected()
+    found, is_sure = seen_by_rays(occluders)
+    assert is_sure.mean() > 1.0 - most_doubtful
+    blocked = (1.0 - found)[is_sure]
+    assert (blocked > 0.2).mean() >= least, "no shadow to compare"
+    off = np.abs(found - expected)[is_sure]
+    # A pixel of 1,536 at a silhouette may be on its other side.
+    assert (off > 0.01).sum() <= 2, f"{(off > 0.01).sum()} pixels are off by up to {off.max():.3f}"
+    assert len(warnings) == bool(note) and all(note in line for line in warnings), warnings
+    return occluders
+
+
+# -- shapes --
+
+
+def cube(location=(0.0, 0.0, 1.0), size=1.0, material=None):
+    bpy.ops.mesh.primitive_cube_add(size=size, location=location)
+    ob = hidden(bpy.context.object)
+    if material is not None:
+        ob.data.materials.append(material)
+    return ob
+
+
+def modified():
+    ob = cube()
+    for name, viewport, render in (("Subsurf", 0, 2), ("Other", 1, 3)):
+        modifier = ob.modifiers.new(name, "SUBSURF")
+        modifier.levels, modifier.render_levels = viewport, render
+    ob.modifiers["Other"].show_render = False
+
+
+def curve():
+    bpy.ops.curve.primitive_bezier_circle_add(radius=1.0, location=(0.0, 0.0, 1.0))
+    ob = hidden(bpy.context.object)
+    ob.data.bevel_depth = 0.2
+    ob.data.dimensions = "3D"
+
+
+def text():
+    bpy.ops.object.text_add(location=(-1.2, -0.4, 1.0))
+    ob = hidden(bpy.context.object)
+    ob.data.body, ob.data.size, ob.data.extrude = "HI", 1.5, 0.05
+
+
+def metaballs():
+    bpy.ops.object.metaball_add(type="BALL", radius=1.0, location=(0.0, 0.0, 1.0))
+    hidden(bpy.context.object).data.render_resolution = 0.1
+
+
+def nurbs_surface():
+    bpy.ops.surface.primitive_nurbs_surface_sphere_add(radius=0.8, location=(0.0, 0.0, 1.0))
+    hidden(bpy.context.object)
+
+
+def collection_instances():
+    """Instances of a collection that is itself not in the scene, mirrored and of different sizes."""
+    collection = bpy.data.collections.new("Parts")
+    ob = cube((0.3, 0.0, 0.0), 0.6)
+    bpy.context.scene.collection.objects.unlink(ob)
+    collection.objects.link(ob)
+    for number, scale in enumerate(((1.0, 1.0, 1.0), (-0.7, 1.2, 0.5))):
+        instance = scene_parts.link(bpy.data.objects.new(f"I{number}", None), (number - 0.8, 0.3, 1.0), scale=scale)
+        instance.instance_type, instance.instance_collection = "COLLECTION", collection
+        instance.rotation_euler = (0.3, 0.2, 0.4 * number)
+
+
+def vertex_instances():
+    parent = hidden(scene_parts.add_plane(size=1.6, name="Parent", location=(0.0, 0.0, 1.0)))
+    parent.instance_type = "VERTS"
+    parent.show_instancer_for_render = False
+    child = cube((0.0, 0.0, 0.0), 0.5)
+    child.parent = parent
+
+
+def shared_data():
+    first = cube((-0.8, 0.0, 1.0), 0.7)
+    second = hidden(bpy.data.objects.new("Second", first.data))
+    scene_parts.link(second, (0.7, 0.2, 1.1), (0.4, 0.1, 0.9), (0.5, 1.0, 1.3))
+
+
+def not_in_the_picture():
+    """Objects that the camera, reflections or the view layer do not show, but whose shadow is there."""
+    a, b, c = cube((-1.0, 0.0, 1.0), 0.6), cube((0.2, 0.0, 1.0), 0.6), cube((1.0, 0.8, 1.0), 0.4)
+    a.visible_diffuse = a.visible_glossy = False
+    b.is_holdout = True
+    collection = bpy.data.collections.new("Indirect")
+    bpy.context.scene.collection.children.link(collection)
+    bpy.context.scene.collection.objects.unlink(c)
+    collection.objects.link(c)
+    bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
+
+
+def glowing():
+    cube(material=scene_parts.bsdf_material("ShaderNodeEmission", "Glow", Strength=0.0)[0])
+
+
+def glass():
+    cube(material=scene_parts.bsdf_material("ShaderNodeBsdfGlass", "Glass")[0])
+
+
+def no_surface_shader():
+    cube(material=scene_parts.new_material("Nothing")[0])
+
+
+def overridden():
+    clear = scene_parts.bsdf_material("ShaderNodeBsdfTransparent", "Clear")[0]
+    cube(material=clear)
+    bpy.context.view_layer.material_override = bpy.data.materials["Floor"]
+
+
+SHAPES = {
+    function.__name__: function
+    for function in (
+        *(modified, curve, text, metaballs, nurbs_surface, collection_instances, vertex_instances, shared_data),
+        *(not_in_the_picture, glowing, glass, no_surface_shader, overridden),
+    )
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_shadows_of_shapes_are_those_of_cycles(tmp_path, name):
+    start()
+    SHAPES[name]()
+    assert_as_cycles(tmp_path)
+
+
+def test_what_casts_no_shadow_blocks_nothing(tmp_path):
+    start()
+    for ob, name in ((cube((-1, 0, 1)), "A"), (cube((1, 0, 1)), "B"), (cube((0, 0, 1)), "C")):
+        ob.name = name
+    bpy.data.objects["A"].visible_shadow = False
+    bpy.data.objects["B"].hide_render = True
+    bpy.data.objects["C"].data.materials.append(scene_parts.bsdf_material("ShaderNodeBsdfTransparent", "Clear")[0])
+    parent = hidden(scene_parts.add_plane(size=1.0, name="Parent", location=(0.0, 0.0, 1.0)))
+    parent.instance_type, parent.visible_shadow = "VERTS", False
+    cube((0.0, 0.0, 0.0), 0.5).parent = parent
+    assert seen_by_cycles(tmp_path) == pytest.approx(1.0, abs=2e-3)
+    occluders, warnings = collected()
+    assert warnings == [] and len(occluders.mesh) == 1  # the floor
+
+
+# -- materials --
+
+
+def pane(material):
+    """A square in the way of half of the light, with a UV map."""
+    return hidden(scene_parts.add_plane(material, size=2.0, name="Pane", location=(0.3, 0.2, 1.0)))
+
+
+def checkered(name="Mask", interpolate="Closest", space="Non-Color"):
+    """An image whose alpha and colors are two patterns of 4 x 4."""
+    image = bpy.data.images.new(name, 4, 4, alpha=True)
+    image.colorspace_settings.name = space
+    rng = np.random.default_rng(3)
+    pixels = rng.integers(0, 256, (4, 4, 4)) / 255.0
+    pixels[..., 3] = rng.integers(0, 3, (4, 4)) / 2.0
+    image.pixels.foreach_set(pixels.astype(np.float32).ravel())
+    image.pack()
+    return image
+
+
+def textured(made, output, **settings):
+    """The output of an image texture."""
+    node = made.tree.nodes.new("ShaderNodeTexImage")
+    node.image, node.interpolation = checkered(space=settings.pop("space", "Non-Color")), "Closest"
+    if output == "Color":
+        node.image.alpha_mode = "CHANNEL_PACKED"
+    for key, value in settings.items():
+        setattr(node, key, value)
+    return node.outputs[output]
+
+
+def clear(made, color=1.0):
+    return made.shader("BsdfTransparent", Color=(color, color, color, 1.0))
+
+
+def alpha_image(made, **settings):
+    inside = made.shader("BsdfPrincipled")
+    made.tree.links.new(textured(made, "Alpha", **settings), inside.node.inputs["Alpha"])
+    return inside
+
+
+def mapped_image(made):
+    inside = alpha_image(made)
+    texture = next(node for node in made.tree.nodes if node.bl_idname == "ShaderNodeTexImage")
+    mapping, place = made.tree.nodes.new("ShaderNodeMapping"), made.tree.nodes.new("ShaderNodeTexCoord")
+    mapping.inputs["Rotation"].default_value[2] = 0.6
+    mapping.inputs["Scale"].default_value = (2.0, 3.0, 1.0)
+    made.tree.links.new(place.outputs["UV"], mapping.inputs["Vector"])
+    made.tree.links.new(mapping.outputs[0], texture.inputs["Vector"])
+    return inside
+
+
+def mixed_by_image(made):
+    return made.mix(textured(made, "Color", space="sRGB"), made.leaf(0.5), clear(made, 0.8))
+
+
+def is_shadow_ray(made):
+    node = made.tree.nodes.new("ShaderNodeLightPath")
+    return made.mix(node.outputs["Is Shadow Ray"], made.shader("BsdfGlass"), clear(made, 0.7))
+
+
+def is_camera_ray(made):
+    node = made.tree.nodes.new("ShaderNodeLightPath")
+    return made.mix(node.outputs["Is Camera Ray"], made.leaf(0.5), clear(made))
+
+
+def stack(made):
+    return made.mix(made.value(0.5), clear(made, 0.5), made.mix(made.value(0.25), made.leaf(0.5), clear(made)))
+
+
+# What a pane's share is, if it is the same everywhere.
+MATERIALS = {
+    "constant": (lambda made: made.mix(made.value(0.3), made.leaf(0.5), clear(made)), 0.3),
+    "principled alpha": (lambda made: made.shader("BsdfPrincipled", Alpha=0.35), 0.65),
+    "added": (lambda made: made.add(clear(made, 0.25), made.add(clear(made, 0.25), made.leaf(0.5))), 0.5),
+    "nested": (stack, 0.375),
+    "holdout": (lambda made: made.mix(made.value(0.5), made.shader("Holdout"), clear(made)), 0.5),
+    "shadow rays": (is_shadow_ray, 0.7),
+    "camera rays": (is_camera_ray, 0.0),
+    "alpha of an image": (alpha_image, None),
+    "clipped image": (lambda made: alpha_image(made, extension="CLIP"), None),
+    "mapped image": (mapped_image, None),
+    "mixed by a color": (mixed_by_image, None),
+}
+
+
+def shown(make):
+    made = Build("Pane")
+    made.show(make(made))
+    return made.material
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_shadows_of_materials_are_those_of_cycles(tmp_path, name):
+    make, share = MATERIALS[name]
+    start()
+    ob = pane(shown(make))
+    if name == "clipped image":
+        uv = ob.data.uv_layers[0].uv
+        uv.foreach_set("vector", 1.6 * np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32) - 0.3)
+    occluders = assert_as_cycles(tmp_path)
+    if share is not None:
+        assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
+
+
+def test_an_image_is_interpolated_as_in_cycles(tmp_path):
+    start()
+    pane(shown(lambda made: alpha_image(made, interpolation="Linear")))
+    expected = seen_by_cycles(tmp_path)
+    found, _ = seen_by_rays(collected()[0])
+    # The light is 2 mm wide, and alpha changes by at most 1 from one pixel of the image, of 0.5 m, to the next.
+    assert np.abs(found - expected).max() < 0.02
+
+
+def test_transparent_shadows_may_be_off(tmp_path):
+    start()
+    material = shown(lambda made: clear(made))
+    material.use_transparent_shadow = False
+    pane(material)
+    assert seen_by_rays(assert_as_cycles(tmp_path))[0].min() == 0.0
+
+
+def test_each_slot_has_its_own_transparency(tmp_path):
+    start()
+    ob = pane(shown(lambda made: clear(made, 0.5)))
+    ob.data.materials.append(scene_parts.principled("Other")[0])
+    corners = [(x, y, z) for z in (0.3, 0.6) for x, y in ((-1, -1), (0.2, -1), (0.2, 1), (-1, 1))]
+    other = hidden(scene_parts.add_mesh("Both", corners, [(0, 1, 2, 3), (4, 5, 6, 7)], location=(0.2, 0.0, 1.5)))
+    other.data.materials.append(ob.data.materials[0])
+    other.data.materials.append(None)
+    other.data.polygons[1].material_index = 1
+    other.material_slots[1].link = "OBJECT"
+    other.material_slots[1].material = shown(lambda made: clear(made, 0.25))
+    found = seen_by_rays(assert_as_cycles(tmp_path))[0]
+    assert {0.5, 0.125, 0.0625} <= set(np.round(found, 5))
+
+
+def test_more_panes_than_cycles_goes_through_block(tmp_path):
+    for most in (2, 3):
+        scene = start()
+        scene.cycles.transparent_max_bounces = most
+        for number in range(3):
+            pane(shown(lambda made: clear(made, 0.9))).location.z += 0.1 * number
+        found = seen_by_rays(assert_as_cycles(tmp_path))[0]
+        assert found.min() == pytest.approx(0.0 if most == 2 else 0.729, abs=1e-5)
+
+
+NAMED = {
+    "procedural": "'Pane'",
+    "colored": "by its mean",
+    "color under alpha": "only Cycles knows",
+    "displaced": "displacement",
+    "volume": "volumes cast no shadows",
+}
+
+
+def procedural(made):
+    return made.mix(made.tree.nodes.new("ShaderNodeTexNoise").outputs[0], made.leaf(0.5), clear(made))
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_what_is_not_as_in_cycles_is_named(name):
+    start()
+    if name == "procedural":
+        pane(shown(procedural))
+    elif name == "colored":
+        pane(shown(lambda made: made.shader("BsdfTransparent", Color=(1.0, 0.5, 0.0, 1.0))))
+    elif name == "color under alpha":
+        pane(shown(mixed_by_image))
+        bpy.data.images["Mask"].alpha_mode = "STRAIGHT"
+    elif name == "volume":
+        made = Build("Pane")
+        made.link(made.shader("VolumePrincipled"), made.output.inputs["Volume"])
+        pane(made.material)
+    else:
+        made = Build("Pane")
+        made.show(made.leaf(0.5))
+        made.material.displacement_method = "DISPLACEMENT"
+        node = made.tree.nodes.new("ShaderNodeDisplacement")
+        made.tree.links.new(node.outputs[0], made.output.inputs["Displacement"])
+        pane(made.material)
+    occluders, warnings = collected()
+    assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
+    share = {"colored": 0.5, "volume": 1.0}.get(name, 0.0)
+    assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
+
+
+# -- hair and points --
+
+
+def test_points_have_the_shadow_of_balls(tmp_path):
+    start()
+    cloud = hidden(scene_parts.link(bpy.data.objects.new("Points", point_cloud(60))))
+    cloud.rotation_euler = (0.1, 0.2, 0.3)
+    assert_mean_shadow(tmp_path, "balls", 0.01)
+
+
+def point_cloud(count):
+    rng = np.random.default_rng(0)
+    cloud = bpy.data.pointclouds.new("Points")
+    if hasattr(cloud, "resize"):
+        cloud.resize(count)
+    else:
+        bpy.data.pointclouds.remove(cloud)
+        mesh = bpy.data.meshes.new("Seeds")
+        mesh.from_pydata([(0.0, 0.0, 0.0)] * count, [], [])
+        seeds = scene_parts.link(bpy.data.objects.new("Seeds", mesh))
+        bpy.context.view_layer.objects.active = seeds
+        seeds.select_set(True)
+        bpy.ops.object.convert(target="POINTCLOUD")
+        cloud = bpy.context.object.data
+        bpy.data.objects.remove(bpy.context.object)
+    places = rng.uniform(-1, 1, (count, 3)) * [1.5, 1.0, 0.3] + [0, 0, 1]
+    cloud.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
+    if "radius" not in cloud.attributes:
+        cloud.attributes.new("radius", "FLOAT", "POINT")
+    cloud.attributes["radius"].data.foreach_set("value", rng.uniform(0.05, 0.2, count).astype(np.float32))
+    return cloud
+
+
+def assert_mean_shadow(folder, note, tolerance):
+    """The shadow is that of Cycles but at silhouettes, which facets move both ways."""
+    expected = seen_by_cycles(folder)
+    occluders, warnings = collected()
+    found, _ = seen_by_rays(occluders)
+    assert len(warnings) == 1 and note in warnings[0], warnings
+    assert 0.03 < 1.0 - expected.mean() < 0.6
+    assert found.mean() == pytest.approx(expected.mean(), abs=tolerance)
+    assert (np.abs(found - expected) > 0.5).mean() < 4.0 * tolerance
+    return occluders
+
+
+def hair_curves(count, points=6):
+    rng = np.random.default_rng(1)
+    curves = bpy.data.hair_curves.new("Hair")
+    curves.add_curves([points] * count)
+    roots = rng.uniform(-1, 1, (count, 1, 3)) * [1.5, 1.0, 0.2] + [0, 0, 1]
+    along = np.linspace(0, 1, points)[None, :, None]
+    places = roots + along * rng.uniform(-1, 1, (count, 1, 3)) + 0.2 * along**2 * rng.uniform(-1, 1, (count, 1, 3))
+    curves.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
+    if "radius" not in curves.attributes:
+        curves.attributes.new("radius", "FLOAT", "POINT")
+    curves.attributes["radius"].data.foreach_set("value", np.full(count * points, 0.06, np.float32))
+    return curves
+
+
+def test_hair_curves_have_the_shadow_of_tubes(tmp_path):
+    start()
+    hidden(scene_parts.link(bpy.data.objects.new("Hair", hair_curves(25))))
+    assert_mean_shadow(tmp_path, "tubes", 0.015)
+
+
+def test_hair_of_particles_has_the_shadow_of_tubes(tmp_path):
+    start()
+    bpy.ops.mesh.primitive_uv_sphere_add(radius=0.3, location=(0.0, 0.0, 1.5))
+    ob = hidden(bpy.context.object)
+    bpy.ops.object.particle_system_add()
+    settings = ob.particle_systems[0].settings
+    settings.type, settings.count, settings.hair_length, settings.render_step = "HAIR", 60, 0.8, 3
+    settings.root_radius, settings.tip_radius, settings.radius_scale = 1.0, 0.3, 0.1
+    ob.location.x = 0.2
+    assert_mean_shadow(tmp_path, "tubes", 0.015)
+
+
+# -- lights --
+
+
+def two_lights(key_blockers=None, fill_blockers=None):
+    """Two lights and two cubes; a light's blockers are {name of a cube: "INCLUDE" or "EXCLUDE"}."""
+    start()
+    fill = add_light("Fill", (-1.0, -0.8, 4.0))
+    cube((-0.8, 0.0, 1.0), 0.7).name, cube((0.8, 0.0, 1.0), 0.7).name = "A", "B"
+    for light, blockers in ((bpy.data.objects["Key"], key_blockers), (fill, fill_blockers)):
+        if blockers is None:
+            continue
+        collection = bpy.data.collections.new(f"Blockers of {light.name}")
+        for name, state in blockers.items():
+            collection.objects.link(bpy.data.objects[name])
+            collection.collection_objects[-1].light_linking.link_state = state
+        light.light_linking.blocker_collection = collection
+
+
+@dataclass
+class Linked:
+    key: dict | None
+    fill: dict | None
+
+
+LINKED = {
+    "neither": Linked(None, None),
+    "included": Linked({"A": "INCLUDE"}, None),
+    "excluded": Linked({"A": "EXCLUDE"}, {"B": "EXCLUDE"}),
+    "both kinds": Linked({"A": "INCLUDE", "B": "EXCLUDE"}, {"B": "INCLUDE"}),
+}
+
+
+@pytest.mark.parametrize("name", LINKED)
+def test_blockers_of_lights_are_those_of_cycles(tmp_path, name):
+    two_lights(LINKED[name].key, LINKED[name].fill)
+    places = {"Key": LIGHT, "Fill": np.array([-1.0, -0.8, 4.0])}
+    for light in places:
+        other = next(ob for ob in places if ob != light)
+        bpy.data.objects[other].hide_render = True
+        expected = seen_by_cycles(tmp_path, places[light])
+        bpy.data.objects[other].hide_render = False
+        occluders, warnings = collected()
+        found, is_sure = seen_by_rays(occluders, places[light], light)
+        assert warnings == [] and found.min() == 0.0
+        assert (np.abs(found - expected)[is_sure] > 0.01).sum() <= 2
+
+
+def test_a_light_without_shadows_is_not_blocked(tmp_path):
+    start()
+    cube()
+    bpy.data.objects["Key"].data.use_shadow = False
+    occluders, warnings = collected()
+    assert seen_by_rays(occluders)[0].min() == 1.0
+    assert np.abs(seen_by_cycles(tmp_path) - 1.0).max() < 2e-3
+    assert len(warnings) == 1 and "'Key'" in warnings[0] and "sharp reflections" in warnings[0]
+
+
+def test_the_scene_is_left_as_it_was(tmp_path):
+    start()
+    pane(shown(alpha_image))
+    text()
+    before = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
+    occluders, _ = collected()
+    occluders.save(tmp_path / "occluders.npz")
+    after = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
+    assert before == after
+    assert np.array_equal(seen_by_rays(Occluders.load(tmp_path / "occluders.npz"))[0], seen_by_rays(occluders)[0])

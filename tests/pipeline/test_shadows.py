@@ -1,0 +1,122 @@
+"""Pictures with shadows, and what `relight` makes of the samples that they keep. No Blender: see `fake_scene`."""
+
+import json
+from dataclasses import replace
+
+import fake_scene
+import numpy as np
+import pytest
+from fake_scene import run, wall
+
+from ltsh_addon.imaging.exr import read_channels
+
+ARGUMENTS = ("--techniques", "ltsh4,reference", "--quiet")
+
+
+def shade(capsys, monkeypatch, room, output, *arguments, **scene):
+    """The channels of a picture of the fake scene."""
+    fake_scene.FakeChild(**scene).install(monkeypatch)
+    assert run(capsys, "shade", room, "-o", output, *ARGUMENTS, *arguments)[0] == 0
+    return read_channels(output / "shade.exr")
+
+
+def parts(channels, start):
+    return {name: values for name, values in channels.items() if name.startswith(start)}
+
+
+def test_samples_that_see_all_of_their_lights_get_the_same_bits(capsys, monkeypatch, room, out):
+    without = shade(capsys, monkeypatch, room, out / "off", "--shadows", "off", wall=wall(9.0))
+    shadowed = shade(capsys, monkeypatch, room, out / "on", wall=wall(9.0))
+    for name, values in without.items():
+        assert np.array_equal(shadowed[name], values), name
+    for technique in ("ltsh4", "reference"):
+        for name, values in parts(shadowed, f"{technique}_unshadowed.").items():
+            assert np.array_equal(values, without[name.replace("_unshadowed", "")])
+    visibility = parts(shadowed, "visibility.")
+    assert len(visibility) == 2 * 3 and all((values == 1.0).all() for values in visibility.values())
+    assert set(shadowed) == set(without) | set(visibility) | set(parts(shadowed, "ltsh4_unsh")) | set(
+        parts(shadowed, "reference_unsh")
+    )
+
+
+def test_behind_a_wall_is_exactly_nothing(capsys, monkeypatch, room, out):
+    without = shade(capsys, monkeypatch, room, out / "off", "--shadows", "off")
+    shadowed = shade(capsys, monkeypatch, room, out / "on", wall=wall(0.5))
+    for technique in ("ltsh4", "reference"):
+        assert all((values == 0.0).all() for values in parts(shadowed, f"{technique}.").values())
+    assert np.array_equal(shadowed["ltsh4_unshadowed.diffuse.G"], without["ltsh4.diffuse.G"])
+    seen = parts(shadowed, "visibility.specular")
+    hit = shadowed["coverage.hit.V"]
+    assert all(np.array_equal(values, 1.0 - hit) for values in seen.values())
+    report = json.loads((out / "on" / "report.json").read_text(encoding="utf-8"))
+    assert report["shadows"]["rays"] > 0 and report["shadows"]["tracer"].startswith("Embree")
+
+
+def test_light_is_what_the_samples_see_of_it(capsys, monkeypatch, room, out):
+    """Half of the lights is hidden: no value is above the unshadowed one, and some are in between."""
+    shadowed = shade(capsys, monkeypatch, room, out, "--shadow-rays", "256", wall=wall(0.7, left=0.0))
+    found, whole = (shadowed[f"ltsh4{kind}.diffuse.R"] for kind in ("", "_unshadowed"))
+    assert (found <= whole).all() and ((found > 0.1 * whole) & (found < 0.9 * whole)).any()
+
+
+CHANGES = "--light", "Light 1", "--power", "x2", "--color", "1,.5,.25", "--light", "Light 0", "--power", "x0"
+
+
+def changed(lights):
+    """CHANGES: the radiance of light 1 is (3, 3, 1), so that its brightest channel is 3."""
+    return (
+        replace(lights[0], radiance=(0.0, 0.0, 0.0)),
+        replace(lights[1], radiance=2.0 * 3.0 * np.array([1.0, 0.5, 0.25])),
+        lights[2],
+    )
+
+
+@pytest.mark.parametrize("some_wall", [None, wall(0.7, left=0.0)], ids=["lobes alone", "shadows"])
+def test_a_picture_lit_anew_is_that_of_other_lights(capsys, monkeypatch, room, out, some_wall):
+    shade(capsys, monkeypatch, room, out, "--keep-visibility", wall=some_wall)
+    rendered = shade(capsys, monkeypatch, room, out / "other", wall=some_wall, change=changed)
+    monkeypatch.undo()
+    assert run(capsys, "relight", out, *CHANGES, "--quiet")[0] == 0
+    found = read_channels(out / "relit" / "shade.exr")
+    assert set(found) == set(rendered)
+    for name, values in rendered.items():
+        # The dark light has no share of its own to be filtered or traced; all else is the same computation.
+        if "visibility" not in name:
+            np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
+    report = json.loads((out / "relit" / "report.json").read_text(encoding="utf-8"))
+    assert report["relit"][0] == {"light": "Light 1", "power": 2.0, "color": [1.0, 0.5, 0.25]}
+
+
+def test_cycles_picture_of_the_former_lights_is_left_out_with_a_word(capsys, monkeypatch, room, out):
+    fake_scene.FakeChild().install(monkeypatch)
+    run(capsys, "compare", room, "-o", out, "--keep-visibility", "--techniques", "ltc", "--quiet")
+    code, stdout, _ = run(capsys, "relight", out, "--light", "Light 2", "-o", out / "new", "--json", "--quiet")
+    assert code == 0 and "Cycles" in json.loads(stdout)["warnings"][-1]
+    assert not parts(read_channels(out / "new" / "compare.exr"), "cycles")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "complaint"),
+    [
+        (("--light", "Key"), 1, "light 'Key' is not in the picture; lights there: 'Light 0', 'Light 1', 'Light 2'"),
+        (("--power", "x2"), 2, "--power: expected --light NAME before it"),
+        (("--light", "Light 0", "--power", "2"), 2, "power is '2', expected x and a factor, such as x2 or x.5"),
+        (("--light", "Light 0", "--color", "1,2"), 2, "color is '1,2', expected red, green and blue such as 1,.8,.6"),
+        (("--light", "Light 0", "--power", "x1", "--power", "x2"), 2, "--power: given twice for light 'Light 0'"),
+        ((), 2, "--light"),
+    ],
+)
+def test_wrong_changes_are_named(capsys, monkeypatch, room, out, arguments, code, complaint):
+    shade(capsys, monkeypatch, room, out, "--keep-visibility")
+    found = run(capsys, "relight", out, *arguments)
+    assert found[0] == code and complaint in found[2] and not (out / "relit").exists()
+
+
+def test_folders_and_files_that_keep_nothing_are_refused(capsys, monkeypatch, room, out):
+    shade(capsys, monkeypatch, room, out)
+    code, _, stderr = run(capsys, "relight", out, "--light", "Light 0")
+    assert code == 1 and "run shade or compare with --keep-visibility" in stderr
+    for content in (b"", b"no archive", (out / "shade.exr").read_bytes()[:2000]):
+        (out / "shade.samples.npz").write_bytes(content)
+        code, _, stderr = run(capsys, "relight", out, "--light", "Light 0")
+        assert code == 1 and "is no file of --keep-visibility" in stderr and len(stderr.splitlines()) == 1

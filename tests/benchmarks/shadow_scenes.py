@@ -61,10 +61,10 @@ def soft(generator):
 def highlight(generator):
     """The mirror image of a long light in a glossy floor, half blocked by bars."""
     _camera((0.0, -4.5, 1.6), (0.0, 0.6, 0.3))
-    scene_parts.add_plane(_matt((0.3, 0.3, 0.32), 0.18), size=10.0, name="Floor")
+    scene_parts.add_plane(_matt((0.3, 0.3, 0.32), 0.15), size=10.0, name="Floor")
     scene_parts.add_sphere(_metal((0.8, 0.8, 0.85), 0.12), radius=0.45, location=(-1.1, 0.0, 0.45))
     scene_parts.add_sphere(_metal((0.9, 0.7, 0.3), 0.35), radius=0.45, location=(1.1, 0.0, 0.45))
-    for number, (height, width) in enumerate(((0.85, 0.12), (1.25, 0.04), (1.55, 0.02))):
+    for number, (height, width) in enumerate(((0.8, 0.25), (1.3, 0.05), (1.55, 0.02))):
         _box(f"Bar {number}", (-2.6, 1.9, height), (2.6, 1.95, height + width), _matt((0.1, 0.1, 0.1), 0.5))
     _box("Post", (0.1, 1.7, 0.0), (0.2, 1.8, 2.2), _metal((0.7, 0.7, 0.7), 0.4))
     _light("Tube", (0.0, 3.2, 1.3), (0.0, 0.0, 0.4), 120.0, size=3.6, size_y=0.8)
@@ -72,7 +72,7 @@ def highlight(generator):
 
 def window(generator):
     """A closed room that has light through the grille of a window only."""
-    _camera((-1.7, -2.3, 1.5), (0.6, 0.6, 0.9))
+    _camera((1.5, -2.3, 1.7), (-0.6, 0.7, 0.6))
     wall, floor = _matt((0.7, 0.68, 0.62), 0.6), _matt((0.4, 0.25, 0.15), 0.3)
     _box("Floor", (-2.2, -2.6, -0.1), (2.2, 2.2, 0.0), floor)
     _box("Ceiling", (-2.2, -2.6, 2.6), (2.2, 2.2, 2.7), wall)
@@ -85,16 +85,16 @@ def window(generator):
     ):
         _box(f"Right {number}", (2.2, *low), (2.4, *high), wall)
     paint = _matt((0.85, 0.85, 0.85), 0.4)
-    for number in range(9):
-        y = -0.8 + 0.2 * number
-        _box(f"Upright {number}", (2.25, y - 0.012, 0.8), (2.28, y + 0.012, 2.1), paint)
+    for number in range(7):
+        y = -0.8 + 0.267 * number
+        _box(f"Upright {number}", (2.25, y - 0.03, 0.8), (2.28, y + 0.03, 2.1), paint)
     for number in range(4):
-        z = 1.0 + 0.3 * number
-        _box(f"Crossbar {number}", (2.25, -0.8, z - 0.012), (2.28, 0.8, z + 0.012), paint)
+        z = 0.92 + 0.35 * number
+        _box(f"Crossbar {number}", (2.25, -0.8, z - 0.02), (2.28, 0.8, z + 0.02), paint)
     _box("Chest", (-0.6, 0.9, 0.0), (0.6, 1.6, 0.7), _matt((0.3, 0.12, 0.06), 0.25))
     scene_parts.add_sphere(_metal((0.9, 0.85, 0.8), 0.2), radius=0.28, location=(0.0, 1.2, 0.98))
     scene_parts.add_sphere(_matt((0.1, 0.35, 0.3), 0.3), radius=0.4, location=(0.7, -0.2, 0.4))
-    _light("Sky", (4.2, 0.2, 2.3), (0.0, 0.2, 0.6), 500.0, size=1.8, size_y=1.4)
+    _light("Sky", (8.0, -0.5, 5.0), (0.0, 0.2, 0.6), 3000.0, size=0.4, size_y=0.3)
 
 
 def leaves(generator):

@@ -31,13 +31,18 @@ def contact(generator):
         _mesh_of("torus", major_radius=0.12, minor_radius=0.03),
     ]
     materials = [_matt((0.7, 0.2, 0.1), 0.4), _metal((0.9, 0.8, 0.6), 0.3), _matt((0.1, 0.3, 0.7), 0.25)]
-    heights = (0.05, 0.1, 0.1, 0.03)
-    for number in range(72):
+    heights, reach = (0.05, 0.1, 0.1, 0.03), (0.26, 0.15, 0.1, 0.15)
+    places = []
+    # Faces that coincide would block each other's light.
+    while len(places) < 44:
+        place, own = generator.uniform((-1.6, -1.0), (1.6, 1.3)), reach[len(places) % 4]
+        if all(math.dist(place, other) > own + its for other, its in places):
+            places.append((place, own))
+    for number, (place, _) in enumerate(places):
         kind = number % 4
-        place = (*generator.uniform((-1.5, -0.9), (1.5, 1.1)), heights[kind])
         turn = (0.5 * math.pi if kind == 0 else 0.0, 0.0, generator.uniform(0.0, math.pi))
-        ob = scene_parts.link(bpy.data.objects.new(f"Part {number}", parts[kind]), place, turn)
-        _give(ob, materials[number % 3])
+        ob = bpy.data.objects.new(f"Part {number}", parts[kind])
+        _give(scene_parts.link(ob, (*place, heights[kind]), turn), materials[number % 3])
     _light("Key", (1.8, -0.6, 2.2), (0.0, 0.0, 0.0), 60.0, size=0.8, size_y=0.5)
     _light("Rim", (-1.0, 2.4, 1.4), (0.0, 0.2, 0.0), 40.0, size=1.4, size_y=0.3)
     _light("Spot", (-2.0, -1.0, 1.8), (0.0, 0.0, 0.0), 15.0, shape="DISK", size=0.25)
@@ -49,6 +54,9 @@ def soft(generator):
     scene_parts.add_plane(_matt((0.5, 0.5, 0.5), 0.3), size=12.0, name="Floor")
     bpy.ops.mesh.primitive_monkey_add(size=1.6, location=(-1.7, -0.4, 0.75), rotation=(-0.6, 0.0, 0.4))
     _give(bpy.context.object, _metal((0.95, 0.6, 0.4), 0.25), smooth=True)
+    # Smooth normals of its 500 faces would stand apart from those of the faces by far.
+    rounded = bpy.context.object.modifiers.new("Rounded", "SUBSURF")
+    rounded.levels = rounded.render_levels = 2
     scene_parts.add_sphere(_matt((0.2, 0.5, 0.3), 0.2), radius=0.7, location=(0.3, 0.6, 0.7))
     bpy.ops.mesh.primitive_torus_add(major_radius=0.6, minor_radius=0.2, location=(1.9, -0.5, 0.6), rotation=(1.2, 0.3, 0))
     _give(bpy.context.object, _matt((0.6, 0.2, 0.5), 0.5), smooth=True)

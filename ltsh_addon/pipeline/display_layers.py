@@ -11,7 +11,7 @@ from ..imaging.exr import write_channels
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES
-from .picture import against_cycles
+from .picture import UNSHADOWED, against_cycles
 
 FOLDER = "images"
 ERROR = "error_"
@@ -44,7 +44,8 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
-    names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
+    hidden = ("cycles_", ERROR), UNSHADOWED
+    names = [name for name in _techniques(layers) if not name.startswith(hidden[0]) and not name.endswith(hidden[1])]
     passes = [name for name in BAKE_PASSES if f"{names[0]}.{name}" in layers]
     _add_combined(layers, names, passes)
     written = {}

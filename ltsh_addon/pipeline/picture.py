@@ -34,6 +34,8 @@ from .options import PictureOptions, child_job
 REFERENCE_SEED = 20160725
 # Lights up to which the picture has a layer for the visibility of each.
 MOST_VISIBILITY_LAYERS = 64
+# Follows the name of a technique in layers without shadows beside those with.
+UNSHADOWED = "_unshadowed"
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
 SAMPLE_LAYERS = {
     "position": "XYZ",
@@ -408,7 +410,7 @@ class Comparison:
                     layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)
             if result.unshadowed is not None:
                 values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
-                layers[f"{name}_unshadowed.{pass_name}"] = self._image(result, values)
+                layers[f"{name}{UNSHADOWED}.{pass_name}"] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:
                 continue

@@ -233,7 +233,7 @@ def run(
     try:
         for _ in range(_children_wanted(task, len(samples), blocks, workers)):
             most = max(2 * FLOAT64_CHUNK if task.single else 0, *map(_size, blocks))
-            children.append(_Child(task, samples, queue, most))
+            children.append(_Shader(task, samples, queue, most))
         _work(task, samples, queue, progress)
     finally:
         queue.stop()
@@ -333,21 +333,21 @@ class _Queue:
         return self._done == self._total
 
 
-class _Child:
-    """One worker process and the thread that feeds it. Whatever goes wrong, its work goes back to the queue."""
+class Child:
+    """A worker process, and the thread that feeds it in `_feed`. The class of the package at `side` does its work."""
 
-    def __init__(self, task, samples, queue, block_size):
-        self._side = ParentSide(task, samples, block_size)
-        self._task, self._queue = task, queue
+    side = ""
+
+    def __init__(self, inherited: tuple[int, ...] = ()):
         self._process = None
-        self._thread = threading.Thread(target=self._feed, name="ltsh-worker", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="ltsh-worker", daemon=True)
         try:
             self._process = subprocess.Popen(
                 [interpreter(), worker.__file__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                pass_fds=self._side.memory.inherited,
+                pass_fds=inherited,
                 # Nothing here uses BLAS, whose threads take time to start.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 # Ctrl-C goes to the parent alone, which ends the child; no console window on Windows.
@@ -355,32 +355,42 @@ class _Child:
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:
-            _logger.warning("worker process: %s cannot be started (%s); shading goes on without", interpreter(), error)
+            _logger.warning("worker process: %s cannot be started (%s); this one goes on alone", interpreter(), error)
             return
         self._thread.start()
 
-    def _feed(self):
-        work = None
+    def _run(self):
         try:
-            commands, answers = self._process.stdin, self._process.stdout
-            memory = self._side.memory
-            worker.send(
-                commands, {"path": sys.path, "handle": memory.handle, "size": self._side.size, "package": _PACKAGE}
-            )
-            worker.send(commands, self._task)
-            self._checked(worker.receive(answers))
-            while (work := self._queue.next_of_all()) is not None:
-                worker.send(commands, self._side.put(work))
-                self._queue.done(work, *self._side.take(work, self._checked(worker.receive(answers))))
+            self._feed()
         except (OSError, EOFError, ValueError, _ChildError) as error:
-            if self._queue.stopped:
+            if self._is_unwanted():
                 return  # `end` has killed the process
-            if work is not None:
-                # This process computes it instead, and meets the same error if the samples are at fault.
-                self._queue.give_back(work)
-            _logger.warning("worker process ended early (%s); shading goes on without", error or type(error).__name__)
+            # This process computes it instead, and meets the same error if the samples are at fault.
+            self._give_back()
+            _logger.warning("worker process ended early (%s); the others go on", error or type(error).__name__)
 
-    def _checked(self, answer):
+    def _feed(self):
+        """Call `begin`, then `ask` again and again."""
+        raise NotImplementedError
+
+    def _is_unwanted(self) -> bool:
+        """True when nobody waits for the child any more."""
+        raise NotImplementedError
+
+    def _give_back(self) -> None:
+        """Leave the work that the child has not done to others."""
+        raise NotImplementedError
+
+    def begin(self, task, *arguments) -> None:
+        """Send the task; `arguments` are what the class at `side` takes beside it."""
+        first = {"path": sys.path, "package": _PACKAGE, "side": self.side, "arguments": arguments}
+        worker.send(self._process.stdin, first)
+        self.ask(task)
+
+    def ask(self, message):
+        """The child's answer to a message."""
+        worker.send(self._process.stdin, message)
+        answer = worker.receive(self._process.stdout)
         if isinstance(answer, str):
             raise _ChildError(answer.strip().splitlines()[-1])
         return answer
@@ -396,6 +406,34 @@ class _Child:
                     stream.close()
                 except OSError:
                     pass  # what could not be sent any more
+
+
+class _Shader(Child):
+    """A child that shades blocks and pairs of `samples`."""
+
+    side = "shading.parallel.ChildSide"
+
+    def __init__(self, task, samples, queue, block_size):
+        self._side = ParentSide(task, samples, block_size)
+        self._task, self._queue, self._work = task, queue, None
+        super().__init__(self._side.memory.inherited)
+
+    def _feed(self):
+        self.begin(self._task, self._side.memory.handle, self._side.size)
+        while (work := self._queue.next_of_all()) is not None:
+            self._work = work
+            self._queue.done(work, *self._side.take(work, self.ask(self._side.put(work))))
+            self._work = None
+
+    def _is_unwanted(self):
+        return self._queue.stopped
+
+    def _give_back(self):
+        if self._work is not None:
+            self._queue.give_back(self._work)
+
+    def end(self):
+        super().end()
         self._side.close()
 
 

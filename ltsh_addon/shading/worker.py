@@ -1,8 +1,8 @@
-"""What a worker process of `shade` runs, started by path: shades samples until its input ends.
+"""What a worker process runs, started by path: does one piece of work after another until its input ends.
 
-Messages are pickles with their length in front. The first one brings the search path and the shared memory,
-the second the task; each later one the layout of a block or of pairs. The answer is what `ChildSide.shade` returns, or
-the text of an error.
+Messages are pickles with their length in front. The first one brings the search path and says which class does the
+work, the second the task; each later one goes to that class's `shade`, for example `shading.parallel.ChildSide`. The
+answer is what that returns, or the text of an error.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def _serve(commands, answers) -> None:
     first = receive(commands)
     # The parent's search path, so that numpy is the same one; running a script puts its own folder first.
     sys.path[:] = [str(PACKAGE_FOLDER.parent), *first["path"]]
-    exchange = importlib.import_module(f"{PACKAGE_FOLDER.name}.shading.parallel")
-    task = receive(commands, first["package"])
-    side = exchange.ChildSide(task, first["handle"], first["size"])
+    module, _, name = first["side"].rpartition(".")
+    side_class = getattr(importlib.import_module(f"{PACKAGE_FOLDER.name}.{module}"), name)
+    side = side_class(receive(commands, first["package"]), *first["arguments"])
     send(answers, None)
     while True:
         message = receive(commands)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from .occluders import OccluderMesh, Occluders, Transparency
 from .ratio import Visibility, visible_shares
-from .rays import Starts, Tracer, open_tracer
+from .rays import Hits, Starts, Tracer, open_tracer
 
 __all__ = [
+    "Hits",
     "OccluderMesh",
     "Occluders",
     "Starts",

@@ -2,8 +2,8 @@
 
 A light is a quadrilateral; what a round, polygonal or textured one leaves dark of it has the weight 0. Half of the
 directions are spread evenly over the solid angle of the light, as diffuse lobes need them. The other half are spread
-evenly over the light after the warp that flattens the peak of GGX (`shading.lookup_table`), as specular lobes need them:
-none misses the light, however sharp the lobe. The balance heuristic (Veach and Guibas 1995) joins both.
+evenly over the light after the warp that flattens the peak of GGX (`shading.lookup_table`), as specular lobes need
+them: none misses the light, however sharp the lobe. The balance heuristic (Veach and Guibas 1995) joins both.
 
 All is in single precision, arrays are (S, Q): S directions from each of Q points, or (Q,). Vectors are lists of three.
 """
@@ -65,10 +65,11 @@ def _reversed_bits(values):
 _POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
 
 
-def unit_points(seeds: np.ndarray, stream: int, first: int, count: int) -> list[np.ndarray]:
-    """Numbers x, y (S, Q) in (0, 1): `count` points of a sequence, changed by the seeds (Q,); `stream` is 0 or 1."""
+def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[np.ndarray]:
+    """Numbers x, y (S, Q) in (0, 1): points `first` to `last` of the sequence `stream`, 0 or 1, changed by the seeds
+    (Q,)."""
     found = []
-    for axis, points in enumerate(_POINTS[stream][:, first : first + count]):
+    for axis, points in enumerate(_POINTS[stream][:, first:last]):
         own = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
         numbers = (points[:, None] ^ own).astype(np.float32)
         numbers += np.float32(0.5)
@@ -333,7 +334,7 @@ class Warps:
         return np.sqrt(warped[0] + warped[1] + warped[2])
 
     def unwarped(self, vectors: np.ndarray) -> np.ndarray:
-        """Turn warped unit vectors (3, S, Q), which are lost, into unit vectors in the local frames; their `lengths`."""
+        """Turn warped unit vectors (3, S, Q) into unit vectors in the local frames, and return their `lengths`."""
         x, y, z = vectors
         z /= self.zz
         x -= self.xz * z

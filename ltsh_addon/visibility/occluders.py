@@ -34,6 +34,7 @@ class Transparency:
     uv: np.ndarray | None = None
     extension: str = "REPEAT"  # one of EXTENSIONS
     interpolation: str = "Linear"  # one of INTERPOLATIONS
+    outside: float = 1.0  # what stands for the image beside it, where `extension` is CLIP
 
     def __post_init__(self):
         if not 0.0 <= self.share <= 1.0:
@@ -73,7 +74,7 @@ class Transparency:
         columns, rows = _within(x, width, self.extension), _within(y, height, self.extension)
         found = self.image[rows, columns]
         if self.extension == "CLIP":
-            found = np.where((x == columns) & (y == rows), found, 1.0)
+            found = np.where((x == columns) & (y == rows), found, self.outside)
         return found
 
 
@@ -88,13 +89,17 @@ def _within(index, size, extension):
 
 @dataclass(frozen=True)
 class OccluderMesh:
-    """Triangles in the space of an object. `normals` are those of smooth shading, at vertices (V, 3) or at corners
-    (T, 3, 3); left out: it is flat."""
+    """Triangles in the space of an object.
+
+    `normals` are those of smooth shading, at vertices (V, 3) or at corners (T, 3, 3); left out: it is flat. Triangles
+    that stand for a hair or a point have a `thickness` (T,): what is shaded is no farther from them.
+    """
 
     vertices: np.ndarray  # (V, 3) float32
     triangles: np.ndarray  # (T, 3) uint32
     transparency: Transparency | None = None  # None: it blocks
     normals: np.ndarray | None = None
+    thickness: np.ndarray | None = None
 
     def __post_init__(self):
         vertices = np.ascontiguousarray(self.vertices, np.float32)
@@ -110,6 +115,11 @@ class OccluderMesh:
             if normals.shape not in (vertices.shape, (len(triangles), 3, 3)):
                 raise ValueError(f"mesh: normals {normals.shape}, expected {vertices.shape} or {len(triangles), 3, 3}")
             object.__setattr__(self, "normals", normals)
+        if self.thickness is not None:
+            thickness = np.ascontiguousarray(self.thickness, np.float32)
+            if thickness.shape != (len(triangles),):
+                raise ValueError(f"mesh: thickness {thickness.shape}, expected {(len(triangles),)}")
+            object.__setattr__(self, "thickness", thickness)
         uv = None if self.transparency is None else self.transparency.uv
         if uv is not None and uv.shape != (len(triangles), 3, 2):
             raise ValueError(f"mesh: uv {uv.shape}, expected {len(triangles), 3, 2}")
@@ -151,6 +161,12 @@ class Occluders:
             raise ValueError(f"occluders: an instance names mesh {mesh.max()}, expected 0 to {len(self.meshes) - 1}")
         object.__setattr__(self, "meshes", tuple(self.meshes))
 
+    def split(self) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers of the instances that block, and of those that let light through; without triangles: neither."""
+        is_clear = np.array([mesh.transparency is not None for mesh in self.meshes], bool)[self.mesh]
+        is_there = np.array([len(mesh.triangles) > 0 for mesh in self.meshes], bool)[self.mesh]
+        return np.flatnonzero(is_there & ~is_clear), np.flatnonzero(is_there & is_clear)
+
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name; 0: nothing is in its way."""
         return self.light_masks.get(light, 1)
@@ -169,12 +185,13 @@ class Occluders:
         for number, mesh in enumerate(self.meshes):
             clear = mesh.transparency
             arrays |= {f"vertices{number}": mesh.vertices, f"triangles{number}": mesh.triangles}
-            if mesh.normals is not None:
-                arrays[f"normals{number}"] = mesh.normals
+            for name in ("normals", "thickness"):
+                if getattr(mesh, name) is not None:
+                    arrays[f"{name}{number}"] = getattr(mesh, name)
             if clear is None:
                 about.append(None)
                 continue
-            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation")}
+            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation", "outside")}
             if clear.image is not None:
                 images.setdefault(id(clear.image), clear.image)
                 record["image"] = list(images).index(id(clear.image))
@@ -201,8 +218,9 @@ class Occluders:
                 image = record.pop("image", None)
                 pixels = None if image is None else arrays[f"image{image}"]
                 clear = Transparency(**record, image=pixels, uv=arrays.get(f"uv{number}"))
-            normals = arrays.get(f"normals{number}")
-            meshes.append(OccluderMesh(arrays[f"vertices{number}"], arrays[f"triangles{number}"], clear, normals))
+            shape = (arrays[f"{name}{number}"] for name in ("vertices", "triangles"))
+            more = (arrays.get(f"{name}{number}") for name in ("normals", "thickness"))
+            meshes.append(OccluderMesh(*shape, clear, *more))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
         own = {name: head[name] for name in ("transparent_surfaces", "light_masks")}
         return cls(tuple(meshes), **instances, **own)

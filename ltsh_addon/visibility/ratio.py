@@ -5,7 +5,8 @@ doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w
 light, w what the pass makes of the light along them, over the density of the rays. The same rays serve both passes.
 
 A few probes go to every pair of a sample and a light. Those that all arrive, or are all blocked, settle it, unless a
-neighbor in the picture found otherwise; the pairs that are left take all rays.
+neighbor in the picture found otherwise. The pairs that are left take as many rays as they are worth by their light.
+Nothing hangs on where a sample stands in a picture or a block but which samples are its neighbors there.
 """
 
 from __future__ import annotations
@@ -15,17 +16,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import FARTHEST, PASSES, AreaLight, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples
 from ..shading import light_cone
 from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.light_polygons import has_lobe
+from . import crew
 from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .filter import ShareFilter
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
 MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
+# Samples of a block that one process takes at a time. Fewer pairs of samples and lights than that take no longer than a
+# process takes to start.
+BLOCK_SAMPLES = 1 << 14
+PAIRS_WORTH_A_CHILD = 300_000
+# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both count
+# alike, as at first, when the specular one counts more, and when the diffuse one does.
+EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
+# Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
+# stratified rays falls with their number to the power -0.8.
+WORTH_POWER = 0.75
+# Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
+TYPICAL_SHARE = 0.25
+LEVELS = (16, 32, 64, 128, 256, 512)
+# Samples that tell what is typical, and pairs of them and a light.
+TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20
 # How often neighbors of mixed pairs that turn out mixed pass that on.
 ROUNDS = 4
 # Rays end this share of their length before the light.
@@ -52,10 +70,14 @@ class Visibility:
     rays: int  # that were traced
     mixed: np.ndarray  # (L, P) bool: pairs of which some rays arrived and some did not
 
-    def noise(self, name: str) -> float:
-        """Estimated relative L2 error of a pass, by the two halves of the rays."""
-        power = np.square(self.radiance[name], dtype=np.float64).sum()
-        return float(np.sqrt(np.square(self.deviation[name], dtype=np.float64).sum() / max(power, 1e-30)))
+    def noise(self, name: str, film: Film | None = None) -> float:
+        """Estimated relative L2 error of a pass, by the two halves of the rays: of samples, or of pixels of a film."""
+        light, variance = self.radiance[name], np.square(self.deviation[name])
+        if film is not None:
+            # The errors of the samples of a pixel do not depend on each other.
+            light, variance = film.image(light), film.image(variance) / film.sub_samples
+        power = np.square(light, dtype=np.float64).sum()
+        return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
 
 
 def visible_shares(
@@ -64,36 +86,90 @@ def visible_shares(
     tracer,
     *,
     passes: Sequence[str] = PASSES,
-    rays: int = 32,
+    rays: int = 128,
     film: Film | None = None,
+    smooth: bool = False,
+    workers: int | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
-    returns it. `progress` may return False to stop: Cancelled is raised.
+    `film` says which samples are neighbors; left out: those before and after. With `smooth`, which takes a film, the
+    shares of penumbrae are filtered (see `filter`). `tracer` is as `visibility.open_tracer` returns it. `workers`
+    processes (None: all cores) give the same result bit for bit; few samples are left to this process. `progress` may
+    return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    rays, count = rays // PROBES * PROBES, len(samples)
-    shares = {name: np.ones((len(lights), count), np.float32) for name in passes}
-    radiance, variance = ({name: np.zeros(count) for name in passes} for _ in range(2))
-    mixed = np.zeros((len(lights), count), bool)
-    surface, neighbors, traced = Surface(samples, passes, tracer), Neighbors.of(film, count), 0
-    for number, light in enumerate(lights):
-        if progress is not None and progress("shadows", number / len(lights)) is False:
-            raise Cancelled("shadows were stopped")
-        pairs = Pairs(surface, light)
-        pairs.trace(rays, neighbors)
-        traced += pairs.traced
-        index = pairs.index
-        mixed[number, index] = pairs.visible & pairs.blocked
+    lights, passes = tuple(lights), tuple(passes)
+    typical = typical_radiance(samples, lights, passes)
+    task = ShadowTask(lights, passes, rays // PROBES * PROBES, smooth, typical)
+    shape = len(lights), len(samples)
+    shares = {name: np.ones(shape, np.float32) for name in passes}
+    radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
+    mixed, traced = np.zeros(shape, bool), 0
+    blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
+    parts = ((samples.take(block), None if film is None else film.take(block)) for block in blocks)
+    wanted = 1 if shape[0] * shape[1] < PAIRS_WORTH_A_CHILD else workers
+    for number, found in crew.run(task, tracer, list(parts), wanted, progress):
+        block = blocks[number]
         for name in passes:
-            shares[name][number, index], mean, deviation = pairs.found(name)
-            radiance[name][index] += mean
-            variance[name][index] += deviation * deviation
-    deviation = {name: np.sqrt(values) for name, values in variance.items()}
+            shares[name][:, block] = getattr(found, name)
+            radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
+        mixed[:, block] = found.mixed
+        traced += found.rays
     return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+@dataclass(frozen=True)
+class ShadowTask:
+    """What to do with every block of samples."""
+
+    lights: tuple[AreaLight, ...]
+    passes: tuple[str, ...]
+    rays: int
+    smooth: bool
+    typical: dict[str, float]
+
+    def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
+        """Those of a block, all in this thread."""
+        shape = len(self.lights), len(samples)
+        shares = {name: np.ones(shape, np.float32) for name in self.passes}
+        radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
+        mixed, traced = np.zeros(shape, bool), 0
+        surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
+        share_filter = ShareFilter(samples, film) if self.smooth and film is not None else None
+        for number, light in enumerate(self.lights):
+            pairs = Pairs(surface, light)
+            pairs.trace(self.rays, neighbors, self.typical)
+            traced += pairs.traced
+            index = pairs.index
+            mixed[number, index] = pairs.visible & pairs.blocked
+            for name in self.passes:
+                share, noise = pairs.found(name)
+                if share_filter is not None:
+                    chosen = mixed[number, index] & pairs.wanted[name]
+                    share, factor = share_filter.filtered(name, index, share, pairs.count, chosen, noise)
+                    noise *= factor
+                unshadowed = pairs.unshadowed(name)
+                shares[name][number, index] = share
+                radiance[name][index] += unshadowed * share
+                variance[name][index] += np.square(unshadowed * noise)
+        deviation = {name: np.sqrt(values) for name, values in variance.items()}
+        return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+
+
+def typical_radiance(samples: SurfaceSamples, lights: Sequence[AreaLight], passes: Sequence[str]) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect of all `lights` without shadows, from some of them."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(lights), 1)), 1)
+    surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
+    radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
+    for light in lights:
+        pairs = Pairs(surface, light)
+        pairs.weigh()
+        for name in passes:
+            radiance[name][pairs.index] += pairs.unshadowed(name)
+    return {name: float(np.sqrt(np.square(values).mean())) if len(values) else 0.0 for name, values in radiance.items()}
 
 
 @dataclass(frozen=True)
@@ -128,11 +204,11 @@ class Surface:
     """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
 
     def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
-        self.tracer, self.starts = tracer, tracer.starts(samples)
+        self.tracer, self.starts = tracer, tracer and tracer.starts(samples)
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)
-        self._known: dict[int, np.ndarray] = {}
+        self._known: list[np.ndarray] = []
         self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)
         self.geometric_normal = self._rows(samples.geometric_normal)
         self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
@@ -149,9 +225,11 @@ class Surface:
 
     def _rows(self, vectors):
         # Normals that stand for each other are the same array.
-        if id(vectors) not in self._known:
-            self._known[id(vectors)] = np.ascontiguousarray(vectors.T, dtype=np.float32)
-        return self._known[id(vectors)]
+        found = np.ascontiguousarray(vectors.T, dtype=np.float32)
+        same = next((known for known in self._known if np.array_equal(known, found)), None)
+        if same is None:
+            self._known.append(found)
+        return found if same is None else same
 
     def horizons(self, name: str) -> tuple[np.ndarray, ...]:
         """The normals (3, P) below whose horizons the lobe of a pass is 0."""
@@ -169,7 +247,7 @@ class Pairs:
 
     def __init__(self, surface: Surface, light: AreaLight):
         self.surface, self.light = surface, light
-        self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
         self.emitter = Emitter(light)
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
@@ -193,21 +271,39 @@ class Pairs:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
 
-    def trace(self, rays: int, neighbors: Neighbors) -> None:
-        """Probes for all pairs, and up to `rays` for those that need them."""
+    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float]) -> None:
+        """Probes for all pairs, and up to `rays` for those that need them; `typical` as from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
-        self._add_rays(np.arange(len(self.index)), 0, PROBES)
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
         self._leave_out_unlit()
-        if rays > PROBES:
-            for _ in range(ROUNDS):
-                chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
-                chosen |= self._unmet()
-                chosen &= self.count < rays
-                if not chosen.any():
-                    break
-                self._add_rays(np.flatnonzero(chosen), PROBES, rays)
+        number, choice = self._plan(rays, typical)
+        for _ in range(ROUNDS):
+            chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
+            chosen |= self._unmet()
+            chosen &= self.count < number
+            if not chosen.any():
+                break
+            for last in np.unique(number[chosen]):
+                for split in range(3):
+                    members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                    self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
+
+    def weigh(self) -> None:
+        """Weights alone, without a ray."""
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
+
+    def _plan(self, rays, typical):
+        """How many rays (Q,) the pairs are worth, and which of SPLITS (Q,), by what they reflect without shadows."""
+        worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
+        most = np.maximum(worth["specular"], worth["diffuse"])
+        wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
+        levels = [level for level in LEVELS if level < rays] + [rays]
+        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
+        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
+        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
+        return number, choice
 
     def _unmet(self):
         """Mask (Q,) of the pairs with a lobe that no ray met so far."""
@@ -239,63 +335,114 @@ class Pairs:
             heights, offset = self._corner_heights(name, unmet)
             toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
             distance = np.sqrt(dot(toward, toward))
-            found = self._transmittance(self.index[unmet], toward / np.maximum(distance, _TINY), distance)
-            self.weights[number][:, unmet] = 1.0
-            self.arriving[number][:, unmet] = found
+            toward /= np.maximum(distance, _TINY)
+            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
+            found = self._transmittance(*(rows[..., 0, :] for rows in aimed))
+            # Next to no light: it counts in no sum of samples.
+            self.weights[number][:, unmet] = _TINY
+            self.arriving[number][:, unmet] = found * _TINY
 
-    def _transmittance(self, index, directions, distances):
-        """Of one ray for each of the samples `index` (R,): directions (3, R), distances (R,)."""
-        origins = self.surface.starts.origins(index, directions.T)
-        self.traced += len(index)
-        masks = np.broadcast_to(self.mask, index.shape)
-        return self.surface.tracer.transmittance(origins, directions.T, distances * END, masks)
+    def _transmittance(self, origins, directions, distances):
+        """Of rays: origins and directions (3, R), distances (R,)."""
+        self.traced += len(distances)
+        masks = np.broadcast_to(self.mask, distances.shape)
+        return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
-    def _add_rays(self, members, first, last):
-        """Rays `first` to `last` for the pairs `members` (M,)."""
+    def _add_rays(self, members, first, last, split, trace=True):
+        """Rays `first` to `last` for the pairs `members` (M,), by one of SPLITS."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
-        for chosen in (diffuse & specular, diffuse & ~specular, ~diffuse & specular):
+        for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
             chosen = members[chosen]
             for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
                 block = chosen[start : start + BLOCK_RAYS // PROBES]
-                view = View(self.surface, self.index[block], self.emitter, self._lobes_of(block))
-                for number in range(first, last, PROBES):
-                    self._add_block(block, view, number)
+                lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
+                view = View(self.surface, self.index[block], self.emitter, lobes)
+                step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
+                for number in range(first, last, step):
+                    rays = Rays(
+                        number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
+                    )
+                    self._add_block(block, view, rays, trace)
         self.count[members] = last
 
-    def _lobes_of(self, block):
-        return tuple(name for name in PASSES if self.wanted[name][block[0]])
-
-    def _add_block(self, block, view, first):
-        """PROBES rays each for the pairs `block` (B,) of a view."""
-        directions, distance, weights = view.rays(first)
-        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
-        arriving = np.zeros(met.shape, np.float32)
-        flat = np.flatnonzero(met)
-        towards = np.stack([np.take(row, flat) for row in directions])
-        index = np.take(np.broadcast_to(view.index, met.shape), flat)
-        arriving.ravel()[flat] = self._transmittance(index, towards, np.take(distance, flat))
-        sums = arriving.sum(axis=0)
-        self.visible[block] |= sums > 0.0
-        self.blocked[block] |= sums < met.sum(axis=0)
+    def _add_block(self, block, view, rays, trace):
+        """Some rays for the pairs `block` (B,) of a view."""
+        directions, distance, weights = view.rays(rays)
+        arriving = np.zeros(distance.shape, np.float32)
+        if trace:
+            met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+            flat = np.flatnonzero(met)
+            aimed = self.surface.starts.aimed(view.index, directions, distance)
+            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in aimed))
+            sums = arriving.sum(axis=0)
+            self.visible[block] |= sums > 0.0
+            self.blocked[block] |= sums < met.sum(axis=0)
         for name, weight in weights.items():
             number = PASSES.index(name)
-            for half in range(2):
-                self.weights[number, half, block] += weight[half::2].sum(axis=0)
-            weight *= arriving
-            for half in range(2):
-                self.arriving[number, half, block] += weight[half::2].sum(axis=0)
+            for sums in (self.weights[number], self.arriving[number]):
+                halves = sums[:, block]
+                rays.add_to(halves, weight)
+                sums[:, block] = halves
+                weight *= arriving
 
-    def found(self, name: str):
-        """Shares (Q,) of a pass, the radiance (Q,) that it reflects, about, and its standard deviation."""
-        number = PASSES.index(name)
-        weights, arriving = self.weights[number], self.arriving[number]
-        halves = np.divide(arriving, weights, out=np.ones_like(weights), where=weights > 0.0)
-        whole = weights.sum(axis=0)
-        share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
+    def unshadowed(self, name: str) -> np.ndarray:
+        """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""
         scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
         scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
-        unshadowed = whole * scale * self.wanted[name]
-        return share, unshadowed * share, unshadowed * 0.5 * np.abs(halves[0] - halves[1])
+        return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
+
+    def found(self, name: str):
+        """Shares (Q,) of a pass, and their standard deviations, about."""
+        weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
+        whole = weights.sum(axis=0)
+        share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
+        # Probes alone have no second half.
+        halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
+        return share, 0.5 * np.abs(halves[0] - halves[1])
+
+
+def _taken(rows, flat):
+    """Values (3, R) or (R,) of rows (3, S, Q) or (S, Q) at places in the flat (S, Q)."""
+    return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The rays `first` to `last` of each pair, PROBES and again PROBES; of each of these some are chosen by the lobe.
+
+    `probes` and `later` say how many of the first PROBES, and of all later ones, are chosen evenly.
+    """
+
+    first: int
+    last: int
+    total: int
+    probes: int
+    later: int
+
+    @property
+    def looks(self) -> int:
+        """How many times PROBES rays these are."""
+        return (self.last - self.first) // PROBES
+
+    @property
+    def evenly(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions evenly."""
+        return tuple(self.probes + self.later * (n // PROBES - 1) if n else 0 for n in (self.first, self.last))
+
+    @property
+    def by_lobe(self) -> tuple[int, int]:
+        """First and last number of the points that choose directions by the lobe."""
+        return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
+
+    def add_to(self, halves, weight):
+        """Add weights (S, Q) to the sums (2, Q) of the first and the second half of the total, one after another."""
+        start, stop = self.evenly
+        parts = np.zeros((self.looks, weight.shape[1]), np.float32)
+        for rows in (weight[: stop - start], weight[stop - start :]):
+            if len(rows):
+                parts += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
+        for number, part in enumerate(parts, self.first // PROBES):
+            halves[int(2 * number * PROBES >= self.total)] += part
 
 
 class View:
@@ -326,24 +473,23 @@ class View:
             self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
-    def rays(self, first: int):
-        """Unit directions (3, S, Q) of the PROBES rays from `first` on, distances (S, Q), weights (S, Q) by lobe."""
-        shares = {("specular", "diffuse"): (4, 4), ("specular",): (6, 2), ("diffuse",): (0, 8)}[self.lobes]
-        by_lobe, evenly = shares
-        shape = (PROBES, len(self.index))
+    def rays(self, rays: Rays):
+        """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
+        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
+        shape = (evenly + by_lobe, len(self.index))
         directions = np.empty((3, *shape), np.float32)
         if evenly:
-            points = unit_points(self.seeds, 0, first * evenly // PROBES, evenly)
+            points = unit_points(self.seeds, 0, *rays.evenly)
             self.quads.directions(*points, out=directions[:, :evenly])
-        density = np.float32(evenly / PROBES) / self.quads.solid_angle
+        density = np.float32(evenly / shape[0]) / self.quads.solid_angle
         if by_lobe:
             local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
-            points = unit_points(self.seeds, 1, first * by_lobe // PROBES, by_lobe)
+            points = unit_points(self.seeds, 1, *rays.by_lobe)
             length[evenly:] = self.warps.unwarped(self.warped_quads.directions(*points, out=local[:, evenly:]))
             self.warps.world(local[:, evenly:], out=directions[:, evenly:])
             self.warps.local(directions[:, :evenly], out=local[:, :evenly])
             length[:evenly] = self.warps.lengths(local[:, :evenly])
-            scale = np.float32(by_lobe / PROBES) * self.warps.determinant / self.warped_quads.solid_angle
+            scale = np.float32(by_lobe / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
             scale *= self.is_seen
             np.clip(length, *_LENGTHS, out=length)
             density = density + scale / (length * length * length)

@@ -13,7 +13,7 @@ import os
 import threading
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import repeat
 
 import numpy as np
@@ -25,14 +25,15 @@ from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
 # Rays in a chunk: its packets stay in the second-level cache.
 CHUNK = 4096
-# Rows of a packet of rays, and of one of rays with what they hit. Two more are room for what some builds of Embree add.
+# Rows of a packet of rays, and of one of rays with what they hit; the last two are room for what some builds add.
 ORIGIN, NEAR, DIRECTION, FAR, MASK = slice(0, 3), 3, slice(4, 7), 8, 9
 RAY_ROWS, U, V, TRIANGLE, GEOMETRY, INSTANCE, HIT_ROWS = 12, 15, 16, 17, 18, 19, 22
-NONE = 0xFFFFFFFF
+NONE, MOST_LEVELS = 0xFFFFFFFF, 32
 # Of the size of coordinates: 8 times their rounding in single precision; 2 times are too few, 4 seem to suffice.
 CLEARANCE = 2.0**-21
-# A sample is looked for so far from its place, in m for a sample near the origin; and in so many surfaces there.
-NEARBY, LAYERS = 2.0**-14, 4
+# A sample is looked for so far from its place, in m for one near the origin, in so many surfaces, until it is as near
+# to one as that share of the way.
+NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
 # A ray goes on from a transparent surface by so much of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 
@@ -74,6 +75,7 @@ class _Embree:
     """The functions of one library, and a device of it."""
 
     def __init__(self, library: str):
+        self.path = library
         try:
             self._library = ctypes.CDLL(library)
             # Keeps Python's lock during a call, which is too short to hand it over.
@@ -127,7 +129,9 @@ class _Packets:
 
     def __init__(self, width: int, rows: int):
         count = CHUNK // width
-        self.values = _aligned(count * rows * width).reshape(count, rows, width)
+        # A build of Embree with more levels of instances would write beyond the last packet, before it is found unfit.
+        values = _aligned((count * rows + 2 * MOST_LEVELS) * width)
+        self.values = values[: count * rows * width].reshape(count, rows, width)
         self.numbers = self.values.view(np.uint32)
         self.values[:, DIRECTION] = 1.0
         start, size = self.values.ctypes.data, rows * width * 4
@@ -170,15 +174,13 @@ class _Scene:
 
     def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray):
         self._embree, self._kept, self._scenes = embree, [], []
-        self.scene, self.instances, self.is_empty = None, [], True
+        self.scene, self.instances = None, index
         uses = np.bincount(occluders.mesh[index], minlength=len(occluders.meshes))
         parts: dict[int, int] = {}
         self.scene = self._new_scene()
         try:
             for number in index:
                 mesh, mask = int(occluders.mesh[number]), int(occluders.masks[number])
-                if not len(occluders.meshes[mesh].triangles):
-                    continue
                 matrix = occluders.matrices[number]
                 if uses[mesh] == 1:
                     self._add_triangles(self.scene, occluders.meshes[mesh], matrix, mask)
@@ -188,9 +190,6 @@ class _Scene:
                         self._add_triangles(parts[mesh], occluders.meshes[mesh], None, ALL_RAYS)
                         embree.CommitScene(parts[mesh])
                     self._add_instance(parts[mesh], matrix, mask)
-                self.instances.append(int(number))
-            self.is_empty = not self.instances
-            self.instances = np.array(self.instances, np.int64)
             embree.CommitScene(self.scene)
             embree.check()
         except BaseException:
@@ -251,7 +250,9 @@ class _Shape:
     size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
 
     @classmethod
-    def of(cls, occluders: Occluders, instance: int, is_applied: bool, triangle, u, v) -> _Shape:
+    def of(cls, occluders: Occluders, hits: Hits, here, is_applied: bool) -> _Shape:
+        """Those of the `hits` that are `here`, all on one instance."""
+        instance, triangle, u, v = hits.instance[here][0], hits.triangle[here], hits.u[here], hits.v[here]
         mesh, matrix = occluders.meshes[occluders.mesh[instance]], occluders.matrices[instance]
         named = mesh.triangles[triangle]
         corners, normals = mesh.vertices[named].astype(np.float64), mesh.normals
@@ -266,6 +267,17 @@ class _Shape:
             normals = normals @ _cofactors(matrix[:, :3]).T
             normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
+
+    def face_normals(self, side: np.ndarray) -> np.ndarray:
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell, or these where
+        a triangle has no area."""
+        edges = self.corners[:, 1:] - self.corners[:, :1]
+        if self.to_world is not None:
+            edges = edges @ self.to_world.T
+        normal = np.cross(edges[:, 0], edges[:, 1])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        normal *= np.where(_dot(normal, side) < 0.0, -1.0, 1.0)[:, None]
+        return np.divide(normal, length, out=side.astype(np.float64), where=length > 0.0)
 
     def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
         """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
@@ -298,20 +310,79 @@ def _cofactors(matrix):
     return np.array([np.cross(matrix[1], matrix[2]), np.cross(matrix[2], matrix[0]), np.cross(matrix[0], matrix[1])])
 
 
-class Tracer:
-    """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`."""
+class EmbreeCaster:
+    """Casts rays through both scenes of `occluders`: what blocks, and what is transparent.
+
+    A caster tells what at most `chunk` rays meet; `Tracer` makes shares of light of that.
+    """
+
+    chunk = CHUNK
 
     def __init__(self, occluders: Occluders, embree: _Embree):
-        self.occluders, self.description = occluders, f"Embree {embree.version}"
-        self._embree, self._lock = embree, threading.Lock()
-        clear = np.array([mesh.transparency is not None for mesh in occluders.meshes], bool)
-        is_clear = clear[occluders.mesh] if len(occluders.mesh) else np.zeros(0, bool)
-        self._opaque = _Scene(embree, occluders, np.flatnonzero(~is_clear))
-        self._clear = _Scene(embree, occluders, np.flatnonzero(is_clear))
-        uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes)) if len(occluders.mesh) else np.zeros(0, int)
-        self._is_applied = uses[occluders.mesh] == 1
+        self.description, self.library = f"Embree {embree.version}", embree.path
+        self._embree, self._scenes = embree, []
+        for index in occluders.split():
+            self._scenes.append(_Scene(embree, occluders, index))
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
+
+    def close(self) -> None:
+        """Free the memory that Embree has taken."""
+        for scene in self._scenes:
+            scene.close()
+
+    def blocked(self, origins, directions, distances, masks) -> np.ndarray:
+        """Mask (R,) of the rays that something blocks."""
+        packets, count, scene = self._packets, len(origins), self._scenes[0]
+        for row, values in ((ORIGIN, origins), (DIRECTION, directions), (FAR, distances), (MASK, masks)):
+            packets.set(row, values)
+        packets.trace(self._embree.occluded, scene.scene, count)
+        return packets.get(FAR, count) < 0.0  # Embree writes -inf
+
+    def closest(self, is_clear: bool, origins, directions, near, far, masks) -> Hits:
+        """What the rays meet first from `near` to `far` of what is transparent, or of what blocks."""
+        packets, count, scene = self._hits, len(origins), self._scenes[is_clear]
+        for row, values in ((ORIGIN, origins), (NEAR, near), (DIRECTION, directions), (FAR, far), (MASK, masks)):
+            packets.set(row, values)
+        packets.numbers[:, GEOMETRY : INSTANCE + 1] = NONE
+        packets.trace(self._embree.intersect, scene.scene, count)
+        geometry, part = packets.get(GEOMETRY, count, True), packets.get(INSTANCE, count, True)
+        ray = np.flatnonzero(geometry != NONE)
+        number = np.where(part == NONE, geometry, part)[ray]
+        distance, u, v = (packets.get(row, count)[ray] for row in (FAR, U, V))
+        return Hits(ray, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[ray], u, v)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What H of R rays meet: the `ray`, how far away, which triangle of which instance, where on it."""
+
+    ray: np.ndarray  # (H,)
+    distance: np.ndarray  # (H,) m
+    instance: np.ndarray  # (H,)
+    triangle: np.ndarray  # (H,)
+    u: np.ndarray  # (H,) share of the second corner
+    v: np.ndarray  # (H,) share of the third
+
+
+class Tracer:
+    """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`.
+
+    `caster` is as EmbreeCaster, and `description` says which it is. Other processes can open the file `library`; None:
+    they cannot.
+    """
+
+    def __init__(self, occluders: Occluders, caster):
+        self.occluders, self.description = occluders, caster.description
+        self.library = getattr(caster, "library", None)
+        self._caster, self._lock = caster, threading.Lock()
+        self._has = [len(index) > 0 for index in occluders.split()]
+        uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes))
+        self._is_applied = uses[occluders.mesh] == 1
+        self._thickness = np.zeros(len(occluders.mesh))  # the largest of each instance, in m
+        thick = [mesh.thickness is not None and len(mesh.triangles) > 0 for mesh in occluders.meshes]
+        for number in np.flatnonzero(np.array(thick, bool)[occluders.mesh]):
+            self._thickness[number] = self._thickness_of(number, slice(None)).max()
 
     def __enter__(self) -> Tracer:
         return self
@@ -320,10 +391,9 @@ class Tracer:
         self.close()
 
     def close(self) -> None:
-        """Free the memory that Embree has taken."""
+        """Free what the caster has taken."""
         with self._lock:
-            self._opaque.close()
-            self._clear.close()
+            self._caster.close()
 
     def transmittance(
         self, origins: np.ndarray, directions: np.ndarray, distances: np.ndarray, masks: np.ndarray | None = None
@@ -335,18 +405,36 @@ class Tracer:
         another, are faster.
         """
         origins, directions, distances = (np.asarray(values, np.float32) for values in (origins, directions, distances))
-        count = len(origins)
+        count, chunk = len(origins), self._caster.chunk
         masks = np.broadcast_to(np.uint32(ALL_RAYS), (count,)) if masks is None else np.asarray(masks, np.uint32)
         shares = np.ones(count, np.float32)
         with self._lock:
-            for start in range(0, count, CHUNK):
-                part = slice(start, start + CHUNK)
+            for start in range(0, count, chunk):
+                part = slice(start, start + chunk)
                 rays = origins[part], directions[part], distances[part], masks[part]
-                if not self._opaque.is_empty:
-                    shares[part][self._is_blocked(*rays)] = 0.0
-                if not self._clear.is_empty:
+                if self._has[False]:
+                    shares[part][self._caster.blocked(*rays)] = 0.0
+                if self._has[True]:
                     self._attenuate(shares[part], *rays)
         return shares
+
+    def _attenuate(self, shares, origins, directions, distances, masks):
+        """Multiply `shares` (R,) by those of the transparent surfaces that the rays meet."""
+        near = np.zeros(len(shares), np.float32)
+        index = np.flatnonzero(shares > 0.0)
+        for _ in range(self.occluders.transparent_surfaces + 1):
+            if not len(index):
+                return
+            rays = origins[index], directions[index], near[index], distances[index], masks[index]
+            hits = self._caster.closest(True, *rays)
+            index = index[hits.ray]
+            for number in np.unique(hits.instance):
+                here = hits.instance == number
+                clear = self.occluders.meshes[self.occluders.mesh[number]].transparency
+                shares[index[here]] *= clear.shares(hits.triangle[here], hits.u[here], hits.v[here])
+            near[index] = hits.distance * STEP
+            index = index[shares[index] > 0.0]
+        shares[index] = 0.0
 
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
@@ -357,98 +445,84 @@ class Tracer:
 
         Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
         from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
-        occluders keeps a small distance from its surface.
+        occluders keeps a small distance from its surface. The side of a triangle is that of its own normal: that of
+        the sample is the smooth one where a lobe ends at the smooth horizon.
         """
         position, normal, smooth_normal = (
-            np.ascontiguousarray(values, np.float32)
+            np.array(values, np.float32, order="C")
             for values in (samples.position, samples.geometric_normal, samples.smooth_normal)
         )
-        count = len(position)
+        count, chunk = len(position), self._caster.chunk
         reach = np.abs(position).max(axis=1, initial=0.0)
         clearance = (CLEARANCE * 8.0 * reach).astype(np.float32)
         lift, terminator = np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32)
-        for start in range(0, count, CHUNK):
-            part = np.arange(start, min(start + CHUNK, count))
-            found, instance, triangle, u, v = self._triangles_at(position[part], normal[part])
-            part = part[found]
-            for number in np.unique(instance):
-                here = np.flatnonzero(instance == number)
-                shape = _Shape.of(self.occluders, number, self._is_applied[number], triangle[here], u[here], v[here])
-                clearance[part[here]] = CLEARANCE * (reach[part[here]] + shape.size)
+        for start in range(0, count, chunk):
+            part = slice(start, start + chunk)
+            found = self._triangles_at(position[part], normal[part], (NEARBY * (1.0 + reach[part])).astype(np.float32))
+            for number in np.unique(found.instance):
+                here = found.instance == number
+                shape = _Shape.of(self.occluders, found, here, self._is_applied[number])
+                index = start + found.ray[here]
+                clearance[index] = CLEARANCE * (reach[index] + shape.size)
+<<<<<<< HEAD
+                normal[index] = shape.face_normals(normal[index])
+=======
+                if self._thickness[number] > 0.0:
+                    clearance[index] += self._thickness_of(number, found.triangle[here])
+>>>>>>> rays
                 if shape.normals is not None:
-                    lifts = shape.lifts(normal[part[here]])
-                    lift[:, part[here]] = lifts
-                    terminator[part[here]] = self.occluders.terminators[number] * np.any(lifts, axis=(0, 2))
+                    lifts = shape.lifts(normal[index])
+                    lift[:, index] = lifts
+                    terminator[index] = self.occluders.terminators[number] * np.any(lifts, axis=(0, 2))
         return Starts(position, normal, smooth_normal, clearance, lift, terminator)
 
-    def _triangles_at(self, position, normal):
-        """Which triangles at most CHUNK samples lie on, as `_closest` has it."""
-        reach = (NEARBY * (1.0 + np.abs(position).max(axis=1))).astype(np.float32)
-        origins = position + reach[:, None] * normal
-        everything = np.full(len(position), ALL_RAYS, np.uint32)
-        best = np.full(len(position), np.inf, np.float32)
-        instance, triangle = np.zeros((2, len(position)), np.int64)
-        u, v = np.zeros((2, len(position)), np.float32)
+    def _thickness_of(self, instance, triangle) -> np.ndarray:
+        """World-space thickness (Q,) of triangles of an instance that has one, in m."""
+        thickness = self.occluders.meshes[self.occluders.mesh[instance]].thickness
+        scale = np.linalg.norm(self.occluders.matrices[instance][:, :3], axis=0).max()
+        return thickness[triangle] * np.float32(scale)
+
+    def _triangles_at(self, position, normal, reach) -> Hits:
+        """Which triangles samples lie on, within `reach` (P,) m or their thickness, as if rays had met them."""
+        found = self._nearest(position, normal, reach)
+        thickest = np.float32(self._thickness.max(initial=0.0))
+        if thickest == 0.0:
+            return found
+        rest = np.ones(len(position), bool)
+        rest[found.ray] = False
+        rest = np.flatnonzero(rest)
+        wider = self._nearest(position[rest], normal[rest], np.full(len(rest), thickest))
+        within = np.zeros(len(wider.ray), bool)
+        for number in np.unique(wider.instance[self._thickness[wider.instance] > 0.0]):
+            here = np.flatnonzero(wider.instance == number)
+            within[here] = wider.distance[here] <= self._thickness_of(number, wider.triangle[here])
+        wider = Hits(rest[wider.ray], *(getattr(wider, field.name) for field in fields(Hits)[1:]))
+        joined = zip(*((getattr(hits, field.name) for field in fields(Hits)) for hits in (found, wider)), strict=True)
+        return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
+
+    def _nearest(self, position, normal, reach) -> Hits:
+        """The triangles nearest to samples along their normals, up to `reach`; `distance` is how near."""
+        count = len(position)
+        origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
+        off = np.full(count, np.inf, np.float32)
+        best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))
         with self._lock:
-            for scene in (self._opaque, self._clear):
-                near = np.zeros(len(position), np.float32)
+            for is_clear in (False, True):
+                near, index = np.zeros(count, np.float32), np.arange(count)
                 # The first triangle may be that of another surface, close above.
-                for _ in range(0 if scene.is_empty else LAYERS):
-                    hit, *found = self._closest(scene, origins, -normal, near, 2.0 * reach, everything)
-                    index, off = np.flatnonzero(hit), np.abs(found[0] - reach[hit])
-                    closer = off < best[index]
-                    index = index[closer]
-                    best[index] = off[closer]
-                    for values, new in zip((instance, triangle, u, v), found[1:], strict=True):
-                        values[index] = new[closer]
-                    near[hit] = found[0] * STEP
-                    near[~hit] = np.inf
-        found = np.isfinite(best)
-        return found, instance[found], triangle[found], u[found], v[found]
-
-    def _is_blocked(self, origins, directions, distances, masks):
-        """Mask (R,) of at most CHUNK rays that an opaque surface blocks."""
-        packets, count = self._packets, len(origins)
-        for row, values in ((ORIGIN, origins), (DIRECTION, directions), (FAR, distances), (MASK, masks)):
-            packets.set(row, values)
-        packets.trace(self._embree.occluded, self._opaque.scene, count)
-        return packets.get(FAR, count) < 0.0  # Embree writes -inf
-
-    def _attenuate(self, shares, origins, directions, distances, masks):
-        """Multiply `shares` (R,) by those of the transparent surfaces that the rays meet."""
-        near = np.zeros(len(shares), np.float32)
-        index = np.flatnonzero(shares > 0.0)
-        for _ in range(self.occluders.transparent_surfaces + 1):
-            if not len(index):
-                return
-            rays = origins[index], directions[index], near[index], distances[index], masks[index]
-            hit, distance, instance, triangle, u, v = self._closest(self._clear, *rays)
-            index = index[hit]
-            for number in np.unique(instance):
-                here = instance == number
-                clear = self._transparency(number)
-                shares[index[here]] *= clear.shares(triangle[here], u[here], v[here])
-            near[index] = distance * STEP
-            index = index[shares[index] > 0.0]
-        shares[index] = 0.0
-
-    def _transparency(self, instance) -> Transparency:
-        return self.occluders.meshes[self.occluders.mesh[instance]].transparency
-
-    def _closest(self, scene, origins, directions, near, far, masks):
-        """What at most CHUNK rays meet first from `near` to `far`: a mask (R,) of those that meet something, then of
-        these the distance, the number of the instance and of its triangle, and the place u, v on it."""
-        packets, count = self._hits, len(origins)
-        for row, values in ((ORIGIN, origins), (NEAR, near), (DIRECTION, directions), (FAR, far), (MASK, masks)):
-            packets.set(row, values)
-        packets.numbers[:, GEOMETRY : INSTANCE + 1] = NONE
-        packets.trace(self._embree.intersect, scene.scene, count)
-        geometry, part = packets.get(GEOMETRY, count, True), packets.get(INSTANCE, count, True)
-        hit = geometry != NONE
-        number = np.where(part == NONE, geometry, part)[hit]
-        values = (packets.get(row, count)[hit] for row in (FAR, U, V))
-        distance, u, v = values
-        return hit, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[hit], u, v
+                for _ in range(LAYERS if self._has[is_clear] else 0):
+                    rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
+                    hits = self._caster.closest(is_clear, *rays)
+                    index = index[hits.ray]
+                    found = np.abs(hits.distance - reach[index])
+                    closer = found < off[index]
+                    for field in fields(Hits)[2:]:
+                        getattr(best, field.name)[index[closer]] = getattr(hits, field.name)[closer]
+                    off[index[closer]] = found[closer]
+                    near[index] = hits.distance * STEP
+                    index = index[off[index] > CERTAIN * reach[index]]
+        there = np.isfinite(off)
+        return Hits(*(getattr(best, field.name)[there] for field in fields(Hits)))
 
 
 # -- where shadow rays start -----------------------------------------------------------------------------------------
@@ -467,33 +541,65 @@ class Starts:
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
-        facing = _dot(self.geometric_normal[index], directions)
+        return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
+
+    def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, S, Q) of S rays each from the samples `index` (Q,), along unit `directions` (3, S, Q)."""
+        normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
+        facing = _dot_rows(normal, directions)
         side = np.copysign(self.clearance[index], facing)
-        terminator = self.terminator[index]
         smooth = np.flatnonzero(terminator)
         lift = None
         if len(smooth):
-            lift, own = self._lifts(index[smooth], directions[smooth], facing[smooth], terminator[smooth])
-            side[smooth] = np.where(own, np.abs(side[smooth]) * own, side[smooth])
-        found = self.position[index] + side[:, None] * self.geometric_normal[index]
+            part = slice(None) if len(smooth) == len(index) else smooth
+            rays = directions[:, :, part], facing[:, part], terminator[part]
+            lift, own = self._lifts(index[part], *rays)
+            side[:, part] = np.where(own, np.abs(side[:, part]) * own, side[:, part])
+        found = side * normal
+        found += self.position[index].T[:, None]
         if lift is not None:
-            found[smooth] += lift
+            found[:, :, part] += lift
         return found
 
+    def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
+
+        They end at `distances`, finite, along `directions` from the sample, wherever they start.
+        """
+        origins = self.origins_of_rows(index, directions)
+        moved = origins - self.position[index].T[:, None]
+        lifted = np.flatnonzero(_dot_rows(moved, moved) > 4.0 * self.clearance[index] ** 2)
+        if len(lifted):
+            directions, distances = directions.copy(), distances.copy()
+            rows = directions.reshape(3, -1)
+            toward = rows[:, lifted] * distances.ravel()[lifted] - moved.reshape(3, -1)[:, lifted]
+            length = np.sqrt(_dot_rows(toward, toward))
+            rows[:, lifted] = toward / np.maximum(length, np.float32(1e-30))
+            distances.ravel()[lifted] = length
+        return origins, directions, distances
+
     def _lifts(self, index, directions, facing, terminator):
-        """How far (S, 3) rays of smooth samples start from the sample, and where they start not to pass their own
-        triangle (S,): above it (1), below (-1) or where the direction tells (0)."""
-        smooth_facing = _dot(self.smooth_normal[index], directions)
-        flipped = np.where(smooth_facing < 0.0, np.float32(-1.0), np.float32(1.0))
+        """How far (3, S, Q) rays of smooth samples start from the sample, and where they start not to pass their own
+        triangle (S, Q): above it (1), below (-1) or where the direction tells (0)."""
+        smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
+        is_inside = smooth_facing < 0.0
+        flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
         facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
         grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
         amount = np.clip(grazing, 0.0, 1.0)
-        lift = amount[:, None] * self.lift[(flipped < 0.0).astype(np.intp), index]
+        outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
         # As in Cycles, light from behind the own triangle meets it.
-        return lift, np.where((amount > 0.0) & (facing <= 0.0), flipped, 0.0)
+        own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
+        return amount * np.where(is_inside, inside, outside), own
+
+
+def _dot_rows(first, second):
+    """Scalar products (S, Q) of vectors (3, S, Q)."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _dot(first, second):
+    """Scalar products (R,) of vectors (R, 3)."""
     return np.einsum("rk,rk->r", first, second)
 
 
@@ -514,7 +620,7 @@ def open_tracer(occluders: Occluders, libraries: Iterable[str | os.PathLike] = (
                 embree = _Embree(library)
                 _probe(embree)
                 _trusted[library] = embree
-            return Tracer(occluders, _trusted[library])
+            return Tracer(occluders, EmbreeCaster(occluders, _trusted[library]))
         except _Unfit as error:
             reasons.append(f"{library}: {error}")
     raise SceneError(f"no library to trace shadow rays with: {listed(reasons, 8, '; ')}")
@@ -544,7 +650,7 @@ def _probe(embree: _Embree) -> None:
         ([0, 5, 1], along, np.inf, 4, 1.0),
     )
     origins, directions, distances, masks, answers = map(np.array, zip(*rays, strict=True))
-    with Tracer(occluders, embree) as tracer:
+    with Tracer(occluders, EmbreeCaster(occluders, embree)) as tracer:
         found = tracer.transmittance(origins, directions, distances, masks)
     if not np.array_equal(found, answers.astype(np.float32)):
         raise _Unfit(f"version {embree.version}: rays of known answer got others")

@@ -21,6 +21,8 @@ class Tracer:
     def __init__(self, passed=lambda origins, directions, distances: np.ones(len(origins))):
         self.passed, self.rays = passed, 0
 
+    library = None
+
     def mask_of(self, name):
         return 0xFFFFFFFF
 
@@ -28,8 +30,9 @@ class Tracer:
         self.position = samples.position
         return self
 
-    def origins(self, index, directions):
-        return self.position[index]
+    def aimed(self, index, directions, distances):
+        origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
+        return origins.astype(np.float32), directions, distances
 
     def transmittance(self, origins, directions, distances, masks):
         self.rays += len(origins)
@@ -92,11 +95,10 @@ def test_weights_are_the_light_that_is_reflected(surface, kind):
         assert (getattr(found, name) == 1.0).all()
     for light in lights:
         expected = shading.shade(samples, [light], "reference", dtype=np.float64, workers=1)
-        pairs = ratio.Pairs(ratio.Surface(samples, PASSES, OPEN), light)
-        pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS)
+        pairs = with_all_rays(samples, light, OPEN)
         # `shade` takes the shadowing of bump maps at one direction.
         for name in PASSES if surface != "tilted" else ("specular",):
-            _, radiance, _ = pairs.found(name)
+            radiance = pairs.unshadowed(name)
             # The rays weigh by the mean color, as far as the light's own color is the same for all of a light.
             color = light.radiance.mean() / light.radiance
             whole = (getattr(expected, name)[0] * color).mean(axis=1)
@@ -164,15 +166,22 @@ def textbook_ggx(cosine_h, cosine_i, cosine_o, alpha):
     return distribution * masking / (4.0 * cosine_i * cosine_o)
 
 
+def with_all_rays(samples, light, tracer):
+    """The pairs of a light after as many rays as there can be, for each."""
+    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), light)
+    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    return pairs
+
+
 @pytest.mark.parametrize("roughness", (0.15, 0.5))
 @pytest.mark.parametrize("shape", ("RECTANGLE", "ELLIPSE"))
 def test_shares_are_those_of_a_quadrature_over_the_light(shape, roughness):
-    samples, film = floor(12, roughness)
+    samples, _ = floor(12, roughness)
     light, tracer = panel(shape=shape), past_spheres(((0.0, 1.0, 0.5), 0.5), ((-1.2, -0.5, 0.3), 0.3))
     expected = brute_force(samples, light, tracer.passed, 150)
-    found = ratio.visible_shares(samples, [light], tracer, rays=1024, film=film)
+    pairs = with_all_rays(samples, light, tracer)
     for name, limit in (("specular", 0.012), ("diffuse", 0.006)):
-        error = getattr(found, name)[0] - expected[name]
+        error = pairs.found(name)[0] - expected[name][pairs.index]
         # Stratified, 1024 rays are off by about 1024^-0.75 = 0.6 % of one; half as many for a sharp lobe.
         assert np.sqrt(np.square(error).mean()) < limit, name
         assert abs(error.mean()) < 0.25 * limit, name
@@ -186,7 +195,7 @@ def test_bump_mapped_lobes_have_the_shares_of_a_quadrature():
     values = {"specular_f0": gray, "specular_f90": gray, "dielectric": 0.0 * gray, "specular_dip": 0.0 * gray}
     samples = dataclasses.replace(samples, **values)
     expected = brute_force(samples, light, tracer.passed, 150)
-    found = ratio.visible_shares(samples, [light], tracer, rays=1024)
+    pairs = with_all_rays(samples, light, tracer)
     for name in PASSES:
-        error = np.abs(getattr(found, name)[0] - expected[name])[found.mixed[0]]
+        error = np.abs(pairs.found(name)[0] - expected[name][pairs.index])[pairs.visible & pairs.blocked]
         assert len(error) > 30 and np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.04, name

@@ -10,11 +10,12 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
-from ..evaluated import SURFACE_TYPES, is_rendered, mesh_key, owner_of, read_values
+from ..evaluated import SURFACE_TYPES, is_rendered, owner_of, read_values
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
 from ..materials.values import Value, combined, constant, is_gray, is_srgb, product, value_at
@@ -27,6 +28,8 @@ NAMED = 3
 # Beyond, hair and points are left out: hair would take some 0.7 GiB.
 MOST_PIECES = 1_000_000
 TUBE_SIDES = 3
+# How far a ball of radius 1 is from its flat faces and their corners, at most.
+BALL_THICKNESS = 0.08
 # Radius of points without one, in m, as in Cycles.
 POINT_RADIUS = 0.01
 
@@ -43,7 +46,10 @@ def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occlud
 class _Collector:
     def __init__(self, depsgraph, override, left_out):
         self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
-        self._blockers = Blockers([instance.object.original for instance in depsgraph.object_instances])
+        objects = {
+            instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
+        }
+        self._blockers = Blockers(list(objects.values()))
         self._meshes: list[OccluderMesh] = []
         # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
         self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
@@ -56,19 +62,16 @@ class _Collector:
     def collect(self, warn) -> Occluders:
         for instance in self._depsgraph.object_instances:
             ob = instance.object
-            if ob.type == "VOLUME" and instance.show_self:
-                self._note("volumes cast no shadows here", ob)
             if ob.type not in SURFACE_TYPES or ob.original.name_full in self._left_out:
                 continue
             if not (ob.visible_shadow and owner_of(instance).visible_shadow):
                 continue
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
-                self._note("its transform is not finite, it blocks nothing", ob)
                 continue
             if instance.show_self and is_rendered(ob):
                 self._add(instance, matrix)
-            if instance.show_particles and not instance.is_instance and ob.particle_systems:
+            if instance.show_particles and ob.particle_systems:
                 self._add_hair(instance)
         for kind, names in self._notes.items():
             warn(f"shadows: {kind}: {listed(map(repr, names), NAMED)}")
@@ -118,7 +121,7 @@ class _Collector:
             materials = [self._override] * len(materials)
         if self._simplified(ob):
             self._note("camera or distance culling is on, but it blocks everywhere", ob)
-        key = (*mesh_key(instance), tuple(material.name_full if material else "" for material in materials))
+        key = (*_shape_key(ob), tuple(material.name_full if material else "" for material in materials))
         if key not in self._parts:
             clear = [self._clear_of(material) for material in materials]
             places = AS_IT_IS
@@ -159,10 +162,8 @@ class _Collector:
             return None
         output = surface.node
         if live_link(surface) is None:
-            if live_link(output.inputs["Volume"]) is None:
-                return None
-            self._note("volumes cast no shadows here", material)
-            return _Clear(constant(1.0))
+            # Volumes are not shaded, which is said elsewhere.
+            return None if live_link(output.inputs["Volume"]) is None else _Clear(constant(1.0))
         value = _share_at(surface)
         if value is None:
             self._note("it is transparent in a way that is not read here, and blocks as if it were opaque", material)
@@ -198,6 +199,9 @@ class _Collector:
             settings = system.settings
             if settings.type != "HAIR" or settings.render_type != "PATH":
                 continue
+            if instance.is_instance:
+                self._note("hair on instances blocks nothing", ob)
+                continue
             count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
             if count * steps > MOST_PIECES:
                 self._note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
@@ -226,8 +230,13 @@ class _Clear:
         use = self.value.image
         mapping = np.array(use.mapping, np.float32)
         uv = uv_of(use.uv_map) @ mapping[:, :2].T + mapping[:, 2]
-        interpolation = "Closest" if use.closest else "Linear"
-        return Transparency(1.0, image_of(self.value), uv.astype(np.float32), use.extension, interpolation)
+        return Transparency(
+            image=image_of(self.value),
+            uv=uv.astype(np.float32),
+            extension=use.extension,
+            interpolation="Closest" if use.closest else "Linear",
+            outside=float(np.clip(self.value.offset[0], 0.0, 1.0)),
+        )
 
 
 def _share_at(socket, groups: tuple = ()) -> Value | None:
@@ -298,6 +307,15 @@ def _is_displaced(material) -> bool:
     if surface is None or live_link(surface.node.inputs["Displacement"]) is None:
         return False
     return getattr(material, "displacement_method", "BUMP") != "BUMP"
+
+
+def _shape_key(ob) -> tuple:
+    """What tells the evaluated data of objects apart while a depsgraph stays as it is."""
+    data = ob.data
+    is_mesh = isinstance(data, bpy.types.Mesh)
+    original = data.original.session_uid if data.original is not None else 0
+    owner = 0 if is_mesh and not ob.modifiers else ob.original.session_uid
+    return owner, original, data.as_pointer(), len(data.vertices) if is_mesh else 0
 
 
 # -- shapes --------------------------------------------------------------------------------------------------------
@@ -426,7 +444,9 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
     one, two = np.arange(sides), (np.arange(sides) + 1) % sides
     low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
     triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
-    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency)
+    # What is shaded is a ribbon through the middle, or a round tube; it bends where these pieces are straight.
+    thickness = np.repeat(1.3 * np.maximum(out[ends], out[ends - 1]), 2 * sides)
+    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency, thickness=thickness)
 
 
 def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
@@ -446,7 +466,9 @@ def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
     places[:, range(3), range(3)] = radii[:, None]
     places[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
     places[:, 3, 3] = 1.0
-    return [OccluderMesh(*_ball(), _constant_transparency(clear, ob, note))], places
+    vertices, triangles = _ball()
+    transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
+    return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], places
 
 
 @cache

@@ -18,6 +18,7 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.pipeline import PictureOptions, shade_scene
 from ltsh_addon.scene import Cancelled
 
 SIZE = (28, 18)
@@ -35,6 +36,7 @@ def lit_scene():
     scene = bpy.context.scene
     scene.render.engine = "LTSH"
     scene.ltsh_view.render_samples, scene.ltsh_view.technique = 1, "ltsh2"
+    scene.ltsh.shadows = False
     settings = scene.render.image_settings
     settings.file_format, settings.color_depth = "OPEN_EXR", "32"
     return plane, sphere
@@ -106,6 +108,21 @@ def test_final_render_is_the_picture_that_shade_makes(scene, tmp_path):
             np.testing.assert_allclose(found, expected, **SAME)
             assert expected.max() > 0.01
     np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), shaded(extraction), **SAME)
+
+
+def test_final_render_has_the_shadows_that_shade_makes(scene, tmp_path):
+    scene.ltsh.shadows, scene.ltsh.shadow_rays = True, 16
+    found = picture(render_passes(scene, tmp_path / "final.exr"), "ViewLayer.Combined.")
+    path = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    shade_scene(PictureOptions(path, tmp_path / "out", techniques=("ltsh2",), shadow_rays=16))
+    channels = read_channels(tmp_path / "out" / "shade.exr")
+    expected, bare = (
+        sum(picture(channels, f"ltsh2{kind}.{name}.") for name in shading.PASSES) for kind in ("", "_unshadowed")
+    )
+    np.testing.assert_allclose(found, expected, **SAME)
+    shadowed = expected.sum(axis=-1) < 0.5 * bare.sum(axis=-1)
+    assert 0.01 < shadowed.mean() < 0.5
 
 
 def test_every_view_layer_has_its_own_picture(scene, tmp_path):

@@ -9,8 +9,6 @@ import pytest
 import scene_parts
 from material_scenes import Build
 
-from ltsh_addon.blender.evaluated import with_render_depsgraph
-from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.blender.render_settings import enable_passes, pass_names, pinned_pixel_filter, render_exr
 from ltsh_addon.imaging.exr import read_channels
@@ -71,15 +69,6 @@ def seen_by_cycles(folder, light=LIGHT):
     return found / (power * (to_light[:, 2] / distance) ** 2 / distance**2 / math.pi)
 
 
-def collected():
-    """The occluders of the open scene and the warnings about them."""
-    warnings = []
-    scene = bpy.context.scene
-    override = bpy.context.view_layer.material_override
-    occluders = with_render_depsgraph(scene, lambda depsgraph: collect_occluders(depsgraph, override, warnings.append))
-    return occluders, warnings
-
-
 def seen_by_rays(occluders, light=LIGHT, name="Key"):
     """Share (N,) of light that reaches the floor, and a mask of the points where the size of the light, the place in
     the pixel or single precision does not matter."""
@@ -99,7 +88,7 @@ def seen_by_rays(occluders, light=LIGHT, name="Key"):
 def assert_as_cycles(folder, note="", least=0.03, most_doubtful=0.35):
     """The occluders, whose shadow is that of Cycles; `note` is all that is warned of."""
     expected = seen_by_cycles(folder)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     found, is_sure = seen_by_rays(occluders)
     assert is_sure.mean() > 1.0 - most_doubtful
     blocked = (1.0 - found)[is_sure]
@@ -173,6 +162,23 @@ def vertex_instances():
     child.parent = parent
 
 
+def generated_instances():
+    """A geometry nodes modifier that puts two meshes it makes on points: a ball, and cubes."""
+    tree = bpy.data.node_groups.new("Scatter", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    entry, end, on_points, made = (
+        tree.nodes.new(kind)
+        for kind in ("NodeGroupInput", "NodeGroupOutput", "GeometryNodeInstanceOnPoints", "GeometryNodeMeshCube")
+    )
+    made.inputs["Size"].default_value = (0.5, 0.4, 0.3)
+    tree.links.new(entry.outputs[0], on_points.inputs["Points"])
+    tree.links.new(made.outputs[0], on_points.inputs["Instance"])
+    tree.links.new(on_points.outputs[0], end.inputs[0])
+    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
+    ob.modifiers.new("Scatter", "NODES").node_group = tree
+
+
 def shared_data():
     first = cube((-0.8, 0.0, 1.0), 0.7)
     second = hidden(bpy.data.objects.new("Second", first.data))
@@ -213,16 +219,23 @@ SHAPES = {
     function.__name__: function
     for function in (
         *(modified, curve, text, metaballs, nurbs_surface, collection_instances, vertex_instances, shared_data),
+        *(generated_instances,),
         *(not_in_the_picture, glowing, glass, no_surface_shader, overridden),
     )
 }
+
+
+# Whose instances share a mesh.
+INSTANCES = ("collection_instances", "vertex_instances", "shared_data", "generated_instances")
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shadows_of_shapes_are_those_of_cycles(tmp_path, name):
     start()
     SHAPES[name]()
-    assert_as_cycles(tmp_path)
+    occluders = assert_as_cycles(tmp_path)
+    if name in INSTANCES:
+        assert len(occluders.meshes) == 2 and len(occluders.mesh) > 2  # the floor is one
 
 
 def test_what_casts_no_shadow_blocks_nothing(tmp_path):
@@ -232,11 +245,14 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
     bpy.data.objects["A"].visible_shadow = False
     bpy.data.objects["B"].hide_render = True
     bpy.data.objects["C"].data.materials.append(scene_parts.bsdf_material("ShaderNodeBsdfTransparent", "Clear")[0])
+    volume = Build("Mist")
+    volume.link(volume.shader("VolumePrincipled", Density=0.0), volume.output.inputs["Volume"])
+    cube((0, 0, 2), material=volume.material)
     parent = hidden(scene_parts.add_plane(size=1.0, name="Parent", location=(0.0, 0.0, 1.0)))
     parent.instance_type, parent.visible_shadow = "VERTS", False
     cube((0.0, 0.0, 0.0), 0.5).parent = parent
     assert seen_by_cycles(tmp_path) == pytest.approx(1.0, abs=2e-3)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert warnings == [] and len(occluders.mesh) == 1  # the floor
 
 
@@ -292,8 +308,8 @@ def mapped_image(made):
     return inside
 
 
-def mixed_by_image(made):
-    return made.mix(textured(made, "Color", space="sRGB"), made.leaf(0.5), clear(made, 0.8))
+def mixed_by_image(made, **settings):
+    return made.mix(textured(made, "Color", space="sRGB", **settings), clear(made, 0.2), clear(made, 0.8))
 
 
 def is_shadow_ray(made):
@@ -323,6 +339,7 @@ MATERIALS = {
     "clipped image": (lambda made: alpha_image(made, extension="CLIP"), None),
     "mapped image": (mapped_image, None),
     "mixed by a color": (mixed_by_image, None),
+    "mixed by a clipped color": (lambda made: mixed_by_image(made, extension="CLIP"), None),
 }
 
 
@@ -337,7 +354,7 @@ def test_shadows_of_materials_are_those_of_cycles(tmp_path, name):
     make, share = MATERIALS[name]
     start()
     ob = pane(shown(make))
-    if name == "clipped image":
+    if "clipped" in name:
         uv = ob.data.uv_layers[0].uv
         uv.foreach_set("vector", 1.6 * np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32) - 0.3)
     occluders = assert_as_cycles(tmp_path)
@@ -349,7 +366,7 @@ def test_an_image_is_interpolated_as_in_cycles(tmp_path):
     start()
     pane(shown(lambda made: alpha_image(made, interpolation="Linear")))
     expected = seen_by_cycles(tmp_path)
-    found, _ = seen_by_rays(collected()[0])
+    found, _ = seen_by_rays(scene_parts.collected_occluders()[0])
     # The light is 2 mm wide, and alpha changes by at most 1 from one pixel of the image, of 0.5 m, to the next.
     assert np.abs(found - expected).max() < 0.02
 
@@ -392,7 +409,6 @@ NAMED = {
     "colored": "by its mean",
     "color under alpha": "only Cycles knows",
     "displaced": "displacement",
-    "volume": "volumes cast no shadows",
 }
 
 
@@ -410,10 +426,6 @@ def test_what_is_not_as_in_cycles_is_named(name):
     elif name == "color under alpha":
         pane(shown(mixed_by_image))
         bpy.data.images["Mask"].alpha_mode = "STRAIGHT"
-    elif name == "volume":
-        made = Build("Pane")
-        made.link(made.shader("VolumePrincipled"), made.output.inputs["Volume"])
-        pane(made.material)
     else:
         made = Build("Pane")
         made.show(made.leaf(0.5))
@@ -421,9 +433,9 @@ def test_what_is_not_as_in_cycles_is_named(name):
         node = made.tree.nodes.new("ShaderNodeDisplacement")
         made.tree.links.new(node.outputs[0], made.output.inputs["Displacement"])
         pane(made.material)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
-    share = {"colored": 0.5, "volume": 1.0}.get(name, 0.0)
+    share = 0.5 if name == "colored" else 0.0
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 
@@ -432,38 +444,15 @@ def test_what_is_not_as_in_cycles_is_named(name):
 
 def test_points_have_the_shadow_of_balls(tmp_path):
     start()
-    cloud = hidden(scene_parts.link(bpy.data.objects.new("Points", point_cloud(60))))
+    cloud = hidden(scene_parts.link(bpy.data.objects.new("Points", scene_parts.point_cloud(60))))
     cloud.rotation_euler = (0.1, 0.2, 0.3)
     assert_mean_shadow(tmp_path, "balls", 0.01)
-
-
-def point_cloud(count):
-    rng = np.random.default_rng(0)
-    cloud = bpy.data.pointclouds.new("Points")
-    if hasattr(cloud, "resize"):
-        cloud.resize(count)
-    else:
-        bpy.data.pointclouds.remove(cloud)
-        mesh = bpy.data.meshes.new("Seeds")
-        mesh.from_pydata([(0.0, 0.0, 0.0)] * count, [], [])
-        seeds = scene_parts.link(bpy.data.objects.new("Seeds", mesh))
-        bpy.context.view_layer.objects.active = seeds
-        seeds.select_set(True)
-        bpy.ops.object.convert(target="POINTCLOUD")
-        cloud = bpy.context.object.data
-        bpy.data.objects.remove(bpy.context.object)
-    places = rng.uniform(-1, 1, (count, 3)) * [1.5, 1.0, 0.3] + [0, 0, 1]
-    cloud.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
-    if "radius" not in cloud.attributes:
-        cloud.attributes.new("radius", "FLOAT", "POINT")
-    cloud.attributes["radius"].data.foreach_set("value", rng.uniform(0.05, 0.2, count).astype(np.float32))
-    return cloud
 
 
 def assert_mean_shadow(folder, note, tolerance):
     """The shadow is that of Cycles but at silhouettes, which facets move both ways."""
     expected = seen_by_cycles(folder)
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     found, _ = seen_by_rays(occluders)
     assert len(warnings) == 1 and note in warnings[0], warnings
     assert 0.03 < 1.0 - expected.mean() < 0.6
@@ -472,23 +461,9 @@ def assert_mean_shadow(folder, note, tolerance):
     return occluders
 
 
-def hair_curves(count, points=6):
-    rng = np.random.default_rng(1)
-    curves = bpy.data.hair_curves.new("Hair")
-    curves.add_curves([points] * count)
-    roots = rng.uniform(-1, 1, (count, 1, 3)) * [1.5, 1.0, 0.2] + [0, 0, 1]
-    along = np.linspace(0, 1, points)[None, :, None]
-    places = roots + along * rng.uniform(-1, 1, (count, 1, 3)) + 0.2 * along**2 * rng.uniform(-1, 1, (count, 1, 3))
-    curves.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
-    if "radius" not in curves.attributes:
-        curves.attributes.new("radius", "FLOAT", "POINT")
-    curves.attributes["radius"].data.foreach_set("value", np.full(count * points, 0.06, np.float32))
-    return curves
-
-
 def test_hair_curves_have_the_shadow_of_tubes(tmp_path):
     start()
-    hidden(scene_parts.link(bpy.data.objects.new("Hair", hair_curves(25))))
+    hidden(scene_parts.link(bpy.data.objects.new("Hair", scene_parts.hair_curves(25))))
     assert_mean_shadow(tmp_path, "tubes", 0.015)
 
 
@@ -545,17 +520,33 @@ def test_blockers_of_lights_are_those_of_cycles(tmp_path, name):
         bpy.data.objects[other].hide_render = True
         expected = seen_by_cycles(tmp_path, places[light])
         bpy.data.objects[other].hide_render = False
-        occluders, warnings = collected()
+        occluders, warnings = scene_parts.collected_occluders()
         found, is_sure = seen_by_rays(occluders, places[light], light)
         assert warnings == [] and found.min() == 0.0
         assert (np.abs(found - expected)[is_sure] > 0.01).sum() <= 2
+
+
+def test_more_sets_of_blockers_than_a_mask_has_bits_are_named():
+    start()
+    cube().name = "A"
+    for number in range(33):
+        light = add_light(f"Light {number:02}", LIGHT)
+        collection = bpy.data.collections.new(light.name)
+        collection.objects.link(bpy.data.objects["A" if number % 2 else "Floor"])
+        light.light_linking.blocker_collection = collection
+    occluders, warnings = scene_parts.collected_occluders()
+    assert len(set(occluders.light_masks.values())) == 31
+    assert seen_by_rays(occluders, name="Light 29")[0].min() == 0.0
+    assert seen_by_rays(occluders, name="Light 30")[0].min() == 1.0
+    assert seen_by_rays(occluders, name="Light 32")[0].min() == 0.0  # as without a collection
+    assert len(warnings) == 1 and "'Light 31', 'Light 32'" in warnings[0]
 
 
 def test_a_light_without_shadows_is_not_blocked(tmp_path):
     start()
     cube()
     bpy.data.objects["Key"].data.use_shadow = False
-    occluders, warnings = collected()
+    occluders, warnings = scene_parts.collected_occluders()
     assert seen_by_rays(occluders)[0].min() == 1.0
     assert np.abs(seen_by_cycles(tmp_path) - 1.0).max() < 2e-3
     assert len(warnings) == 1 and "'Key'" in warnings[0] and "sharp reflections" in warnings[0]
@@ -566,7 +557,7 @@ def test_the_scene_is_left_as_it_was(tmp_path):
     pane(shown(alpha_image))
     text()
     before = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
-    occluders, _ = collected()
+    occluders, _ = scene_parts.collected_occluders()
     occluders.save(tmp_path / "occluders.npz")
     after = [(block.name_full, block.users) for block in (*bpy.data.objects, *bpy.data.meshes, *bpy.data.materials)]
     assert before == after

@@ -25,8 +25,8 @@ def save(folder):
 
 
 def baked(path, output, **options):
-    """Report and layers by file name, row 0 on top."""
-    values = {"size": (SIZE, SIZE), "margin": 0, **options}
+    """Report and layers by file name, row 0 on top; without shadows unless asked for."""
+    values = {"size": (SIZE, SIZE), "margin": 0, "shadows": "off", **options}
     report = bake_scene(BakeOptions(scene=path, output=output, **values))
     return report, {file.name: imaging.read_layers(file) for file in sorted(output.glob("*.exr"))}
 

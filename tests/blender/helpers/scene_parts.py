@@ -8,7 +8,9 @@ import bpy
 import numpy as np
 
 from ltsh_addon.blender import render_settings
+from ltsh_addon.blender.evaluated import with_render_depsgraph
 from ltsh_addon.blender.extract import pixels
+from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.process import client
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
@@ -100,6 +102,45 @@ def add_sphere(material=None, radius=0.8, name="Sphere", smooth=True, segments=3
     return ob
 
 
+def point_cloud(count):
+    """Data of points from 5 to 20 cm around a box 1 m above the origin."""
+    rng = np.random.default_rng(0)
+    cloud = bpy.data.pointclouds.new("Points")
+    if hasattr(cloud, "resize"):
+        cloud.resize(count)
+    else:
+        bpy.data.pointclouds.remove(cloud)
+        mesh = bpy.data.meshes.new("Seeds")
+        mesh.from_pydata([(0.0, 0.0, 0.0)] * count, [], [])
+        seeds = link(bpy.data.objects.new("Seeds", mesh))
+        bpy.context.view_layer.objects.active = seeds
+        seeds.select_set(True)
+        bpy.ops.object.convert(target="POINTCLOUD")
+        cloud = bpy.context.object.data
+        bpy.data.objects.remove(bpy.context.object)
+    places = rng.uniform(-1, 1, (count, 3)) * [1.5, 1.0, 0.3] + [0, 0, 1]
+    cloud.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
+    if "radius" not in cloud.attributes:
+        cloud.attributes.new("radius", "FLOAT", "POINT")
+    cloud.attributes["radius"].data.foreach_set("value", rng.uniform(0.05, 0.2, count).astype(np.float32))
+    return cloud
+
+
+def hair_curves(count, points=6):
+    """Data of hair 12 cm thick around a box 1 m above the origin."""
+    rng = np.random.default_rng(1)
+    curves = bpy.data.hair_curves.new("Hair")
+    curves.add_curves([points] * count)
+    roots = rng.uniform(-1, 1, (count, 1, 3)) * [1.5, 1.0, 0.2] + [0, 0, 1]
+    along = np.linspace(0, 1, points)[None, :, None]
+    places = roots + along * rng.uniform(-1, 1, (count, 1, 3)) + 0.2 * along**2 * rng.uniform(-1, 1, (count, 1, 3))
+    curves.attributes["position"].data.foreach_set("vector", places.astype(np.float32).ravel())
+    if "radius" not in curves.attributes:
+        curves.attributes.new("radius", "FLOAT", "POINT")
+    curves.attributes["radius"].data.foreach_set("value", np.full(count * points, 0.06, np.float32))
+    return curves
+
+
 def add_white_world():
     """A sky of radiance 1."""
     world = bpy.data.worlds.new("World")
@@ -173,6 +214,16 @@ def prepare():
     layer = render_settings.choose_view_layer(scene, warnings)
     inventory = pixels.prepare_scene(scene, layer, camera, warnings)
     return scene, layer, inventory, warnings
+
+
+def collected_occluders():
+    """What blocks light in the open scene, and the warnings about it."""
+    warnings, override = [], bpy.context.view_layer.material_override
+
+    def visit(depsgraph):
+        return collect_occluders(depsgraph, override, warnings.append)
+
+    return with_render_depsgraph(bpy.context.scene, visit), warnings
 
 
 def silent(stage, fraction):

@@ -13,7 +13,7 @@ from scene_parts import add_plane, principled
 
 from ltsh_addon import cli
 
-OPTIONS = ["--size", "256", "--margin", "0", "--techniques", "ltc,ltsh2,ltsh4", "--quiet"]
+OPTIONS = ["--size", "256", "--margin", "0", "--techniques", "ltc,ltsh2,ltsh4", "--shadows", "off", "--quiet"]
 
 with_limit = pytest.mark.skipif(bool(bpy.app.binary_path), reason="Blender does not start under a limit of files")
 pytestmark = [

@@ -464,12 +464,10 @@ class Tracer:
                 shape = _Shape.of(self.occluders, found, here, self._is_applied[number])
                 index = start + found.ray[here]
                 clearance[index] = CLEARANCE * (reach[index] + shape.size)
-<<<<<<< HEAD
-                normal[index] = shape.face_normals(normal[index])
-=======
                 if self._thickness[number] > 0.0:
                     clearance[index] += self._thickness_of(number, found.triangle[here])
->>>>>>> rays
+                else:
+                    normal[index] = shape.face_normals(normal[index])
                 if shape.normals is not None:
                     lifts = shape.lifts(normal[index])
                     lift[:, index] = lifts

@@ -58,7 +58,8 @@ def soft(generator):
     rounded = bpy.context.object.modifiers.new("Rounded", "SUBSURF")
     rounded.levels = rounded.render_levels = 2
     scene_parts.add_sphere(_matt((0.2, 0.5, 0.3), 0.2), radius=0.7, location=(0.3, 0.6, 0.7))
-    bpy.ops.mesh.primitive_torus_add(major_radius=0.6, minor_radius=0.2, location=(1.9, -0.5, 0.6), rotation=(1.2, 0.3, 0))
+    ring = {"major_radius": 0.6, "minor_radius": 0.2}
+    bpy.ops.mesh.primitive_torus_add(**ring, location=(1.9, -0.5, 0.6), rotation=(1.2, 0.3, 0.0))
     _give(bpy.context.object, _matt((0.6, 0.2, 0.5), 0.5), smooth=True)
     for number in range(5):
         bpy.ops.mesh.primitive_cylinder_add(radius=0.12, depth=2.4, location=(-3.0 + 1.5 * number, 2.2, 1.2))
@@ -106,7 +107,7 @@ def window(generator):
 
 
 def leaves(generator):
-    """Ground and a wall behind branches of leaves whose outlines are the alpha of an image; out of the camera's sight."""
+    """Ground and a wall in the shadow of leaves, whose outlines are the alpha of an image; the camera sees none."""
     _camera((0.0, -4.6, 1.7), (0.0, 0.6, 0.6))
     scene_parts.add_plane(_matt((0.35, 0.3, 0.22), 0.45), size=12.0, name="Ground")
     _box("Wall", (-4.0, 2.0, 0.0), (4.0, 2.1, 3.0), _matt((0.6, 0.58, 0.55), 0.3))

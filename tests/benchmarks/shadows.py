@@ -30,6 +30,7 @@ from ltsh_addon.blender.process import client  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
 from ltsh_addon.imaging.font import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
+from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
 from ltsh_addon.scene import PASSES  # noqa: E402
 from ltsh_addon.shading.parallel import CORES_VARIABLE, cores  # noqa: E402
 
@@ -39,7 +40,8 @@ MOST_BIAS = {"specular": 0.02, "diffuse": 0.005}
 # Of the error of Cycles in the same time.
 MOST_OF_CYCLES = 0.5
 RAYS_PER_SECOND, MOST_NUMPY, LEAST_SPEED_UP = 4e6, 2.0, 1.5
-FEW, DEFAULT = 16, 64
+# The most that a pair of a sample and a light may take: few, as by default, and many.
+FEW, DEFAULT, MANY = 16, PictureOptions.shadow_rays, 512
 # Moves everything, so that the rays of each sample are other ones.
 SHIFT = np.array([0.0625, 0.03125, 0.046875])
 CALIBRATION = (4, 32)
@@ -51,7 +53,7 @@ class Settings:
 
     size: tuple[int, int] = (320, 180)
     cycles_samples: int = 1024
-    most_rays: int = 256
+    most_rays: int = MANY
     rays: int = DEFAULT
     pictures: Path | None = None
 
@@ -60,7 +62,7 @@ class Settings:
         return f"{self.size[0]}x{self.size[1]}"
 
 
-QUICK = Settings(size=(128, 72), cycles_samples=128, most_rays=64)
+QUICK = Settings(size=(128, 72), cycles_samples=128, most_rays=256)
 LARGE = Settings(size=(640, 360), cycles_samples=4096, most_rays=1024)
 
 
@@ -244,8 +246,9 @@ def errors(scene: Measured):
         plain = scene.error(scene.unshadowed[name], name=name).estimate
         verdict = "" if bias.estimate <= MOST_BIAS[name] else f"  MISSED, target {MOST_BIAS[name]:.1%}"
         print(f"    {name:<9} {plain:>11.1%}{bias!s:>26}{cells[0]:>34}{cells[1]:>34}{verdict}")
-    brighter = sum((runs[rays][0][0][name] > scene.unshadowed[name] * (1 + 1e-5)).sum() for rays in runs for name in PASSES)
-    finite = all(np.isfinite(images[name]).all() for pair, _ in runs.values() for images in pair for name in PASSES)
+    every = [(name, images[name]) for pair, _ in runs.values() for images in pair for name in PASSES]
+    brighter = sum((image > scene.unshadowed[name] * (1.0 + 1e-5)).sum() for name, image in every)
+    finite = all(np.isfinite(image).all() for _, image in every)
     print(f"    values above the unshadowed picture: {brighter}; all finite: {finite}")
     first, second = runs[most][0]
     return {name: 0.5 * (first[name] + second[name]) for name in PASSES}
@@ -299,13 +302,6 @@ class TimedTracer:
     def __getattr__(self, name):
         return getattr(self._tracer, name)
 
-    def __enter__(self):
-        self._tracer.__enter__()
-        return self
-
-    def __exit__(self, *error):
-        return self._tracer.__exit__(*error)
-
     def transmittance(self, origins, *arguments, **options):
         start = time.thread_time()
         found = self._tracer.transmittance(origins, *arguments, **options)
@@ -358,13 +354,16 @@ def ray_speed(blocks=6, size=1 << 16):
 def ray_counts(scene: Measured):
     """Print processor time by number of rays, and how much of it is not spent on them."""
     rows = {}
-    for rays in (FEW, DEFAULT, 256):
+    for rays in (FEW, DEFAULT, MANY):
         tracer, samples = scene.tracer(0)
-        timed = tracer._tracer = TimedTracer(tracer._tracer)
         start = time.process_time()
         with tracer:
-            shadows = tracer.trace(samples, PASSES, rays, film=scene.extraction.film)
-        rows[rays] = time.process_time() - start, shadows.rays
+            timed = TimedTracer(tracer._tracer)
+            samples = replace(samples, position=samples.position - scene.extraction.origin)
+            found = visibility.visible_shares(
+                samples, tracer._lights, timed, rays=rays, film=scene.extraction.film, workers=1
+            )
+        rows[rays] = time.process_time() - start, found.rays
         numpy_share = rows[rays][0] / timed.seconds - 1.0 if timed.seconds else math.nan
         verdict = "" if numpy_share <= MOST_NUMPY else "  MISSED"
         print(f"  {rays:>4} rays: {rows[rays][0]:.2f} s, {rows[rays][1]:>9} traced, "
@@ -372,7 +371,7 @@ def ray_counts(scene: Measured):
               f"numpy {numpy_share:.2f} times that (target {MOST_NUMPY:.0f}){verdict}")  # fmt: skip
     (t0, n0), (t1, n1), (t2, n2) = rows.values()
     print(f"  seconds per million rays more: {(t1 - t0) / (n1 - n0) * 1e6:.3f} from {FEW} to {DEFAULT}, "
-          f"{(t2 - t1) / (n2 - n1) * 1e6:.3f} from {DEFAULT} to 256 (linear: the same)")  # fmt: skip
+          f"{(t2 - t1) / (n2 - n1) * 1e6:.3f} from {DEFAULT} to {MANY} (linear: the same)")  # fmt: skip
 
 
 def memory_and_cores(path, folder, settings):
@@ -455,9 +454,9 @@ def report(settings: Settings, names=NAMES):
             scene = Measured(path, settings)
             extraction = scene.extraction
             noise = [f"{imaging.reference_noise(*scene.halves[part], scene.mask):.2%} {part}" for part in PASSES]
-            print(f"  {name}, {settings.resolution}, {len(extraction.samples)} samples, {len(extraction.lights)} lights,"
-                  f" {extraction.occluders.triangle_count} triangles; noise of Cycles, {settings.cycles_samples} samples:"
-                  f" {', '.join(noise)}")  # fmt: skip
+            counts = f"{len(extraction.samples)} samples, {len(extraction.lights)} lights"
+            print(f"  {name}, {settings.resolution}, {counts}, {extraction.occluders.triangle_count} triangles; noise of"
+                  f" Cycles, {settings.cycles_samples} samples: {', '.join(noise)}")  # fmt: skip
             ours = errors(scene)
             images = equal_time(scene, path, folder)
             images["Cycles, converged"] = sum(scene.halves.values()).mean(axis=0)

@@ -300,6 +300,8 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     cycles.transparent_max_bounces, view_layer.pass_alpha_threshold = 1024, 0.5
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.light_sampling_threshold = 0.0
+    # How likely a light is chosen matters between two horizons: as `cycles.light_tree` tells.
+    cycles.use_light_tree = True
     cycles.caustics_reflective = True
     view_layer.samples = 0
 

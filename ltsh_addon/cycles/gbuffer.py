@@ -138,8 +138,7 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
     apart = np.spacing(np.abs(some).max(axis=1).astype(np.float32)).astype(np.float64)
     nearest = np.full(len(some), np.inf)
     for light in lights:
-        size = np.linalg.norm(light.half_u) + np.linalg.norm(light.half_v)
-        distance = np.linalg.norm(some - light.center, axis=1) - size
+        distance = np.linalg.norm(some - light.center, axis=1) - light.radius
         height = np.abs((some - light.center) @ light.direction)
         nearest = np.minimum(nearest, np.maximum(distance, height))
     share = apart / np.maximum(nearest, 1e-30)

@@ -8,7 +8,9 @@ import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
 from ..shading import brdf, polygon
+from .light_tree import light_chances
 
+SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
 # Reflected rays stay at least this far above the true surface, or this share of the view's own elevation.
 MINIMUM_REFLECTION_ELEVATION = 0.01
 ELEVATION_SHARE = 0.9
@@ -59,53 +61,107 @@ SMALLEST_ALPHA = 1e-3
 # Directions at which both probabilities are compared: around the horizon, closest to each other near the highlight,
 # at heights between the two horizons.
 AROUND, CONCENTRATION = 48, 6.0
-HEIGHTS = (0.25, 0.75)
+HEIGHTS = (1.0 / 6.0, 0.5, 5.0 / 6.0)
 # In rad. What lies between horizons that are closer is not worth a look.
 SMALLEST_ANGLE = 1e-4
-BLOCK = 4096
+# Of what lies between the horizons. A sample is split where more than this comes from below either.
+SMALLEST_SHARE = 5e-3
+BLOCK = 2048
 
 
-def end_at_horizons_of_cycles(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> SurfaceSamples:
-    """The samples with the smooth normal as geometric normal where that horizon is nearer to what Cycles sums up."""
+def end_at_horizons_of_cycles(
+    samples: SurfaceSamples, lights: tuple[AreaLight, ...], hit: np.ndarray | None = None, is_baked: bool = False
+) -> tuple[SurfaceSamples, np.ndarray]:
+    """Samples (Q) whose specular lobes end where those of Cycles do, and of which of `samples` (P) each is, (Q,).
+
+    Between the horizons of the smooth normal and of the mesh Cycles counts directions that a light chose above the
+    former, and directions that the surface chose above the latter, each with its weight of multiple importance
+    sampling. Where this leaves a part, a sample becomes two: one that ends at the mesh's horizon, and one without
+    diffuse light that ends at the smooth one. They follow one another and add up to the sample. `hit` (P,) are
+    the numbers of the hits on surfaces; left out: each sample is one. Of what is `is_baked`, Cycles chooses directions
+    by the specular lobes alone.
+    """
+    index = np.arange(len(samples))
     reflects = (samples.specular_f90 != 0.0).any(axis=1) | (samples.dielectric != 0.0).any(axis=1)
     apart = np.abs(samples.geometric_normal - samples.smooth_normal).max(axis=1) > SMALLEST_ANGLE
     differ = np.flatnonzero(reflects & apart)
     if len(differ) == 0 or not lights:
-        return samples
-    normal = np.array(samples.geometric_normal)
+        return samples, index
+    chances = lobe_chances(samples, index if hit is None else hit, is_baked)
+    by_smooth = np.zeros(len(samples))
     for start in range(0, len(differ), BLOCK):
         block = differ[start : start + BLOCK]
-        by_lobe, by_light = horizon_excess(samples.take(block), lights)
-        # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
-        smooth = block[np.abs(by_lobe) <= np.abs(by_light)]
-        normal[smooth] = samples.smooth_normal[smooth]
-    return replace(samples, geometric_normal=normal)
+        by_smooth[block] = smooth_share(*horizon_excess(samples.take(block), lights, chances[:, block]))
+    by_smooth = np.where(by_smooth < SMALLEST_SHARE, 0.0, np.where(by_smooth > 1.0 - SMALLEST_SHARE, 1.0, by_smooth))
+    split = np.flatnonzero((by_smooth > 0.0) & (by_smooth < 1.0))
+    index = np.concatenate([index, split])
+    ends_smooth = np.concatenate([by_smooth == 1.0, np.ones(len(split), dtype=bool)])
+    share = np.concatenate([np.where(by_smooth == 1.0, 1.0, 1.0 - by_smooth), by_smooth[split]])[:, None]
+    diffuse = np.concatenate([np.ones(len(samples)), np.zeros(len(split))])[:, None]
+    order = np.argsort(index, kind="stable")
+    index, ends_smooth, share, diffuse = index[order], ends_smooth[order], share[order], diffuse[order]
+    ended = samples.take(index)
+    specular = {name: getattr(ended, name) * share for name in SPECULAR_FIELDS}
+    normal = np.where(ends_smooth[:, None], ended.smooth_normal, ended.geometric_normal)
+    return replace(ended, geometric_normal=normal, diffuse_albedo=ended.diffuse_albedo * diffuse, **specular), index
 
 
-def horizon_excess(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """What only one of the horizons lets through (P,), of directions that the lobe chose and of those that the light
+def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
+    """Share (P,) of a lobe that ends at the smooth horizon, the rest at the mesh's, from `horizon_excess`."""
+    both = by_lobe + by_light
+    # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
+    return np.clip(np.divide(by_light, both, out=np.ones_like(both), where=both != 0.0), 0.0, 1.0)
+
+
+def lobe_chances(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np.ndarray:
+    """How likely Cycles chooses directions by the specular and the diffuse lobe of the samples, (2, P): about as their
+    albedos are to those of all samples with the same `hit` (P,)."""
+    specular = _reflectance(samples, np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0))
+    diffuse = np.zeros_like(specular) if is_baked else samples.diffuse_albedo.mean(axis=1)
+    _, hit = np.unique(hit, return_inverse=True)
+    both = np.stack([specular, diffuse])
+    return both / np.maximum(np.bincount(hit, weights=both.sum(axis=0))[hit], 1e-12)
+
+
+def _reflectance(samples, cosine) -> np.ndarray:
+    """Mean reflectance (P, ...) of the lobes for cosines (P, ...) of the half angle."""
+    names = ("specular_f0", "specular_f90", "dielectric")
+    values = [getattr(samples, name).mean(axis=1) for name in names] + [np.maximum(samples.ior, 1.0)]
+    f0, f90, weight, ior = (value.reshape(-1, *[1] * (cosine.ndim - 1)) for value in values)
+    schlick = f0 + (f90 - f0) * brdf.schlick_curve(cosine)
+    return np.maximum(schlick + weight * brdf.dielectric_reflectance(cosine, ior), 0.0)
+
+
+def horizon_excess(
+    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=light_chances
+) -> tuple[np.ndarray, np.ndarray]:
+    """What only one of the horizons lets through (P,), of directions that a lobe chose and of those that the light
     chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
 
-    Where both horizons make no difference the first is 1 and the second 0.
+    `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, see `light_tree.light_chances`. Where
+    both horizons make no difference the first is 1 and the second 0.
     """
     crossed = np.stack([_crosses(samples, light) for light in lights])
     index = np.flatnonzero(crossed.any(axis=0))
     by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
     if len(index) == 0:
         return by_lobe, by_light
-    samples, crossed = samples.take(index), crossed[:, index]
-    solid_angle = np.stack([_solid_angle(samples.position, light) for light in lights])
-    brightness = solid_angle * np.array([np.abs(light.radiance).sum() for light in lights])[:, None]
-    density = brightness / np.maximum(brightness.sum(axis=0) * solid_angle, 1e-12)
+    samples, crossed, chances = samples.take(index), crossed[:, index], chances[:, index]
+    chance = choose(samples.position, samples.smooth_normal, lights)
     towards, width = _directions(samples)
     lobe = _lobe_density(samples, towards)
+    half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("phni,pi->phn", towards, samples.view), 0.0))
+    reflected = lobe * _seen_by_light(samples, towards) * _reflectance(samples, half)
+    diffuse = np.maximum(np.einsum("phni,pi->phn", towards, samples.diffuse_normal), 0.0) / np.pi
+    chosen2 = np.square(chances[0][:, None, None] * lobe + chances[1][:, None, None] * diffuse)
     by_lobe[index] = 0.0
     for number, light in enumerate(lights):
         rows = np.flatnonzero(crossed[number])
-        excess = np.abs(light.radiance).sum() * lobe[rows] * width[rows]
+        excess = np.abs(light.radiance).sum() * reflected[rows] * width[rows]
         excess *= _hits(light, samples.position[rows], towards[rows])
-        light2 = np.square(density[number, rows])[:, None, None]
-        weight = light2 / (light2 + np.square(lobe[rows]))
+        density = chance[number, rows] / np.maximum(_solid_angle(samples.position[rows], light), 1e-12)
+        light2 = np.square(density)[:, None, None]
+        weight = light2 / np.maximum(light2 + chosen2[rows], 1e-30)
         by_light[index[rows]] += (excess * weight).sum(axis=(1, 2))
         by_lobe[index[rows]] += (excess * (1.0 - weight)).sum(axis=(1, 2))
     return by_lobe, by_light
@@ -143,6 +199,16 @@ def _lobe_density(samples, towards) -> np.ndarray:
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
     cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
     return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)
+
+
+def _seen_by_light(samples, towards) -> np.ndarray:
+    """Share (P, H, N) of the microfacets seen by the eye, in the middle of the directions, that these reach: 0 below
+    the horizon of the lobe."""
+    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
+    to_eye = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
+    to_light = np.maximum(np.einsum("phni,pi->phn", towards, samples.normal), 0.0)
+    slopes = [np.sqrt(cosine * cosine + alpha2 * (1.0 - cosine * cosine)) for cosine in (to_eye, to_light)]
+    return to_light * (to_eye + slopes[0]) / np.maximum(to_eye * slopes[1] + to_light * slopes[0], 1e-30)
 
 
 def _directions(samples):

@@ -10,7 +10,7 @@ import numpy as np
 from ..scene import SurfaceSamples
 from . import closures
 from .closures import sheen_albedo, velvet_albedo
-from .horizons import bump_alpha2, unit, valid_specular_normal
+from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal
 
 AOV_PREFIX = "ltsh_"
 MAX_LOBES = 8
@@ -199,9 +199,6 @@ class LobeSlot:
             return np.ones_like(mean)
         factor = closures.multiple_scattering(mean, *self.albedos)
         return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
-
-
-SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
 
 
 @dataclass

@@ -29,6 +29,13 @@ class TexelMesh:
     uv: np.ndarray  # (T, 3, 2)
     material: np.ndarray  # (T,) number of the material
     vertices: np.ndarray  # (T, 3) numbers in the mesh
+    mirrored: bool | np.ndarray = False  # the transform turns right hands into left ones
+
+    def true_normals(self) -> np.ndarray:
+        """Unit normals (T, 3) of the faces. Smooth normals may point to the other side of a face, as where a quad is
+        bent."""
+        sides = self.corners[:, 1:] - self.corners[:, :1]
+        return unit(np.cross(sides[:, 0], sides[:, 1])) * (-1.0 if self.mirrored else 1.0)
 
     def save(self, path) -> None:
         """Write an .npz."""
@@ -106,8 +113,7 @@ def texel_samples(
 
     read_map(number) returns the baked map of that number at the texels, (Q, 3).
     """
-    sides = mesh.corners[:, 1:] - mesh.corners[:, :1]
-    facets = unit(np.cross(sides[:, 0], sides[:, 1]))
+    true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
     maps = {number: read_map(number) for number in _maps_read(materials)}
     pieces, index = [], []
@@ -116,9 +122,7 @@ def texel_samples(
         triangle, weights = texels.triangle[block], texels.barycentric[block]
         position = _interpolated(mesh.corners, triangle, weights)
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
-        true_normal = facets[triangle]
-        flipped = np.sum(true_normal * smooth_normal, axis=-1, keepdims=True) < 0.0
-        true_normal = np.where(flipped, -true_normal, true_normal)
+        true_normal = true_normals[triangle]
         number = mesh.material[triangle]
         hits = Hits(
             position=position,
@@ -131,8 +135,9 @@ def texel_samples(
         )
         of_block = {name: values[block] for name, values in maps.items()}
         samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
-        pieces.append(end_at_horizons_of_cycles(samples, lights))
-        index.append(texel + start)
+        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
+        pieces.append(samples)
+        index.append(texel[of_sample] + start)
     return joined(pieces), np.concatenate(index)
 
 

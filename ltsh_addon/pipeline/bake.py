@@ -85,6 +85,7 @@ def bake_objects(
                     files += made.files
                     seconds |= made.seconds
                     shutil.rmtree(folder / record["folder"])
+            manifest["warnings"] += tracer.warnings if tracer else []
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
     return TaskResult(document, seconds, tuple(files))
@@ -283,7 +284,8 @@ class ObjectBaker:
             options = self.options
             passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
             rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
-            shares = self.tracer.trace(samples, sorted(passes), rays).shares
+            workers = 1 if self._threads() > 1 else None
+            shares = self.tracer.trace(samples, sorted(passes), rays, workers=workers).shares
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)

@@ -10,6 +10,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from .. import shading, visibility
-from ..files import replacing
+from ..files import replacing, temporary_folder
 from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
 
 # Of the files of `keep_picture`.
@@ -37,6 +38,7 @@ class Shadows:
     rays: int
     tracer: str  # what traced them
     seconds: float = 0.0
+    warnings: tuple[str, ...] = ()
 
     def shares_of(self, index: np.ndarray | None) -> dict[str, np.ndarray]:
         """Those (L, Q) of the samples at `index` (Q,); None: of all."""
@@ -56,17 +58,21 @@ class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
     def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
-        self._origin, self._lights = origin, [light.moved(-origin) for light in lights]
-        from ..blender.process.blender_process import embree_libraries
-
-        self._tracer = visibility.open_tracer(occluders, embree_libraries())
+        self.warnings: list[str] = []
+        self._occluders, self._origin = occluders, origin
+        self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
 
     def __enter__(self):
-        self._tracer.__enter__()
+        from ..blender.process.blender_rays import open_rays
+
+        with ExitStack() as stack:
+            folder = stack.enter_context(temporary_folder())
+            self._tracer = stack.enter_context(open_rays(self._occluders, folder, self.warnings.append))
+            self._ending = stack.pop_all()
         return self
 
     def __exit__(self, *error):
-        return self._tracer.__exit__(*error)
+        return self._ending.__exit__(*error)
 
     def trace(
         self,
@@ -75,17 +81,18 @@ class ShadowTracer:
         rays: int,
         *,
         film: Film | None = None,
+        workers: int | None = None,
         progress: Progress | None = None,
     ) -> Shadows:
-        """The shares of all lights that `samples` see; `film` as of `visibility.visible_shares`."""
+        """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        found = visibility.visible_shares(
-            samples, self._lights, self._tracer, passes=passes, rays=rays, film=film, progress=progress
-        )
+        settings = {"passes": passes, "rays": rays, "film": film, "workers": workers, "progress": progress}
+        found = visibility.visible_shares(samples, self._lights, self._tracer, **settings)
         shares = {name: getattr(found, name) for name in passes}
-        noise = {name: found.noise(name) for name in passes}
-        return Shadows(shares, noise, found.rays, self._tracer.description, time.perf_counter() - start)
+        noise = {name: found.noise(name, film) for name in passes}
+        seconds, tracer = time.perf_counter() - start, self._tracer.description
+        return Shadows(shares, noise, found.rays, tracer, seconds, tuple(self.warnings))
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:

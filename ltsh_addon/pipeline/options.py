@@ -22,6 +22,7 @@ MOST_FRAMES = 100_000
 # Of both halves of a Cycles reference: Cycles takes so many for each.
 MOST_CYCLES_SAMPLES = 2 << 24
 TEXTURE_SIDES = (64, 8192)
+SHADOW_RAYS = 8, 1024
 MOST_MARGIN = 512
 # Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
 MARGIN_TYPES = ("extend", "adjacent")
@@ -130,6 +131,14 @@ def positive(text: str) -> int:
     if text.isdecimal() and int(text) > 0:
         return int(text)
     raise ValueError(f"{text!r} was given, expected a whole number above 0")
+
+
+def shadow_rays(text: str) -> int:
+    """Rays of a light and a point."""
+    fewest, most = SHADOW_RAYS
+    if text.isdecimal() and fewest <= int(text) <= most:
+        return int(text)
+    raise ValueError(f"shadow rays are {text!r}, expected a whole number from {fewest} to {most}")
 
 
 def cycles_samples(text: str) -> int:
@@ -298,7 +307,7 @@ def _shadow_rays() -> Any:
         "at most so many per light and point where some are blocked and some are not; shared by the points of a pixel "
         "or texel (default: %(default)s)"
     )
-    return option("--shadow-rays", default=64, type=positive, metavar="N", help=meaning)
+    return option("--shadow-rays", default=64, type=shadow_rays, metavar="N", help=meaning)
 
 
 def _scripts() -> Any:

@@ -269,8 +269,10 @@ class _Shape:
         return cls(in_world + matrix[:, 3], normals, shares, None, size)
 
     def face_normals(self, side: np.ndarray) -> np.ndarray:
-        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors (Q, 3) tell, or these where
-        a triangle has no area."""
+        """Unit normals (Q, 3) of the triangles in world space, on the sides that the vectors `side` (Q, 3) tell.
+
+        Where a triangle has no area it is that vector.
+        """
         edges = self.corners[:, 1:] - self.corners[:, :1]
         if self.to_world is not None:
             edges = edges @ self.to_world.T

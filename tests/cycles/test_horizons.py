@@ -8,12 +8,13 @@ import pytest
 from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
+from ltsh_addon.cycles.light_tree import light_chances
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
 def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
     """Points at the origin, seen obliquely, whose geometric and smooth normals differ."""
-    tilted, up = np.array([0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
+    tilted, up = np.array([-0.1, 0.0, 1.0]) / np.hypot(0.1, 1.0), np.array([0.0, 0.0, 1.0])
     view = np.array(view)
     vectors = {"view": view, "normal": up, "diffuse_normal": up, "smooth_normal": up, "geometric_normal": tilted}
     zero = np.zeros((count, 3))
@@ -36,24 +37,78 @@ def light_at(distance, half):
 
 
 @pytest.mark.parametrize(
-    "roughness, view, light, smooth",
+    "roughness, view, light, share",
     [
-        (0.6, (-0.96, 0.0, 0.28), (3.0, 0.3), True),
+        (0.6, (-0.96, 0.0, 0.28), (3.0, 0.3), 1.0),
         # The mirror direction is 3 degrees above the horizon: 45 per sr for the lobe's choice, 0.2 for the light's.
-        (0.15, (-0.9987, 0.0, 0.05), (0.5, 3.0), False),
+        (0.15, (-0.9987, 0.0, 0.05), (0.5, 3.0), 0.0),
     ],
 )
-def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, view, light, smooth):
+def test_rough_lobes_of_small_lights_end_at_the_smooth_horizon(roughness, view, light, share):
     samples = samples_near_the_horizon(roughness, view)
-    found = end_at_horizons_of_cycles(samples, (light_at(*light),)).geometric_normal
-    assert np.array_equal(found, samples.smooth_normal if smooth else samples.geometric_normal)
+    found, index = end_at_horizons_of_cycles(samples, (light_at(*light),))
+    at_smooth = (found.geometric_normal == samples.smooth_normal[index]).all(axis=1)
+    assert np.abs(found.specular_f0[at_smooth].sum(axis=0) / 4.0 - share).max(initial=0.0) < 0.02
+
+
+def test_samples_that_are_split_add_up():
+    samples = samples_near_the_horizon(0.3, (-0.99, 0.0, 0.14))
+    samples = replace(samples, diffuse_albedo=np.full((4, 3), 0.5), dielectric=np.full((4, 3), 0.7))
+    found, index = end_at_horizons_of_cycles(samples, (light_at(2.0, 0.6),))
+    assert index.tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
+    for name in ("specular_f0", "specular_f90", "dielectric", "diffuse_albedo"):
+        assert np.allclose(getattr(found, name)[::2] + getattr(found, name)[1::2], getattr(samples, name), atol=1e-12)
+    assert not found.diffuse_albedo[1::2].any()
+    assert np.array_equal(found.geometric_normal[::2], samples.geometric_normal)
+    assert np.array_equal(found.geometric_normal[1::2], samples.smooth_normal)
+
+
+def test_a_bake_leaves_more_to_the_lobe_than_a_picture():
+    """Its directions all come from the specular lobe, which takes from the light's choice."""
+    samples = replace(samples_near_the_horizon(0.3, (-0.99, 0.0, 0.14)), diffuse_albedo=np.full((4, 3), 1.0))
+    lights, hit = (light_at(2.0, 0.6),), np.arange(4)
+    shares = [
+        horizons.smooth_share(*horizons.horizon_excess(samples, lights, horizons.lobe_chances(samples, hit, baked)))
+        for baked in (True, False)
+    ]
+    assert (shares[0] + 0.05 < shares[1]).all()
+
+
+def test_chances_of_two_lights_are_those_of_their_irradiance_where_they_are_far_away():
+    """Bounds of small lights meet: the light sends its power times both cosines by the squared distance."""
+    samples = samples_near_the_horizon(0.5, count=1)
+    places = [(0.6, 0.0, 0.8, 50.0), (0.0, 0.8, 0.6, 100.0)]
+    lights = []
+    for number, (x, y, z, distance) in enumerate(places):
+        light = light_at(1.0, 0.1 * (number + 1))
+        toward = np.array([x, y, z])
+        side = np.cross(toward, (0.0, 1.0, 0.0) if y == 0.0 else (1.0, 0.0, 0.0))
+        half = 0.1 * (number + 1)
+        placed = {"center": toward * distance, "half_u": half * side, "half_v": half * np.cross(toward, side)}
+        lights.append(replace(light, **placed, direction=-toward))
+    expected = np.array([(number + 1) ** 2 * z / distance**2 for number, (*_, z, distance) in enumerate(places)])
+    found = light_chances(samples.position, samples.smooth_normal, tuple(lights))
+    # The lights reach 0.34 degrees, of which the cosines' slopes make up to 1 %.
+    assert np.allclose(found[:, 0], expected / expected.sum(), rtol=0.01)
+
+
+@pytest.mark.parametrize("count, loses", [(1, False), (2, False), (9, True), (30, True), (70, False)])
+def test_chances_of_lights_add_up(count, loses):
+    """To 1 where there is one leaf; in a tree one may go down to where no light shines on the point."""
+    generator = np.random.default_rng(count)
+    normal = horizons.unit(generator.normal(size=(50, 3)))
+    lights = tuple(replace(light_at(2.0, 0.2), center=generator.normal(size=3) + (4.0, 0.0, 0.0)) for _ in range(count))
+    sums = light_chances(np.zeros((50, 3)), normal, lights).sum(axis=0)
+    assert sums.max() < 1.0 + 1e-5 and (sums > 0.0).mean() > 0.4
+    assert (sums[sums > 0.0].min() > 1.0 - 1e-5) != loses
 
 
 def test_without_lights_or_differences_nothing_changes():
     samples = samples_near_the_horizon(0.5)
-    assert end_at_horizons_of_cycles(samples, ()) is samples
+    assert end_at_horizons_of_cycles(samples, ())[0] is samples
     flat = replace(samples, geometric_normal=samples.smooth_normal)
-    assert end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),)) is flat
+    found, index = end_at_horizons_of_cycles(flat, (light_at(3.0, 0.3),))
+    assert found is flat and index.tolist() == [0, 1, 2, 3]
 
 
 def test_coarse_meshes_are_named_where_they_fill_the_picture():

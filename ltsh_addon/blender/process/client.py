@@ -102,9 +102,10 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
+        samples, film = _ended(samples, film, lights)
         return Extraction(
             lights=lights,
-            samples=end_at_horizons_of_cycles(samples, lights),
+            samples=samples,
             film=film,
             warnings=tuple(manifest["warnings"] + warnings),
             problems=tuple(problems),
@@ -122,6 +123,16 @@ def build_demo(path: Path, *, progress: Progress | None = None) -> None:
     """Build the example scene and save it as the .blend `path`, at once or not at all. Raises SceneError, OSError."""
     with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
+
+
+def _ended(samples, film, lights) -> tuple[SurfaceSamples, Film]:
+    """The samples ended at the horizons of Cycles, and their film."""
+    hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
+    samples, index = end_at_horizons_of_cycles(samples, lights, hit)
+    first = np.diff(index, prepend=-1) > 0
+    if film.first is not None:
+        first &= film.first[index]
+    return samples, replace(film.take(index), first=None if first.all() else first)
 
 
 def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str], list[str]]:

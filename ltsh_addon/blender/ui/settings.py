@@ -185,7 +185,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     shadow_rays: IntProperty(
         name="Shadow Rays",
         description="At most so many per light and pixel or texel, where a light is neither seen whole nor not at all",
-        min=8, max=1 << 16, soft_max=512, default=64,
+        min=8, max=1024, soft_max=512, default=64,
     )  # fmt: skip
     output_folder: StringProperty(
         name="Output",

@@ -15,7 +15,7 @@ from ...scene import PASSES, AreaLight
 from ...shading import load_table
 from ...shading.lookup_table import LookupTable
 from .shaders import (
-    BRIGHTNESS,
+    BOUNDS,
     CHOICE,
     EXCESS,
     HORIZON_CORNERS,
@@ -35,7 +35,7 @@ from .textures import (
     upload_lights,
 )
 
-_RESULTS = {BRIGHTNESS: "brightnesses", EXCESS: "excesses", CHOICE: "horizons"}
+_RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
 
 
@@ -61,7 +61,7 @@ class HorizonPass:
         self._resize(gbuffer.size)
         corners = [HORIZON_CORNERS if light.is_round else len(light.polygon()) for light in lights.lights]
         directions = horizons.AROUND * len(horizons.HEIGHTS)
-        self._run(BRIGHTNESS, gbuffer, lights, shares(corners))
+        self._run(BOUNDS, gbuffer, lights, shares(corners))
         self._run(EXCESS, gbuffer, lights, shares([directions * count for count in corners]), view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)])
         return self._textures[_RESULTS[CHOICE]]

@@ -283,14 +283,14 @@ def _moving_lines(k, others):
 
 
 # The steps that choose horizons, and the textures that they read: lights where there is a loop over them.
-BRIGHTNESS, EXCESS, CHOICE = "brightness", "excess", "choice"
+BOUNDS, EXCESS, CHOICE = "bounds", "excess", "choice"
 _SEEN = ("positions", "smooth_normals", "geometric_normals", "f90s", "dielectric_weights", "lights")
 HORIZON_SAMPLERS = {
-    BRIGHTNESS: _SEEN,
-    EXCESS: (*_SEEN, "normals", "brightnesses"),
+    BOUNDS: _SEEN,
+    EXCESS: (*_SEEN, "normals", "f0s", "bases", "diffuse_normals", "light_bounds"),
     CHOICE: ("smooth_normals", "geometric_normals", "excesses"),
 }
-_HORIZON_CONSTANTS = {BRIGHTNESS: {"place": "IVEC2"}, EXCESS: {"place": "IVEC2", "view": "VEC4"}, CHOICE: {}}
+_HORIZON_CONSTANTS = {BOUNDS: {"place": "IVEC2"}, EXCESS: {"place": "IVEC2", "view": "VEC4"}, CHOICE: {}}
 # Of round lights, as in `AreaLight.polygon`.
 HORIZON_CORNERS = 32
 

@@ -178,6 +178,9 @@ def test_positions_that_stay_far_are_named_with_their_effect():
     assert gbuffer.rounded_positions(far, [light]) == gbuffer.rounded_positions(position, []) == []
     far[0] = position[0]
     assert gbuffer.rounded_positions(far, [light]) == []
+    # 6 m beside a square of 8 m, in its plane: no closer by its radius than 4.3 m, which is enough.
+    square = replace(light, shape="RECTANGLE", half_u=(4.0, 0.0, 0.0), half_v=(0.0, 4.0, 0.0))
+    assert gbuffer.rounded_positions(position + [10.0, 0.0, -1.0], [square]) == []
 
 
 def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):

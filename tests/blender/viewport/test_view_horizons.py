@@ -16,7 +16,8 @@ from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.surfaces import View
 from ltsh_addon.blender.viewport.textures import upload_lights, upload_samples
-from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, end_at_horizons_of_cycles, horizon_excess
+from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_chances, smooth_share
+from ltsh_addon.cycles.light_tree import chances_of, light_bounds
 from ltsh_addon.scene import SurfaceSamples
 
 WIDTH, HEIGHT = 32, 16
@@ -33,10 +34,27 @@ def read(texture):
     return np.array(values, np.float32).astype(np.float64).reshape(-1, 4)
 
 
-def is_certain(samples, lights):
-    """Mask (P,) of samples for which rounding cannot turn the choice."""
-    by_lobe, by_light = np.abs(horizon_excess(samples, lights))
-    return np.abs(by_lobe - by_light) >= TIE * (by_lobe + by_light)
+def chances_in_one_leaf(position, normal, lights):
+    """Those of lights, which the card takes for one leaf of the tree."""
+    return chances_of(np.stack([light_bounds(light, position, normal) for light in lights]))
+
+
+def shares(samples, lights):
+    """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
+    turn the choice nor no light is between the horizons."""
+    of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
+    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, chances_in_one_leaf)
+    # Of what is between the horizons where they cross, one part may cancel the other.
+    is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
+    share = smooth_share(by_lobe, by_light)
+    return share, is_sum & (np.abs(share - 0.5) >= TIE), by_lobe + by_light != 1.0
+
+
+def ended(samples, lights):
+    """The samples as the viewport ends them: at the horizon of the larger part."""
+    is_smooth = shares(samples, lights)[0] >= 0.5
+    normal = np.where(is_smooth[:, None], samples.smooth_normal, samples.geometric_normal)
+    return replace(samples, geometric_normal=normal)
 
 
 def chosen(kind, count=4):
@@ -60,12 +78,12 @@ def test_the_card_chooses_the_horizon_that_numpy_chooses():
     results = with_graphics(lambda: [chosen(kind, count) for kind, count in kinds.items()])
     turned = 0
     for kind, (found, samples, lights) in zip(kinds, results, strict=True):
-        ended = end_at_horizons_of_cycles(samples, lights).geometric_normal
-        by_lobe, by_light = horizon_excess(samples, lights)
-        sure = is_certain(samples, lights) & (by_lobe + by_light != 1.0)
-        wrong = np.abs(found - ended).max(axis=1) > 1e-6
+        expected = ended(samples, lights).geometric_normal
+        _, is_certain, has_light = shares(samples, lights)
+        sure = is_certain & has_light
+        wrong = np.abs(found - expected).max(axis=1) > 1e-6
         assert not wrong[sure].any(), kind
-        smooth = np.abs(ended - samples.smooth_normal).max(axis=1) < 1e-6
+        smooth = np.abs(expected - samples.smooth_normal).max(axis=1) < 1e-6
         turned += min(smooth[sure].sum(), (~smooth)[sure].sum())
     # Both choices are there.
     assert turned > 20
@@ -128,11 +146,11 @@ def drawn(camera):
 def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     camera = low_poly_sphere()
     lights, samples, pixel, pictures = with_graphics(lambda: drawn(camera))
-    ended = end_at_horizons_of_cycles(samples, lights)
-    sure = is_certain(samples, lights)
+    numpys = ended(samples, lights)
+    _, sure, _ = shares(samples, lights)
     assert sure.mean() > 0.99
     for (technique, name), found in pictures.items():
-        expected = shading.shade(ended, lights, technique, passes=(name,), workers=1, dtype=np.float64).combined
+        expected = shading.shade(numpys, lights, technique, passes=(name,), workers=1, dtype=np.float64).combined
         times = (np.abs(found - expected) / (ABSOLUTE + RELATIVE * np.abs(expected))).max(axis=1)
         assert times[sure].max() <= 1.0, f"{technique}, {name}: {times[sure].max():.1f} times as far off as it may be"
     smooth = replace(samples, geometric_normal=samples.smooth_normal)
@@ -149,7 +167,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     place = np.full(SIZE[0] * SIZE[1], -1)
     place[pixel] = np.arange(len(pixel))
     match = place[(SIZE[1] - 1 - row) * SIZE[0] + column]
-    theirs, ours = found.samples.take(match >= 0), ended.take(match[match >= 0])
+    theirs, ours = found.samples.take(match >= 0), numpys.take(match[match >= 0])
     for name, share in (("smooth_normal", 0.97), ("normal", 0.95), ("diffuse_normal", 0.97), ("geometric_normal", 0.9)):
         apart = np.abs(getattr(theirs, name) - getattr(ours, name)).max(axis=1)
         assert (apart < 1e2 * SMALLEST_ANGLE).mean() > share, f"{name}: {(apart < 1e2 * SMALLEST_ANGLE).mean():.3f}"

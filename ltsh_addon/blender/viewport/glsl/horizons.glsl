@@ -1,13 +1,13 @@
 /* Which horizon ends the specular lobe of a pixel, as `cycles.horizons` decides for samples.
 
-   Three steps, of which the first two add up over draw calls so that lights may be many: how bright the lights are from
-   the pixel, what only one of both horizons lets through of the directions that the lobe and the lights choose, and
-   which normal that gives. */
+   Three steps, of which the first two add up over draw calls so that lights may be many: bounds of what the lights send
+   to the pixel, what only one of both horizons lets through of the directions that lobes and lights choose, and which
+   normal that gives: where samples become two, the pixel ends at the horizon of the larger part. */
 
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
 struct seen_light {
-    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float radiance; bool faces;
+    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float radiance; float end; bool faces;
 };
 
 seen_light light_from(int number, vec3 position)
@@ -24,6 +24,8 @@ seen_light light_from(int number, vec3 position)
     light.count = half_u.w > 0.0 ? int(half_u.w) : LTSH_ROUND_CORNERS;
     light.first = half_u.w > 0.0 ? int(center.w) : LTSH_ROUND_FIRST;
     light.radiance = radiance.x + radiance.y + radiance.z;
+    float tangent = ltsh_light_texel(header + 5).x;
+    light.end = tangent > 0.0 ? inversesqrt(1.0 + tangent * tangent) : 0.0;
     light.faces = dot(light.offset, light.direction) < 0.0;
     return light;
 }
@@ -39,41 +41,78 @@ bool has_two_horizons(ivec2 texel)
 }
 #endif
 
-#ifdef LTSH_BRIGHTNESS
-/* Van Oosterom and Strackee 1983, eq. 8; the volumes are those of a pyramid, exact for small lights, too. */
-float solid_angle(seen_light light)
+#ifndef LTSH_CHOICE
+/* Solid angle in sr, and area. Van Oosterom and Strackee 1983, eq. 8; the volumes are those of a pyramid, exact for
+   small lights, too. */
+vec2 extent(seen_light light)
 {
-    float height = dot(light.offset, cross(light.half_u, light.half_v));
+    vec3 normal = cross(light.half_u, light.half_v);
+    float height = dot(light.offset, normal);
     vec2 start = ltsh_corner(light.first);
     vec3 a = light.offset + start.x * light.half_u + start.y * light.half_v;
     float far_a = length(a);
     vec2 before = ltsh_corner(light.first + 1) - start;
-    float total = 0.0;
+    vec2 total = vec2(0.0);
     for (int i = 2; i < light.count; ++i) {
         vec2 after = ltsh_corner(light.first + i) - start;
         vec3 b = a + before.x * light.half_u + before.y * light.half_v;
         vec3 c = a + after.x * light.half_u + after.y * light.half_v;
         float far_b = length(b);
         float far_c = length(c);
-        float volume = height * (before.x * after.y - before.y * after.x);
+        float twice = before.x * after.y - before.y * after.x;
+        float volume = height * twice;
         float below = far_a * far_b * far_c + dot(a, b) * far_c + dot(b, c) * far_a + dot(c, a) * far_b;
-        total += abs(volume) > 0.0 || abs(below) > 0.0 ? 2.0 * atan(volume, below) : 0.0;
+        total.x += abs(volume) > 0.0 || abs(below) > 0.0 ? 2.0 * atan(volume, below) : 0.0;
+        total.y += 0.5 * twice;
         before = after;
     }
-    return light.faces ? abs(total) : 0.0;
+    return vec2(light.faces ? abs(total.x) : 0.0, length(normal) * abs(total.y));
 }
 
+/* Cosines of the sums of two angles of 0 to pi, with the sign -1 of their differences, from their cosines. */
+vec2 cosines_of_sums(vec2 first, float second, float sign)
+{
+    return first * second - sign * sqrt(max(1.0 - first * first, 0.0) * max(1.0 - second * second, 0.0));
+}
+
+/* The most and the least that the light may send to the pixel, as `light_tree.light_bounds`; whether it sends anything. */
+vec3 bounds(seen_light light, vec3 smooth_normal, float area)
+{
+    float far = length(light.offset);
+    vec3 axis = light.offset / max(far, 1e-30);
+    float width = 1.0;
+    float farthest = far;
+    for (int i = 0; i < 4; ++i) {
+        vec3 corner = light.offset + float(i % 2 * 2 - 1) * light.half_u + float(i / 2 * 2 - 1) * light.half_v;
+        float reach = length(corner);
+        width = min(width, dot(corner, axis) / max(reach, 1e-30));
+        farthest = max(farthest, reach);
+    }
+    width = max(width, -1.0);
+    vec2 cosines = vec2(dot(axis, smooth_normal), -dot(axis, light.direction));
+    vec2 most = mix(cosines_of_sums(cosines, width, -1.0), vec2(1.0), greaterThanEqual(cosines, vec2(width)));
+    vec2 least = cosines_of_sums(cosines, width, 1.0);
+    bool seen = cosines.y > 0.0 && most.x > 0.0 && most.y > light.end;
+    bool whole = seen && width > 0.0 && least.x > 0.0 && least.y > light.end;
+    float power = light.radiance * area;
+    vec2 sent = power * vec2(most.x * most.y / (far * far), least.x * least.y / (farthest * farthest));
+    return vec3(seen ? sent.x : 0.0, whole ? sent.y : 0.0, seen ? 1.0 : 0.0);
+}
+#endif
+
+#ifdef LTSH_BOUNDS
 void main()
 {
     ivec2 texel = ivec2(gl_FragCoord.xy);
     vec3 position = texelFetch(positions, texel, 0).xyz;
     int end = has_two_horizons(texel) ? place.y : 0;
-    float brightness = 0.0;
+    vec3 smooth_normal = texelFetch(smooth_normals, texel, 0).xyz;
+    vec3 total = vec3(0.0);
     for (int i = place.x; i < end; ++i) {
         seen_light light = light_from(i, position);
-        brightness += light.radiance * solid_angle(light);
+        total += bounds(light, smooth_normal, extent(light).y);
     }
-    color = vec4(brightness, 0.0, 0.0, 0.0);
+    color = vec4(total, 0.0);
 }
 #endif
 
@@ -135,6 +174,31 @@ float lobe_density(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
     return alpha2 / (LTSH_PI * steep * steep) * masking / (4.0 * cosine);
 }
 
+/* As `horizons._seen_by_light`. */
+float seen_by_light(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
+{
+    float alpha = max(roughness * roughness, LTSH_SMALLEST_ALPHA);
+    vec2 cosines = vec2(max(dot(normal, towards_eye), 1e-3), max(dot(normal, towards), 0.0));
+    vec2 slopes = sqrt(cosines * cosines + alpha * alpha * (1.0 - cosines * cosines));
+    return cosines.y * (cosines.x + slopes.x) / max(cosines.x * slopes.y + cosines.y * slopes.x, 1e-30);
+}
+
+/* Exact unpolarized reflectance of a dielectric. */
+float dielectric_reflectance(float cosine, float ior)
+{
+    float inner = sqrt(max(ior * ior - 1.0 + cosine * cosine, 0.0));
+    float straight = (cosine - inner) / max(cosine + inner, 1e-30);
+    float along = (ior * ior * cosine - inner) / max(ior * ior * cosine + inner, 1e-30);
+    return 0.5 * (straight * straight + along * along);
+}
+
+/* Mean reflectance for the cosine of the half angle, of mean f0, f90, weight and index of the dielectric lobe. */
+float reflectance(vec4 means, float cosine)
+{
+    float schlick = means.x + (means.y - means.x) * pow(1.0 - cosine, 5.0);
+    return max(schlick + means.z * dielectric_reflectance(cosine, means.w), 0.0);
+}
+
 void main()
 {
     ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -147,13 +211,27 @@ void main()
     vec3 along = mirrored - dot(mirrored, smooth_normal) * smooth_normal;
     along /= max(length(along), 1e-12);
     vec3 across = cross(smooth_normal, along);
-    float brightness = max(texelFetch(brightnesses, texel, 0).x, 1e-30);
+    vec3 all_bounds = texelFetch(light_bounds, texel, 0).xyz;
+    vec3 diffuse_normal = texelFetch(diffuse_normals, texel, 0).xyz;
+    vec4 base = texelFetch(bases, texel, 0);
+    vec3 third = vec3(1.0 / 3.0);
+    vec4 means = vec4(dot(texelFetch(f0s, texel, 0).xyz, third), dot(texelFetch(f90s, texel, 0).xyz, third),
+        dot(texelFetch(dielectric_weights, texel, 0).xyz, third), max(base.w, 1.0));
+    /* As `horizons.lobe_chances` of a single sample. */
+    vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
+    chances /= max(chances.x + chances.y, 1e-12);
     int end = has_two_horizons(texel) ? place.y : 0;
     vec2 excess = vec2(0.0);
     for (int i = place.x; i < end; ++i) {
         seen_light light = light_from(i, position);
-        float density = light.radiance / brightness;
         int directions = crosses(light, smooth_normal, true_normal) ? LTSH_AROUND * LTSH_HEIGHTS : 0;
+        float density = 0.0;
+        if (directions > 0) {
+            vec2 seen = extent(light);
+            vec3 own = bounds(light, smooth_normal, seen.y);
+            float by_least = all_bounds.y > 0.0 ? own.y / all_bounds.y : own.z / max(all_bounds.z, 1.0);
+            density = 0.5 * (own.x / max(all_bounds.x, 1e-30) + by_least) / max(seen.x, 1e-12);
+        }
         for (int k = 0; k < directions; ++k) {
             float turn = (float(k / LTSH_HEIGHTS) + 0.5) / float(LTSH_AROUND) * 2.0 - 1.0;
             float grown = exp(LTSH_CONCENTRATION * turn);
@@ -165,9 +243,11 @@ void main()
             vec3 towards = cos(elevation) * around + sin(elevation) * smooth_normal;
             float width = rise * span * cos(elevation) / float(LTSH_HEIGHTS);
             float lobe = lobe_density(towards, towards_eye, bent.xyz, bent.w);
-            float amount = hits(light, towards) ? light.radiance * lobe * width : 0.0;
-            float ratio = lobe / density;
-            float share = 1.0 / (1.0 + ratio * ratio);
+            float chosen = chances.x * lobe + chances.y * max(dot(towards, diffuse_normal), 0.0) / LTSH_PI;
+            float reflected = lobe * seen_by_light(towards, towards_eye, bent.xyz, bent.w)
+                * reflectance(means, sqrt(max(0.5 + 0.5 * dot(towards, towards_eye), 0.0)));
+            float amount = hits(light, towards) ? light.radiance * reflected * width : 0.0;
+            float share = density * density / max(density * density + chosen * chosen, 1e-30);
             excess += amount * vec2(1.0 - share, share);
         }
     }
@@ -181,7 +261,9 @@ void main()
     ivec2 texel = ivec2(gl_FragCoord.xy);
     vec4 smooth_normal = texelFetch(smooth_normals, texel, 0);
     vec4 true_normal = texelFetch(geometric_normals, texel, 0);
-    vec2 excess = abs(texelFetch(excesses, texel, 0).xy);
-    color = excess.x <= excess.y ? smooth_normal : true_normal;
+    vec2 excess = texelFetch(excesses, texel, 0).xy;
+    /* The share of the lights' choice is more than a half, or nothing was seen of any light. */
+    bool is_smooth = excess.x + excess.y == 0.0 || excess.y / (excess.x + excess.y) >= 0.5;
+    color = is_smooth ? smooth_normal : true_normal;
 }
 #endif

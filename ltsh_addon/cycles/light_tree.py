@@ -1,0 +1,201 @@
+"""How likely Cycles chooses a light for a point: the chances that its light tree gives (Conty Estevez and Kulla 2018,
+"Importance Sampling of Many Lights with Adaptive Tree Splitting", doi:10.1145/3233305).
+
+Chances do not change what renders converge to but between two horizons, see `horizons`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache, reduce
+
+import numpy as np
+
+from ..scene import AreaLight
+
+# Of these Cycles makes a leaf at most, and tries so many places along each axis where clusters may be cut.
+LIGHTS_OF_LEAF = 8
+BUCKETS = 12
+# More are all taken for one leaf: none of them matters much.
+MOST_LIGHTS = 64
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Lights in a box, their directions within the angle `spread` around `axis`, each of which shines as far as `reach`
+    from its own."""
+
+    lights: tuple[int, ...]
+    low: np.ndarray  # (3,) m
+    high: np.ndarray  # (3,) m
+    axis: np.ndarray  # (3,) unit
+    spread: float  # rad
+    reach: float  # rad
+    power: float
+    halves: tuple[Cluster, Cluster] | None = None
+
+    def joined(self, other: Cluster) -> Cluster:
+        """Both clusters in one."""
+        wide, narrow = (other, self) if other.spread > self.spread else (self, other)
+        cosine = float(np.clip(wide.axis @ narrow.axis, -1.0, 1.0))
+        apart, axis, spread = np.arccos(cosine), wide.axis, wide.spread
+        if wide.spread + 5e-4 < min(np.pi, apart + narrow.spread):
+            spread = min(0.5 * (apart + wide.spread + narrow.spread), np.pi)
+            across = narrow.axis - cosine * axis
+            length = np.linalg.norm(across)
+            if spread < np.pi and length > 1e-6:
+                turn = spread - wide.spread
+                axis = np.cos(turn) * axis + np.sin(turn) * across / length
+        low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
+        lights, reach = self.lights + other.lights, max(self.reach, other.reach)
+        return Cluster(lights, low, high, axis, spread, reach, self.power + other.power)
+
+    def cost(self) -> float:
+        """Power, times the area of the box, times the measure of directions (eq. 2)."""
+        x, y, z = self.high - self.low
+        area = 2.0 * (x * y + y * z + z * x)
+        far = min(np.pi, self.spread + self.reach)
+        sine, cosine = np.sin(self.spread), np.cos(self.spread)
+        fringe = 2.0 * far * sine - np.cos(self.spread - 2.0 * far) - 2.0 * self.spread * sine + cosine
+        directions = 2.0 * np.pi * (1.0 - cosine) + 0.5 * np.pi * fringe
+        return self.power * (area if area > 0.0 else np.linalg.norm(self.high - self.low)) * directions
+
+    def bounds(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """The most and the least (2, P) that points (P, 3) with normals may get from lights around the box's center."""
+        center, radius = 0.5 * (self.low + self.high), 0.5 * np.linalg.norm(self.high - self.low)
+        offset = center - position
+        distance = np.linalg.norm(offset, axis=1)
+        ratio = np.minimum(radius / np.maximum(distance, 1e-30), 1.0)
+        width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
+        is_above = (normal * offset).sum(axis=1) + np.abs(normal) @ (0.5 * (self.high - self.low)) > 0.0
+        distance = np.maximum(distance, 0.5 * radius)
+        return _bounds(self, offset, normal, width, distance, distance) * is_above
+
+
+def _bounds(cluster, offset, normal, width, near, far):
+    """Bounds (2, P) of a cluster that reaches a cone of cosine `width` (P,) around the offset."""
+    axis = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-30)[:, None]
+    here, there = (axis * normal).sum(axis=1), -(axis @ cluster.axis)
+    most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
+    least_here = np.maximum(_cosine_of_sum(here, width, 1.0), 0.0)
+    closest = np.where(there >= width, 1.0, _cosine_of_sum(there, width, -1.0))
+    is_inside = closest >= np.cos(cluster.spread)
+    most_there = np.where(is_inside, 1.0, _cosine_of_sum(closest, np.cos(cluster.spread), -1.0))
+    end = cluster.spread + cluster.reach
+    is_seen = (most_here >= 0.0) & (is_inside | (end > np.pi) | (closest > np.cos(end)))
+    farthest = _cosine_of_sum(there, width, 1.0)
+    rest = cluster.reach - cluster.spread
+    is_whole = is_seen & (rest >= 0.0) & (there >= 0.0) & (width >= 0.0) & (farthest >= np.cos(rest))
+    least_there = _cosine_of_sum(farthest, np.cos(cluster.spread), 1.0)
+    most = cluster.power * np.abs(most_here * most_there) / np.maximum(near, 1e-30) ** 2
+    least = cluster.power * np.abs(least_here * least_there) / np.maximum(far, 1e-30) ** 2
+    return np.stack([np.where(is_seen, most, 0.0), np.where(is_whole, least, 0.0)])
+
+
+def _cosine_of_sum(first, second, sign):
+    """Cosine of the sum of two angles of 0 to pi, or with the sign -1 of their difference, from their cosines."""
+    return first * second - sign * np.sqrt(np.maximum(1.0 - first**2, 0.0) * np.maximum(1.0 - second**2, 0.0))
+
+
+def light_chances(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...]) -> np.ndarray:
+    """How likely each of the lights (L, P) is chosen for points (P, 3) with smooth normals: by the most and by the
+    least that a half of the lights may send, each half of the time, down to the leaves."""
+    own = np.empty((len(lights), 2, len(position)), np.float32 if len(lights) > MOST_LIGHTS else np.float64)
+    for number, light in enumerate(lights):
+        own[number] = light_bounds(light, position, normal)
+    if len(lights) > MOST_LIGHTS:
+        return chances_of(own)
+    chances = np.zeros((len(lights), len(position)))
+    clusters = [(_tree(np.array([_row(light) for light in lights]).tobytes(), len(lights)), np.ones(len(position)))]
+    while clusters:
+        cluster, chance = clusters.pop()
+        if cluster.halves is None:
+            chances[list(cluster.lights)] = chance * chances_of(own[list(cluster.lights)])
+            continue
+        halves = cluster.halves
+        bounds = [own[half.lights[0]] if len(half.lights) == 1 else half.bounds(position, normal) for half in halves]
+        clusters.extend(
+            (half, chance * share) for half, share in zip(halves, chances_of(np.stack(bounds)), strict=True)
+        )
+    return chances
+
+
+def chances_of(bounds: np.ndarray) -> np.ndarray:
+    """Chances (N, P) of alternatives by the most and the least, (N, 2, P), that they may send."""
+    most, least = bounds[:, 0], bounds[:, 1]
+    # Where all may send nothing, all that may send something are alike.
+    least = np.where(least.sum(axis=0) > 0.0, least, most > 0.0)
+    return sum(0.5 * part / np.maximum(part.sum(axis=0), 1e-30) for part in (most, least))
+
+
+def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The most and the least (2, P) that points (P, 3) with normals may get from one light, by its rectangle."""
+    offset = light.center - position
+    distance = np.linalg.norm(offset, axis=1)
+    axis = offset / np.maximum(distance, 1e-30)[:, None]
+    corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
+    reach = np.array([np.linalg.norm(corner, axis=1) for corner in corners])
+    along = np.array([(corner * axis).sum(axis=1) for corner in corners])
+    width = np.clip((along / np.maximum(reach, 1e-30)).min(axis=0), -1.0, 1.0)
+    bounds = _bounds(
+        _cluster_of(np.array(_row(light)), 0),
+        offset,
+        normal,
+        width,
+        distance,
+        np.maximum(reach.max(axis=0), distance),
+    )
+    return bounds * (offset @ light.direction < 0.0)
+
+
+def _row(light) -> list[float]:
+    power = np.abs(light.radiance).mean() * np.linalg.norm(light.area_vector)
+    return [*light.center, *light.half_u, *light.half_v, *light.direction, 0.5 * light.spread, power]
+
+
+def _cluster_of(row, number: int) -> Cluster:
+    center, half_u, half_v, direction = row[:12].reshape(4, 3)
+    reach = np.abs(half_u) + np.abs(half_v)
+    return Cluster((number,), center - reach, center + reach, direction, 0.0, row[12], row[13])
+
+
+@lru_cache(maxsize=4)
+def _tree(rows: bytes, count: int) -> Cluster:
+    """The tree of `count` lights, of which `_row` gave the bytes."""
+    rows = np.frombuffer(rows).reshape(count, -1)
+    return _grown([_cluster_of(row, number) for number, row in enumerate(rows)], rows[:, :3])
+
+
+def _all(clusters) -> Cluster:
+    """All clusters in one, as wide as those with power are."""
+    lights = tuple(number for cluster in clusters for number in cluster.lights)
+    return replace(
+        reduce(Cluster.joined, [cluster for cluster in clusters if cluster.power] or clusters[:1]), lights=lights
+    )
+
+
+def _grown(clusters: list[Cluster], centers: np.ndarray) -> Cluster:
+    """The clusters, of one light each, in one whose halves are those that cost least; `centers` (L, 3) of all."""
+    whole = _all(clusters)
+    if len(clusters) < 2:
+        return whole
+    places = centers[[cluster.lights[0] for cluster in clusters]]
+    extent = places.max(axis=0) - places.min(axis=0)
+    least, cut = whole.cost(), None
+    for axis in np.flatnonzero(extent > 0.0):
+        along = (places[:, axis] - places[:, axis].min()) / extent[axis]
+        bucket = np.clip((BUCKETS * along).astype(int), 0, BUCKETS - 1)
+        for end in range(1, BUCKETS):
+            parts = [
+                [c for c, b in zip(clusters, bucket, strict=True) if (b < end) == first] for first in (True, False)
+            ]
+            if all(parts):
+                cost = extent.max() / extent[axis] * sum(_all(part).cost() for part in parts)
+                least, cut = (cost, (axis, len(parts[0]))) if cost < least else (least, cut)
+    if cut is None and len(clusters) <= LIGHTS_OF_LEAF:
+        return whole
+    order, middle = np.arange(len(clusters)), len(clusters) // 2
+    if cut is not None:
+        order, middle = np.argsort(places[:, cut[0]], kind="stable"), cut[1]
+    halves = [[clusters[number] for number in part] for part in (order[:middle], order[middle:])]
+    return replace(whole, halves=tuple(_grown(half, centers) for half in halves))

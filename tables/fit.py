@@ -72,8 +72,6 @@ def settings(family, model, size) -> dict:
         "excess_weight": refine.EXCESS_WEIGHT,
         "light_weight": refine.LIGHT_WEIGHT,
         "error_floor": refine.ERROR_FLOOR,
-        "tail_weight": refine.TAIL_WEIGHT,
-        "tail_floor": refine.TAIL_FLOOR,
     }
 
 
@@ -186,8 +184,9 @@ def _fitted_nodes(family, model, roughness, cosine, curves, progress, checkpoint
     cells = Cells.of(model, (len(roughness), len(cosine)), GRAZING_COSINE, curves)
     nodes = refine.refine(family, model, cells, state, refined)
     warp = nodes[..., : family.parameters]
-    solved = project_nodes(family, model, roughness, cosine, warp, curves)
-    coefficients = refine.fresnel_coefficients(family, model, cells, nodes, solved, curves)
+    limit, albedo = project_nodes(family, model, roughness, cosine, warp, curves)
+    coefficients = refine.fresnel_coefficients(family, model, cells, nodes, limit, curves)
+    coefficients = refine.with_exact_albedo(family, model, cells, nodes, coefficients, albedo)
     progress(1.0)
     return warp, coefficients, node_errors(family, model, roughness, cosine, warp, coefficients)
 

@@ -43,8 +43,7 @@ def fresnel_basis(sweeps: int = 800):
         target = (squared_weight * residual).T @ free
         optimized = np.linalg.solve(_damped(system), target[..., None])[..., 0].T
         optimized = np.linalg.qr(optimized.T)[0].T
-    # Head on all curves but the first are 0, so that what is wrong with F = 1 counts F0 times in every lobe.
-    curves = np.concatenate([fixed, optimized - optimized[:, -1:]])
+    curves = np.concatenate([fixed, optimized])
     return curves, combine(curves, brdf.dielectric_reflectance(COSINES, TABULATED_IOR[:, None]))
 
 

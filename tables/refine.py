@@ -9,13 +9,6 @@ The squared error of a point is a sum of four terms, all relative to the true lo
   is often seen in the tail alone;
 - ALBEDO_WEIGHT times the squared error of the albedo;
 - EXCESS_WEIGHT times the square of what the negative mass, relative to the albedo, has above NEGATIVE_SHARE.
-
-Then the other Fresnel curves are fitted under the warps found for F = 1. They are parts of a dielectric's lobe, whose
-reflectance is low but for grazing directions: what is wrong by little beside (1 - c)^5 at its peak can be ten times the
-dielectric's light in the tail. So their errors are relative to the lobe of a dielectric, and there is a fifth term:
-
-- TAIL_WEIGHT times the mean square of the errors over the soft lights, each relative to its own integral and
-  TAIL_FLOOR times the light's mean reflection by a sphere.
 """
 
 from __future__ import annotations
@@ -35,27 +28,8 @@ ALBEDO_WEIGHT = 9.0
 NEGATIVE_WEIGHT = 2.0
 NEGATIVE_SHARE = 0.008
 EXCESS_WEIGHT = 50.0
-TAIL_WEIGHT = 0.003
-TAIL_FLOOR = 0.1
 WINDOWS = 40
 WINDOW_WIDTHS = np.radians([8.0, 16.0, 28.0])
-
-
-# A dielectric of index of refraction 1.5 as a combination of the Fresnel curves: Schlick's reflectance
-DIELECTRIC = np.array([0.04, 0.96, 0.0, 0.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Goal:
-    """The Fresnel curves (F, C) that are fitted, and what they are parts of: `whole` (F,) are the curves' shares in the
-    lobe that errors are relative to, `tail` is the weight of the errors in its tail."""
-
-    curves: np.ndarray
-    whole: np.ndarray
-    tail: float
-
-
-PLAIN = Goal(FLAT, np.ones(1), 0.0)
 
 
 @dataclass(frozen=True)
@@ -76,34 +50,34 @@ class Linearization:
         return 1.0 / np.maximum(self.error, ERROR_FLOOR)
 
 
-def linearize(family, model, cells, nodes, goal=PLAIN, *, derivatives=True) -> Linearization:
+def linearize(family, model, cells, nodes, curves=FLAT, *, derivatives=True) -> Linearization:
     """Linearization at `nodes` (R, T, n + size): the channels of the warp, then the coefficients for F = 1."""
     values = cells.interpolate(nodes)
     found = []
     for part in batches(len(values)):
-        albedo = cells.albedo[part, : len(goal.curves)]
-        points = Points.at(model, cells.cosine[part], cells.roughness[part] ** 2, goal.curves, albedo=albedo)
-        found.append(_linearize(family, points, values[part], goal, derivatives))
+        points = Points.at(
+            model, cells.cosine[part], cells.roughness[part] ** 2, curves, albedo=cells.albedo[part, : len(curves)]
+        )
+        found.append(_linearize(family, points, values[part], derivatives))
     return Linearization(*(None if part[0] is None else np.concatenate(part) for part in zip(*found, strict=True)))
 
 
-def _linearize(family, points, values, goal, derivatives):
+def _linearize(family, points, values, derivatives):
     warp, coefficients = values[:, : family.parameters], values[:, family.parameters :]
     basis = _basis(family, points, warp)
     lobe = np.einsum("psk,pk->ps", basis, coefficients)
-    whole, albedo = points.lobes @ goal.whole, points.albedo @ goal.whole
-    functionals, scales = _functionals(points, whole, goal.tail)
+    functionals, scales = _functionals(points)
     # Missing: of every curve for the right-hand side, of F = 1 for the error
     targets = points.lobes.copy()
     targets[..., 0] -= lobe
     weights = points.quadrature * (1.0 + NEGATIVE_WEIGHT * (lobe < 0.0))
-    weights /= (points.quadrature * whole**2).sum(axis=1)[:, None]
+    weights /= (points.quadrature * points.lobes[..., 0] ** 2).sum(axis=1)[:, None]
     misses = np.matmul(functionals, targets)
-    albedo_row = _albedo_row(family, albedo, warp, coefficients)
-    albedo_misses = points.albedo / albedo[:, None]
+    albedo_row = _albedo_row(family, points, warp, coefficients)
+    albedo_misses = points.albedo / points.albedo[:, :1]
     albedo_misses[:, 0] -= np.einsum("pd,pd->p", albedo_row[:, family.parameters :], coefficients)
-    squared = (weights * targets[..., 0] ** 2).sum(axis=1) + (scales * misses[..., 0] ** 2).sum(axis=1)
-    excess_row = np.where(lobe < 0.0, points.quadrature, 0.0) / albedo[:, None]
+    squared = (weights * targets[..., 0] ** 2).sum(axis=1) + scales * (misses[..., 0] ** 2).sum(axis=1)
+    excess_row = np.where(lobe < 0.0, points.quadrature, 0.0) / points.albedo[:, :1]
     excess = np.maximum(-(excess_row * lobe).sum(axis=1) - NEGATIVE_SHARE, 0.0)
     excess_row *= (excess > 0.0)[:, None]
     error = np.sqrt(squared + ALBEDO_WEIGHT * albedo_misses[:, 0] ** 2 + EXCESS_WEIGHT * excess**2)
@@ -112,7 +86,8 @@ def _linearize(family, points, values, goal, derivatives):
     importance = 1.0 / np.maximum(error, ERROR_FLOOR)
     jacobian = np.concatenate([_warp_slopes(family, points, warp, coefficients, lobe), basis], axis=-1)
     matrices, right = _normal(jacobian, weights * importance[:, None], targets)
-    rows = [(np.matmul(functionals, jacobian), scales * importance[:, None], misses)]
+    scales = np.broadcast_to((scales * importance)[:, None], misses.shape[:2])
+    rows = [(np.matmul(functionals, jacobian), scales, misses)]
     rows.append((albedo_row[:, None], (ALBEDO_WEIGHT * importance)[:, None], albedo_misses[:, None]))
     if points.lobes.shape[2] == 1:
         slopes = np.matmul(excess_row[:, None], jacobian)
@@ -144,18 +119,17 @@ def _warp_slopes(family, points, warp, coefficients, lobe, step=1e-5):
     return np.stack([(np.einsum("psk,pk->ps", basis, coefficients) - lobe) / step for basis in moved], axis=-1)
 
 
-def _albedo_row(family, albedo, warp, coefficients):
-    """Derivatives (P, n + size) of the albedo relative to `albedo` (P,)."""
+def _albedo_row(family, points, warp, coefficients):
+    """Derivatives (P, n + size) of the relative albedo."""
     tilt = _tilt(family, warp)
     by_warp = np.zeros((len(warp), family.parameters))
     if family.kind == "ltc":
         by_warp[:, 3] = -0.5 * np.sin(tilt) * coefficients[:, 0]
-    return np.concatenate([by_warp, family.basis_albedo(tilt)], axis=1) / albedo[:, None]
+    return np.concatenate([by_warp, family.basis_albedo(tilt)], axis=1) / points.albedo[:, :1]
 
 
-def _functionals(points, whole, tail):
-    """Rows (P, W, S) that integrate over soft lights, mirror-symmetric in y, and the scales (P, W) of their squares for
-    parts of a lobe `whole` (P, S)."""
+def _functionals(points):
+    """Rows (P, W, S) that integrate over soft lights, mirror-symmetric in y, and the scale (P,) of their squares."""
     k = np.arange(WINDOWS) + 0.5
     z, azimuth = 1.0 - k / WINDOWS, np.pi * (1.0 + np.sqrt(5.0)) * k
     radius = np.sqrt(1.0 - z * z)
@@ -166,11 +140,8 @@ def _functionals(points, whole, tail):
     # Windows of single precision are as good: they weigh the lobe and what is fitted to it alike.
     exponents = [((np.matmul(side, directions) - 1.0) * sharpness).astype(np.float32) for side in (centers, mirrored)]
     windows = (np.exp(exponents[0]) + np.exp(exponents[1])) * points.quadrature[:, None, :]
-    plain = points.lobes[..., 0]
-    reflectance = np.divide(whole, plain, out=np.ones_like(plain), where=plain > 0.0)
-    seen, sphere = np.moveaxis(np.matmul(windows, np.stack([whole, reflectance / (4.0 * np.pi)], axis=-1)), -1, 0)
-    scales = LIGHT_WEIGHT / (seen**2).sum(axis=1)[:, None]
-    return windows, scales + tail / WINDOWS / (seen + TAIL_FLOOR * sphere) ** 2
+    seen = np.matmul(windows, points.lobes[..., :1])[..., 0]
+    return windows, LIGHT_WEIGHT / (seen**2).sum(axis=1)
 
 
 ITERATIONS = 3
@@ -206,15 +177,11 @@ def refine(family, model, cells, state: State, progress=None) -> np.ndarray:
     return state.nodes
 
 
-def fresnel_coefficients(family, model, cells, nodes, solved, curves) -> np.ndarray:
+def fresnel_coefficients(family, model, cells, nodes, limit, curves) -> np.ndarray:
     """Coefficients (R, T, F, size) for Fresnel curves (F, C), curve 0 being F = 1: the same least squares problem with
-    the warps of `nodes` held. They are moved as little as the error allows so that the nodes' albedo is exact. `solved`
-    is what is known of the nodes: coefficients (R, T, F, size), of which those that are not free are taken, and the
-    albedo (R, T, F)."""
-    limit, albedo = solved
+    the warps of `nodes` held. `limit` (R, T, F, size) has the rows that are fixed."""
     free = free_entries(family, model, cells.shape)[..., family.parameters :]
-    plain = linearize(family, model, cells, nodes).matrices[:, family.parameters :, family.parameters :]
-    here = linearize(family, model, cells, nodes, Goal(curves, DIELECTRIC, TAIL_WEIGHT))
+    here = linearize(family, model, cells, nodes, curves)
     matrices = here.matrices[:, family.parameters :, family.parameters :]
     coefficients = np.where(free[:, :, None], 0.0, limit)
     coefficients[:, :, 0] = nodes[..., family.parameters :]
@@ -222,22 +189,22 @@ def fresnel_coefficients(family, model, cells, nodes, solved, curves) -> np.ndar
         fixed = cells.interpolate(coefficients[:, :, curve])
         right = here.right[:, family.parameters :, curve] - np.matmul(matrices, fixed[..., None])[..., 0]
         coefficients[:, :, curve] += _solve(cells, matrices, right, free, 1e-6)
-    tilt = nodes[..., 3].ravel() if family.kind == "ltc" else np.zeros(nodes[..., 0].size)
-    row = family.basis_albedo(tilt).reshape(*nodes.shape[:2], -1)
-    for part, blocks in ((slice(0, 1), plain), (slice(1, None), matrices)):
-        missing = albedo[..., part] - (coefficients[:, :, part] * row[:, :, None]).sum(axis=-1)
-        coefficients[:, :, part] += _least_change(cells.node_blocks(blocks), free, row, missing)
     return coefficients
 
 
-def _least_change(blocks, free, row, missing):
-    """Changes (R, T, F, size) of the coefficients that cost the error least and add `missing` (R, T, F) to the dot
-    product with `row` (R, T, size)."""
+def with_exact_albedo(family, model, cells, nodes, coefficients, albedo) -> np.ndarray:
+    """Coefficients (R, T, F, size), moved as little as the error allows, so that the nodes have `albedo` (R, T, F)."""
+    free = free_entries(family, model, cells.shape)[..., family.parameters :]
+    here = linearize(family, model, cells, nodes)
+    blocks = cells.node_blocks(here.matrices[:, family.parameters :, family.parameters :])
     inverse = _inverse_of_free(blocks, 1e-6 * np.einsum("ijkk->ijk", blocks), free)
+    tilt = nodes[..., 3].ravel() if family.kind == "ltc" else np.zeros(nodes[..., 0].size)
+    row = family.basis_albedo(tilt).reshape(*nodes.shape[:2], -1)
     direction = np.matmul(inverse, row[..., None])[..., 0]
     scale = (row * direction).sum(axis=-1)[..., None]
+    missing = albedo - (coefficients * row[:, :, None]).sum(axis=-1)
     share = np.divide(missing, scale, out=np.zeros_like(missing), where=scale > 0.0)
-    return share[..., None] * direction[:, :, None]
+    return coefficients + share[..., None] * direction[:, :, None]
 
 
 def free_entries(family, model, shape) -> np.ndarray:

@@ -468,6 +468,8 @@ class Comparison:
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
             f"noise of the Cycles reference {percent(imaging.reference_noise(*halves, hit))}",
         ]
+        if self.shadows is not None and len(passes) == 1:
+            notes.append(f"noise of our shadows {percent(self.shadows.noise[passes[0]])}")
         if notice := self._subset_notice():
             notes.append(f"{notice}; elsewhere gray")
         title = f"{Path(self.options.scene).stem}: {title} radiance beside Cycles"
@@ -533,6 +535,14 @@ _ROW = {
     "against_cycles?": {"unbiased_relative_error?": NUMBER | None, "unbiased_squared_error?": NUMBER | None},
     "against_reference?": {**_ERRORS, "metals?": _ERRORS, "dielectrics?": _ERRORS},
 }
+
+
+def _shadows(value, place) -> None:
+    """What `Shadows.report` gives, or nothing."""
+    if value is not None:
+        check(value, {"noise": {str: NUMBER}}, place)
+
+
 # What `merge`, a baseline and a summary need of a report (see `reading.check`).
 REPORT = {
     "scene": str,
@@ -543,6 +553,7 @@ REPORT = {
     **dict.fromkeys(("warnings", "problems?"), [str]),
     **dict.fromkeys(("sub_samples", "cycles_samples", "surface_samples"), int),
     "versions": dict,
+    "shadows?": _shadows,
     "passes": some({str: {"noise?": NUMBER | None, "techniques": {str: _ROW}}}),
 }
 
@@ -570,8 +581,10 @@ def unbiased(figures: dict) -> str:
 def summary(report: dict, seconds: dict) -> list[str]:
     """A table of one picture: errors and seconds per pass and technique."""
     found = []
+    shadows = report.get("shadows")
     for pass_name, figures in report["passes"].items():
         noise = f", noise of Cycles {percent(figures['noise'])}" if "noise" in figures else ""
+        noise += f", of our shadows {percent(shadows['noise'].get(pass_name))}" if shadows else ""
         found.append(f"{pass_name}{noise}")
         heads = f"{'vs Cycles':>12}{'vs reference':>14}{'metals':>10}{'dielectrics':>13}{'s':>8}"
         found.append(f"  {'technique':<12}{heads}")

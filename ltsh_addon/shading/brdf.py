@@ -56,19 +56,6 @@ def half_angle_cosine(cos_theta_o, directions):
     return np.sqrt(np.clip(0.5 * (1.0 + cosine), 0.0, 1.0))
 
 
-def least_half_angle_cosine(view, offset, radius):
-    """A lower bound (P,) of that cosine between view (3, P), unit, and all directions into the sphere of `radius`
-    around offset (3, P)."""
-    distance = np.maximum(np.sqrt((offset * offset).sum(axis=0)), 1e-30)
-    toward = np.clip((offset * view).sum(axis=0) / distance, -1.0, 1.0)
-    aside = np.sqrt(1.0 - toward * toward)
-    sine = np.minimum(radius / distance, 1.0)
-    cosine = np.sqrt(1.0 - sine * sine)
-    # The farthest direction of the cone, unless the cone holds the one opposite to the view.
-    is_short = (aside * cosine + toward * sine > 0.0) & (sine < 1.0)
-    return np.sqrt(np.maximum(0.5 * (1.0 + (toward * cosine - aside * sine)), 0.0)) * is_short
-
-
 def schlick_curve(cosine):
     """(1 - c)^5 (Schlick 1994): the reflectance is f0 + (f90 - f0) (1 - c)^5."""
     complement = 1.0 - cosine

@@ -15,10 +15,10 @@ from functools import partial
 import numpy as np
 
 from . import float64, light_cone, moments32
-from .brdf import least_half_angle_cosine
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
+from .tails import TailLimits
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
@@ -68,12 +68,13 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
             rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
-            least = None
-            if not isinstance(vectors[-1], int):
-                least = table.head_on_reflectance(samples.ior[index]).astype(np.float32)
-            integrate, width = LobeIntegral(ridges, weights, least, scratch), float64.lobe_width(samples, index)
-            limit = FresnelLimit.of(samples, index, vectors) if table.family == "ltsh" and len(vectors) > 1 else None
-            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width, limit))
+            integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
+            limits = None
+            if table.family == "ltsh":
+                geometric = rows[clip_rows[0]] if len(clip_rows) > 1 else None
+                kinds = 1 in vectors, not isinstance(vectors[-1], int)
+                limits = TailLimits.of(samples, index, geometric, kinds, np.float32)
+            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width, limits))
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
 
@@ -92,26 +93,6 @@ def _chunks(members):
 
 
 @dataclass(frozen=True)
-class FresnelLimit:
-    """The limits of `float64.limit_fresnel` for Q samples."""
-
-    view: np.ndarray  # (3, Q)
-    ior: np.ndarray | None  # (Q,), where the last integral is that of a dielectric
-    schlick: bool  # whether the second integral is that of Schlick's curve
-
-    @classmethod
-    def of(cls, samples, index, vectors) -> FresnelLimit:
-        has_dielectric = not isinstance(vectors[-1], int)
-        ior = samples.ior[index].astype(np.float32) if has_dielectric else None
-        return cls(_columns(samples.view, index), ior, vectors[1] == 1)
-
-    def apply(self, integrals, part, offset, radius) -> None:
-        """Limit integrals (F, Q') of a light's `offset` (3, Q') and `radius` from the samples `part`."""
-        cosine = least_half_angle_cosine(self.view[:, part], offset, np.float32(radius))
-        float64.limit_fresnel(integrals, cosine, self.schlick, None if self.ior is None else self.ior[part])
-
-
-@dataclass(frozen=True)
 class Lobes:
     """The lobes of Q samples; integrate(columns, corners, index, smallest) gives (F, Q') integrals and a mask."""
 
@@ -121,7 +102,7 @@ class Lobes:
     integrate: Callable
     colors: np.ndarray  # (F, 3, Q) reflectances of the integrals
     width: np.ndarray | float  # as for `light_levels`
-    limit: FresnelLimit | None = None
+    limits: TailLimits | None = None
 
 
 class _Lighting:
@@ -157,8 +138,8 @@ class _Lighting:
                     axes = integrate.rows
                 polygons = local_corners(light, outline, offset, axes, self.scratch)
                 found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
-                if lobes.limit is not None:
-                    lobes.limit.apply(found, part, offset, light.radius)
+                if lobes.limits is not None:
+                    lobes.limits.apply(found, part, offset, light, self.scratch)
                 if redo.any():
                     found[:, redo] = 0.0
                     needs_float64.append(index[part][redo])
@@ -228,7 +209,7 @@ def _light_of_each(items, number):
     """One (light, group, corners) in place of several with equally many corners, of which each sample has its own."""
     fields = {
         name: np.stack([getattr(light, name) for light, _, _ in items])[number]
-        for name in ("center", "direction", "radiance", "radius")
+        for name in ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
     }
     corners = np.stack([corners for _, _, corners in items])
     return float64.LightOfEachSample(**fields), 0, corners[number].transpose(1, 0, 2)
@@ -403,12 +384,11 @@ class ShadowedFormFactor:
 class LobeIntegral:
     """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`.
 
-    The first one is that for F = 1. With `least` (Q,) the last one is that of a dielectric, at least `least` times
-    the first.
+    The first one is that for F = 1.
     """
 
-    def __init__(self, ridges, weights, least, scratch):
-        self.ridges, self.weights, self.least, self.scratch = ridges, weights, least, scratch
+    def __init__(self, ridges, weights, scratch):
+        self.ridges, self.weights, self.scratch = ridges, weights, scratch
 
     def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
         weights = _selected(self.weights, part, index)
@@ -416,8 +396,6 @@ class LobeIntegral:
         np.negative(values, out=values)
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(-LEAST_SHARE) * cosine, out=values[0])
-        if self.least is not None:
-            np.maximum(values[-1], _selected(self.least, part, index) * values[0], out=values[-1])
         return values, needs_float64
 
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import light_cone
-from .brdf import dielectric_reflectance, least_half_angle_cosine, schlick_curve
 from .edge_integrals import vector_irradiance
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
 from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
 from .reference import reference_integrals
 from .spherical_harmonics import coefficient_index
+from .tails import TailLimits
 
 # Of the roughness by which the effort for a lobe is chosen.
 LEAST_ROUGHNESS = 1e-3
@@ -32,12 +32,19 @@ class LightOfEachSample:
     center: np.ndarray  # (P, 3)
     direction: np.ndarray  # (P, 3)
     radiance: np.ndarray  # (P, 3)
-    radius: np.ndarray  # (P,)
+    half_u: np.ndarray  # (P, 3)
+    half_v: np.ndarray  # (P, 3)
+    area_vector: np.ndarray  # (P, 3)
     affects_diffuse: bool = True
     affects_specular: bool = True
     is_focused: bool = False
     is_profiled: bool = False
     is_round: bool = False
+
+    def take(self, index) -> LightOfEachSample:
+        """The lights of the samples `index`."""
+        names = ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
+        return LightOfEachSample(**{name: getattr(self, name)[index] for name in names})
 
     def receives(self, receiver, index):
         """None, as of a light without receivers: those that the light does not reach were left out before."""
@@ -123,10 +130,10 @@ def shade_specular(samples, lights, table, radiance, error=None):
             )
         for index, integrals in parts:
             if table != REFERENCE and table.family == "ltsh":
-                offset = _of(light.center, index) - samples.position[index]
-                radius = light.radius if np.ndim(light.radius) == 0 else light.radius[index]
-                least = least_half_angle_cosine(samples.view[index].T, offset.T, radius)
-                limit_fresnel(integrals, least, True, np.maximum(samples.ior[index], 1.0))
+                offset = (_of(light.center, index) - samples.position[index]).T
+                limits = TailLimits.of(samples, index, samples.geometric_normal[index].T, (True, True), np.float64)
+                own = light if np.ndim(light.center) == 1 else light.take(index)
+                limits.apply(integrals, slice(None), offset, own, _fresh_array)
             plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
@@ -134,18 +141,9 @@ def shade_specular(samples, lights, table, radiance, error=None):
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
-def limit_fresnel(integrals, cosine, has_schlick: bool, ior) -> None:
-    """Limit integrals (F, Q) over a light to which the half angle has at least the cosine (Q,).
-
-    The first is for F = 1, with `has_schlick` the second for Schlick's curve, with `ior` (Q,) the last for dielectrics.
-
-    No curve integrates to more than its largest value over the light times the integral for F = 1. In the tail of a
-    lobe, where the curves are small, the fit of their coefficients may be off by more than that.
-    """
-    if has_schlick:
-        np.minimum(integrals[1], schlick_curve(cosine) * integrals[0], out=integrals[1])
-    if ior is not None:
-        np.minimum(integrals[-1], dielectric_reflectance(cosine, ior) * integrals[0], out=integrals[-1])
+def _fresh_array(name, shape):
+    """In place of a Scratch."""
+    return np.empty(shape)
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
@@ -171,7 +169,6 @@ def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon)
         vectors = np.concatenate([part.coefficients, np.broadcast_to(cosine, part.coefficients[:1].shape)])
         *values, plain = np.maximum(-polygon_integrals(table, part, polygon, vectors), 0.0)
         values[0] = np.maximum(values[0], LEAST_SHARE * plain)
-        values[3] = np.maximum(values[3], table.head_on_reflectance(samples.ior[index]) * values[0])
         return np.stack(values)
 
     if not light.is_profiled:

@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from . import edge_integrals, lookup_table
+from . import edge_integrals, lookup_table, tails
 from .lobes import LEAST_SHARE
 from .lookup_table import LookupTable
 from .spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
 
 # Raise it when a function of core.h changes: headers of different versions refuse to be included together.
-CORE_VERSION = 4
+CORE_VERSION = 5
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
@@ -54,6 +54,7 @@ def core_text() -> str:
         "TWO_OVER_PI": float_literal(2.0 / np.pi),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "FOUR_PI": float_literal(4.0 * np.pi),
+        "NEAR_SQUARED": float_literal(tails.NEAR_RADII**2),
         "ARC_NODES": "\n".join(_arc_node_lines()),
     }
     return filled(_text("core.h"), values)

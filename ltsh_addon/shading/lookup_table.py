@@ -14,7 +14,6 @@ Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg)
 One coefficient vector per Fresnel curve shares the warp: a lobe is linear in its coefficients, so that a reflectance
 sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f c_f. Curves 0, 1 and 2 are 1 and
 (1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals); `dielectric_weights` gives w_f for dielectrics.
-Head on, at c = 1, all curves but the first are 0.
 """
 
 from __future__ import annotations
@@ -139,15 +138,6 @@ class LookupTable:
     def dielectric_weights(self, ior: np.ndarray) -> np.ndarray:
         """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
-
-    def head_on_reflectance(self, ior: np.ndarray) -> np.ndarray:
-        """F0 (P,) of dielectrics of relative `ior` (P,), clamped to the table's range: what they reflect at least.
-
-        Integrals of a dielectric's lobe are not below F0 times those for F = 1: in the tail of a lobe, where small
-        errors of the fit may be larger than the lobe, there would be black spots else.
-        """
-        ior = np.clip(ior, self.fresnel_ior[0], self.fresnel_ior[-1])
-        return ((ior - 1.0) / (ior + 1.0)) ** 2
 
 
 def warp_entries(cosine, alpha, a, b, c, sine=None):

@@ -34,6 +34,7 @@ NAMES = [
 
 _SHIM = """
 #include <cmath>
+#include <math.h>
 #define LTSH_GLSL 1
 struct vec3 { float x, y, z; };
 static inline float atan(float y, float x) { return std::atan2(y, x); }
@@ -105,6 +106,23 @@ void integral(int n, const float *cosine, const float *roughness, int curve, int
     }
 }
 
+/* Of a rectangle, from a point with the normal (0, 0, 1). */
+static ltsh_limits rectangle_limits(float cosine, float roughness, const float *v)
+{
+    ltsh_vec3 view = ltsh_make_vec3(sqrtf((1.0f - cosine) * (1.0f + cosine)), 0.0f, cosine);
+    ltsh_vec3 normal = ltsh_make_vec3(0.0f, 0.0f, 1.0f);
+    ltsh_vec3 zero = ltsh_make_vec3(0.0f, 0.0f, 0.0f);
+    ltsh_vec3 first = ltsh_add_scaled(vector(v + 3), -1.0f, vector(v));
+    ltsh_vec3 second = ltsh_add_scaled(vector(v + 6), -1.0f, vector(v + 3));
+    ltsh_extent light;
+    light.center = ltsh_add_scaled(ltsh_add_scaled(zero, 0.5f, vector(v)), 0.5f, vector(v + 6));
+    light.half_u = ltsh_add_scaled(zero, 0.5f, first);
+    light.half_v = ltsh_add_scaled(zero, 0.5f, second);
+    light.area = ltsh_cross(first, second);
+    if (ltsh_dot(light.area, light.center) > 0.0f) { light.area = ltsh_cross(second, first); }
+    return ltsh_tail_limits(normal, normal, view, roughness, light);
+}
+
 void shaded(int n, const float *cosine, const float *roughness, const float *ior, int corners, const float *vertices,
     float *out)
 {
@@ -114,9 +132,14 @@ void shaded(int n, const float *cosine, const float *roughness, const float *ior
         ltsh_cell cell = NAME_cell(cosine[i], roughness[i]);
         NAME_moments moments = NAME_polygon_moments(NAME_lookup_warp(cell), visible);
         float plain = NAME_plain_integral(NAME_moment_weights(NAME_lookup_curve(cell, 0)), moments, sign);
+        ltsh_limits limits = rectangle_limits(cosine[i], roughness[i], vertices + 3 * corners * i);
+        int is_limited = UPPER_COEFFICIENTS > 1 && plain > 0.0f;
+        plain = is_limited ? ltsh_between(plain, limits.least, limits.most) : plain;
         NAME_weights weights = NAME_moment_weights(NAME_lookup_dielectric(cell, ior[i]));
+        float coat = NAME_dielectric_integral(weights, moments, sign, ior[i], plain);
+        float most = is_limited ? ltsh_dielectric_reflectance(limits.cosine, ior[i]) * plain : 1e30f;
         out[2 * i] = plain;
-        out[2 * i + 1] = NAME_dielectric_integral(weights, moments, sign, ior[i], plain);
+        out[2 * i + 1] = ltsh_between(coat, 0.0f, most);
     }
 }
 

@@ -165,7 +165,7 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         3   direction; texel of the first receiver
         4   radiance; number of receivers, -1: all
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
-        6   power of the falloff; its smoothing; `AreaLight.radius`
+        6   power of the falloff; its smoothing; area
 
     No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
     """
@@ -217,7 +217,7 @@ def _header(light, first, count, half_v, first_receiver):
         [*light.direction, first_receiver],
         [*light.radiance, receivers],
         [tangent, 1.0 / share, reach, _bound(light)],
-        [light.falloff, light.smooth, light.radius, 0.0],
+        [light.falloff, light.smooth, np.linalg.norm(light.area_vector), 0.0],
     ])  # fmt: skip
 
 

@@ -41,6 +41,12 @@ struct ltsh_warp { float xx; float xz; float yy; float zz; float tilt; };
 /* An edge of a spherical polygon of length theta: phi = theta / sin(theta), psi = (phi - 1) / (1 - cos(theta)),
    q = 1 / (1 + cos(theta)); `total` is the sum of its ends, `normal` the cross product start x end. */
 struct ltsh_edge { ltsh_vec3 start; ltsh_vec3 total; ltsh_vec3 normal; float phi; float psi; float q; };
+/* A light around the point: its center, half sides of the parallelogram around it, its area times the direction to which
+   it shines. */
+struct ltsh_extent { ltsh_vec3 center; ltsh_vec3 half_u; ltsh_vec3 half_v; ltsh_vec3 area; };
+/* Bounds of the integral for F = 1, and the least cosine between the view and the half vectors; without bounds 0, 1e30
+   and 0. */
+struct ltsh_limits { float least; float most; float cosine; };
 
 #ifndef LTSH_GLSL
 typedef struct ltsh_frame ltsh_frame;
@@ -48,6 +54,8 @@ typedef struct ltsh_polygon ltsh_polygon;
 typedef struct ltsh_cell ltsh_cell;
 typedef struct ltsh_warp ltsh_warp;
 typedef struct ltsh_edge ltsh_edge;
+typedef struct ltsh_extent ltsh_extent;
+typedef struct ltsh_limits ltsh_limits;
 #endif
 
 LTSH_FUNCTION float ltsh_larger(float a, float b) { return a > b ? a : b; }
@@ -369,6 +377,70 @@ LTSH_FUNCTION ltsh_polygon ltsh_warped_polygon(ltsh_warp warp, ltsh_polygon poly
         polygon.corners[i] = ltsh_warped(warp, polygon.corners[i]);
     }
     return polygon;
+}
+
+/* Exact unpolarized Fresnel reflectance of a dielectric seen from outside; ior is at least 1. */
+LTSH_FUNCTION float ltsh_dielectric_reflectance(float cosine, float ior)
+{
+    float g = LTSH_SQRT(ltsh_larger(ior * ior - 1.0f + cosine * cosine, 0.0f));
+    float perpendicular = (g - cosine) / ltsh_larger(g + cosine, 1e-30f);
+    float quotient = (cosine * (g + cosine) - 1.0f) / (cosine * (g - cosine) + 1.0f);
+    return 0.5f * perpendicular * perpendicular * (1.0f + quotient * quotient);
+}
+
+/* The value, or what is nearest to it from `least` to `most`. */
+LTSH_FUNCTION float ltsh_between(float value, float least, float most)
+{
+    return value < least ? least : (value > most ? most : value);
+}
+
+/* Limits for integrals over the light in the tail of a lobe, where the mirrored view ray misses the light by far and a
+   fitted lobe may be off by more than its value: least and greatest GGX BRDF times both cosines by the squared distance,
+   of the center and the corners, times the area. Below the horizon of `second`, or else of `normal`, nothing is seen. */
+LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
+    ltsh_vec3 normal, ltsh_vec3 second, ltsh_vec3 view, float roughness, ltsh_extent light)
+{
+    float mu = ltsh_dot(normal, view);
+    float mirrored = 2.0f * mu * ltsh_dot(normal, light.center) - ltsh_dot(view, light.center);
+    ltsh_vec3 sum = ltsh_add_scaled(light.half_u, 1.0f, light.half_v);
+    ltsh_vec3 difference = ltsh_add_scaled(light.half_u, -1.0f, light.half_v);
+    float radius_squared = ltsh_larger(ltsh_dot(sum, sum), ltsh_dot(difference, difference));
+    float beyond = ltsh_dot(light.center, light.center) - @NEAR_SQUARED@ * radius_squared;
+    ltsh_limits limits;
+    limits.least = 0.0f;
+    limits.most = 1e30f;
+    limits.cosine = 0.0f;
+    float squared = mirrored < 0.0f ? 0.0f : mirrored * mirrored;
+    if (squared >= beyond || beyond <= 0.0f) {
+        return limits;
+    }
+    float alpha = ltsh_larger(roughness * roughness, @MIN_ALPHA@);
+    float alpha_squared = alpha * alpha;
+    float rest = 1.0f - alpha_squared;
+    float slope = LTSH_SQRT(alpha_squared + rest * mu * mu);
+    float factor = -0.5f * @ONE_OVER_PI@ * alpha_squared * ltsh_dot(light.center, light.area);
+    float least_half = 1.0f;
+    for (int i = 0; i < 5; ++i) {
+        ltsh_vec3 along = i < 3 ? sum : difference;
+        float sign = i == 0 ? 0.0f : ((i == 1 || i == 3) ? 1.0f : -1.0f);
+        ltsh_vec3 offset = ltsh_add_scaled(light.center, sign, along);
+        float square = ltsh_dot(offset, offset);
+        float away = LTSH_SQRT(square);
+        float height = ltsh_dot(normal, offset);
+        float halved = square + away * ltsh_dot(view, offset);
+        float middle = height + mu * away;
+        float ratio = halved / (halved - 0.5f * rest * middle * middle);
+        height = ltsh_larger(height, 0.0f);
+        float masking = mu * LTSH_SQRT(alpha_squared * square + rest * height * height) + height * slope;
+        float value = factor * ratio * ratio * height / (masking * square * away);
+        float seen = ltsh_dot(second, offset) > 0.0f ? value : 0.0f;
+        limits.least = i == 0 || seen < limits.least ? seen : limits.least;
+        limits.most = i == 0 ? value : ltsh_larger(limits.most, value);
+        halved = 0.5f * halved / square;
+        least_half = halved < least_half ? halved : least_half;
+    }
+    limits.cosine = LTSH_SQRT(ltsh_larger(least_half, 0.0f));
+    return limits;
 }
 
 #elif LTSH_SHARED != @VERSION@

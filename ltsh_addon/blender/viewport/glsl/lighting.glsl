@@ -52,7 +52,7 @@ void main()
         values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
 #endif
 #ifndef LTSH_COSINE
-        values = specular_limited(values, point, shining.offset, ltsh_light_texel(header + 6).z);
+        values = specular_limited(values, point, shining, ltsh_light_texel(header + 6).z, focused);
 #endif
         reflected += ltsh_reflected(point, values);
 #endif

@@ -1,10 +1,10 @@
 @SUM@
 /* Axes of the warped local frame, and the normals of the horizons. */
 struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; };
-/* Weights of the moments by Fresnel term, how wide the lobe is in radians, and the least reflectance of the dielectric. */
+/* Weights of the moments by Fresnel term, and how wide the lobe is in radians. */
 struct specular_weights {
     float plain[LTSH_COEFFICIENTS]; float schlick[LTSH_COEFFICIENTS]; float dip[LTSH_COEFFICIENTS];
-    float dielectric[LTSH_COEFFICIENTS]; float width; float least;
+    float dielectric[LTSH_COEFFICIENTS]; float width;
 };
 
 vec3 specular_warped(specular_lobe lobe, vec3 v)
@@ -89,8 +89,6 @@ specular_weights ltsh_weights(ltsh_cell cell, ltsh_point point)
         specular_sum values = ltsh_curve_at(cell, curve);
 @TERMS@
     }
-    float ior = 1.0 + position / LTSH_IOR_STEPS;
-    w.least = (ior - 1.0) / (ior + 1.0) * ((ior - 1.0) / (ior + 1.0));
     w.width = max(point.roughness, LTSH_LEAST_ROUGHNESS) * max(point.roughness, LTSH_LEAST_ROUGHNESS);
     return w;
 }
@@ -156,31 +154,28 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
     /* As in `lobes.LEAST_SHARE`: the third moment is twice the integral of z. */
     plain = max(plain, -LTSH_LEAST_OF_COSINE * sum.values[2]);
 #endif
-    /* As in `LookupTable.head_on_reflectance`. */
-    float dielectric = max(ltsh_product(weights.dielectric, sum), weights.least * plain);
+    float dielectric = ltsh_product(weights.dielectric, sum);
     return vec4(plain, ltsh_product(weights.schlick, sum), ltsh_product(weights.dip, sum), dielectric);
 }
 
 #ifndef LTSH_COSINE
-/* As `brdf.least_half_angle_cosine` and `float64.limit_fresnel`. */
-vec4 specular_limited(vec4 values, ltsh_point point, vec3 offset, float radius)
+/* As `tails.TailLimits.apply`; of a profiled light only the reflectances are limited. */
+vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float area, bool profiled)
 {
-    float far = max(sqrt(dot(offset, offset)), 1e-30);
-    float toward = clamp(dot(offset, point.view) / far, -1.0, 1.0);
-    float aside = sqrt(1.0 - toward * toward);
-    float sine = min(radius / far, 1.0);
-    float cosine = sqrt(1.0 - sine * sine);
-    bool is_short = aside * cosine + toward * sine > 0.0 && sine < 1.0;
-    float c = is_short ? sqrt(max(0.5 * (1.0 + toward * cosine - aside * sine), 0.0)) : 0.0;
+    ltsh_extent extent;
+    extent.center = light.offset;
+    extent.half_u = light.half_u;
+    extent.half_v = light.half_v;
+    extent.area = area * light.direction;
+    ltsh_limits limits = ltsh_tail_limits(point.normal, point.geometric, point.view, point.roughness, extent);
     float ior = max(point.ior, 1.0);
-    float g = sqrt(max(ior * ior - 1.0 + c * c, 0.0));
-    float perpendicular = (g - c) / max(g + c, 1e-30);
-    float quotient = (c * (g + c) - 1.0) / (c * (g - c) + 1.0);
-    float dielectric = 0.5 * perpendicular * perpendicular * (1.0 + quotient * quotient);
-    float complement = 1.0 - c;
+    float complement = 1.0 - limits.cosine;
     float squared = complement * complement;
+    bool limited = !profiled && values.x > 0.0;
+    values.x = limited ? ltsh_between(values.x, limits.least, limits.most) : values.x;
     values.y = min(values.y, squared * squared * complement * values.x);
-    values.w = min(values.w, dielectric * values.x);
+    values.w = min(values.w, ltsh_dielectric_reflectance(limits.cosine, ior) * values.x);
+    values.w = max(values.w, ltsh_dielectric_reflectance(1.0, ior) * values.x);
     return values;
 }
 #endif

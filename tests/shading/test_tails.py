@@ -1,0 +1,114 @@
+"""Limits of integrals in the tails of lobes, with the reference quadrature and a second formula for them as oracles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import textbook
+from surface_scenes import area_light, single_sample, unit
+
+from ltsh_addon import shading
+
+
+def bounds(view, roughness, light):
+    """(least, greatest) integral for F = 1 at the origin, normal z; None for lights without limits."""
+    signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+    points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
+    distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
+    mirrored = np.array([-view[0], -view[1], view[2]])
+    angle = np.arccos(np.clip(mirrored @ light.center / distance, -1.0, 1.0))
+    if distance <= 2.0 * radius or angle <= np.arcsin(2.0 * radius / distance):
+        return None
+    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v))
+    values = []
+    for point in points:
+        length = np.linalg.norm(point)
+        brdf = textbook.ggx_brdf(view, point / length, roughness**2) if point[2] > 0.0 else 0.0
+        values.append(brdf * max(point[2], 0.0) * area * abs(light.direction @ point) / length**4)
+    return min(values), max(values)
+
+
+def limited(value, view, roughness, light):
+    """`value` between the bounds, if there are any."""
+    limits = bounds(view, roughness, light)
+    return value if limits is None else min(max(value, limits[0]), limits[1])
+
+
+def random_case(generator):
+    """(view, roughness, light) of a light that shines on the origin."""
+    mu, roughness = generator.uniform(0.02, 1.0), generator.uniform(0.1, 1.0)
+    center = unit(generator.normal(size=3) + np.array([0.0, 0.0, 0.5]))
+    direction = unit(generator.normal(size=3))
+    direction *= -np.sign(direction @ center)
+    half_u = unit(np.cross(direction, generator.normal(size=3)))
+    half_v = np.cross(half_u, direction)
+    half_u, half_v = (vector * 10.0 ** generator.uniform(-1.5, -0.3) for vector in (half_u, half_v))
+    light = area_light(center=center, direction=direction, half_u=half_u, half_v=half_v, radiance=(1, 1, 1))
+    return textbook.view_direction(mu), roughness, light
+
+
+def shaded(sample, light, technique, dtype=np.float64):
+    return shading.shade(sample, [light], technique, passes=["specular"], workers=1, dtype=dtype).specular[0, 0, 0]
+
+
+WHITE = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1)}
+
+
+def cases(count):
+    """`count` of the random cases with bounds, and the bounds."""
+    generator = np.random.default_rng(5)
+    while count:
+        view, roughness, light = random_case(generator)
+        limits = bounds(view, roughness, light)
+        if limits is not None:
+            count -= 1
+            yield view, roughness, light, limits
+
+
+def test_true_lobes_are_within_the_bounds():
+    """So a limit never takes the right value away; lights in all directions, some cut by the horizon."""
+    cut = 0
+    for view, roughness, light, (least, most) in cases(200):
+        sample = single_sample(view=view, roughness=roughness, **WHITE)
+        exact = shaded(sample, light, shading.REFERENCE)
+        # The quadrature stops at 1e-4 of the value plus 1e-6.
+        assert 0.9998 * least - 2e-6 <= exact <= 1.0002 * most + 2e-6, (view, roughness, light)
+        cut += least == 0.0 < most
+    assert cut > 10
+
+
+@pytest.mark.parametrize("technique", ["ltsh2", "ltsh4"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_integrals_are_within_the_bounds(technique, dtype):
+    """And those of a dielectric between its reflectance head on and its largest one on the light."""
+    changed = 0
+    for view, roughness, light, (least, most) in cases(60):
+        found = shaded(single_sample(view=view, roughness=roughness, **WHITE), light, technique, dtype)
+        margin = 1e-4 * most + 1e-9
+        assert least - margin <= found <= most + margin, (view, roughness, light)
+        changed += min(abs(found - least), abs(found - most)) < margin
+        coat = shaded(single_sample(view=view, roughness=roughness, dielectric=1.0), light, technique, dtype)
+        cosine = min(np.sqrt(0.5 + 0.5 * view @ unit(corner)) for corner in light.polygon())
+        s, p = textbook.fresnel_amplitudes(min(cosine, np.sqrt(0.5 + 0.5 * view @ unit(light.center))), 1.5)
+        assert 0.04 * found - margin <= coat <= 0.5 * (s + p) * found + margin, (view, roughness, light)
+    assert changed > 10
+
+
+def test_lights_that_the_geometric_horizon_cuts_have_no_lower_bound():
+    """True lobes are half as bright as the bounds say where the horizon goes through the center of the light."""
+    darker = 0
+    for view, roughness, light, (least, _) in cases(60):
+        toward = unit(light.center)
+        geometric = unit(np.array([0.0, 0.0, 1.0]) - toward[2] * toward)
+        sample = single_sample(view=view, roughness=roughness, geometric_normal=geometric, **WHITE)
+        darker += shaded(sample, light, "ltsh4") < 0.8 * least
+    assert darker > 10
+
+
+def test_a_profiled_light_is_not_limited_by_its_area():
+    """A falloff leaves a millionth of the light."""
+    for view, roughness, light, _ in cases(10):
+        sample = single_sample(view=view, roughness=roughness, **WHITE)
+        fading = replace(light, smooth=1e6 * float(light.center @ light.center))
+        plain, faded = (shaded(sample, one, "ltsh4") for one in (light, fading))
+        assert faded <= 1e-4 * plain

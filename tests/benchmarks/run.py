@@ -270,6 +270,15 @@ def cycles(options):
     bake_cost.equal_error(options.quick)
 
 
+def shadows(options):
+    """Shadows beside Cycles: errors, error at equal time, rays, memory (see shadows.py)."""
+    import shadows as measured
+
+    settings = measured.QUICK if options.quick else measured.LARGE if options.large else measured.Settings()
+    heading("shadows: errors without noise against Cycles with shadows; times are processor time")
+    measured.report(settings)
+
+
 def animation(options):
     """Frames of an animation beside a single one."""
     from animation import report
@@ -305,6 +314,7 @@ SECTIONS = {
     "growth": growth,
     "processes": processes,
     "cycles": cycles,
+    "shadows": shadows,
     "animation": animation,
     "viewport": viewport,
 }
@@ -326,7 +336,7 @@ def main():
     print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
           f"load {os.getloadavg()[0]:.1f}, children run on {parallel.interpreter()}")  # fmt: skip
     for name in options.sections or SECTIONS:
-        if not (name in ("cycles", "animation", "viewport") and options.no_cycles):
+        if not (name in ("cycles", "shadows", "animation", "viewport") and options.no_cycles):
             SECTIONS[name](options)
     print(f"\n{time.perf_counter() - start:.0f} s")
 

@@ -1,0 +1,530 @@
+"""Shadows beside Cycles: errors, time at equal error, rays per second, memory; part of `make bench`, needs bpy.
+
+python tests/benchmarks/shadows.py [SCENE ...] [--size WxH] [--cycles-samples N] [--most-rays N] [--pictures FOLDER]
+
+Errors are noise-cancelled: against two halves of Cycles, and two runs of our own that share no random number, so that
+neither noise counts. Times are processor time, that of child processes and of starting them included.
+"""
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import measure  # noqa: E402
+
+from ltsh_addon import imaging, shading, visibility  # noqa: E402
+from ltsh_addon.blender.process import client  # noqa: E402
+from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
+from ltsh_addon.imaging.font import draw_text  # noqa: E402
+from ltsh_addon.pipeline import lighting  # noqa: E402
+from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
+from ltsh_addon.scene import PASSES  # noqa: E402
+from ltsh_addon.shading.parallel import CORES_VARIABLE, cores  # noqa: E402
+
+NAMES = ("contact", "soft", "highlight", "window", "leaves", "demo")
+# Of the error without the noise of Cycles and our own.
+MOST_BIAS = {"specular": 0.02, "diffuse": 0.005}
+# Of the error of Cycles in the same time.
+MOST_OF_CYCLES = 0.5
+RAYS_PER_SECOND, MOST_NUMPY, LEAST_SPEED_UP = 4e6, 2.0, 1.5
+# The most that a pair of a sample and a light may take: few, as by default, and many.
+FEW, DEFAULT, MANY = 16, PictureOptions.shadow_rays, 512
+# Moves everything, so that the rays of each sample are other ones.
+SHIFT = np.array([0.0625, 0.03125, 0.046875])
+CALIBRATION = (4, 32)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long the measurement takes, and how much can be believed of it."""
+
+    size: tuple[int, int] = (320, 180)
+    cycles_samples: int = 1024
+    most_rays: int = MANY
+    rays: int = DEFAULT
+    pictures: Path | None = None
+
+    @property
+    def resolution(self):
+        return f"{self.size[0]}x{self.size[1]}"
+
+
+QUICK = Settings(size=(128, 72), cycles_samples=128, most_rays=256)
+LARGE = Settings(size=(640, 360), cycles_samples=4096, most_rays=1024)
+
+
+# -- processes ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Of a process and all that it has started: seconds, processor seconds; MiB at the peak of the process itself, and
+    of the largest of all."""
+
+    seconds: float
+    processor: float
+    own_peak: float
+    peak: float
+
+
+def run(command, cores_used=None) -> Usage:
+    """Run to the end, on all cores or some. Raises CalledProcessError."""
+    environment = dict(os.environ)
+    pin = None
+    if cores_used is not None:
+        environment[CORES_VARIABLE] = str(cores_used)
+        chosen = sorted(os.sched_getaffinity(0))[:cores_used]
+
+        def pin():
+            os.sched_setaffinity(0, chosen)
+
+    start, own = time.perf_counter(), 0.0
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            list(map(str, command)), cwd=ROOT, env=environment, stdout=output, stderr=output, preexec_fn=pin
+        )
+        while True:
+            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
+            if pid:
+                break
+            own = max(own, measure.resident(process.pid, "VmHWM"))
+            time.sleep(0.01)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            output.seek(0)
+            raise subprocess.CalledProcessError(process.returncode, command, output.read()[-2000:])
+    seconds = time.perf_counter() - start
+    return Usage(seconds, usage.ru_utime + usage.ru_stime, own, usage.ru_maxrss / 1024.0)
+
+
+def shade(scene, output, settings, *more, **options) -> Usage:
+    """What `ltsh shade` takes."""
+    command = [sys.executable, "-m", "ltsh_addon", "shade", scene, "-o", output, "--techniques", "ltsh4", "--quiet"]
+    return run([*command, "--resolution", settings.resolution, *more], **options)
+
+
+def cycles(scene, output, settings, samples, denoised) -> Usage:
+    """What it takes Cycles to render direct light, as the comparison does, and to denoise it."""
+    command = [sys.executable, __file__, "--render", output, "--size", settings.resolution]
+    return run([*command, "--cycles-samples", samples, *(["--denoise"] if denoised else []), scene])
+
+
+def render(scene_path, output, size, samples, denoise):
+    """In a process of its own: what `cycles` measures."""
+    import bpy
+
+    from ltsh_addon.blender import render_settings
+
+    bpy.ops.wm.open_mainfile(filepath=str(scene_path))
+    scene = bpy.context.scene
+    camera = render_settings.choose_camera(scene, None)
+    layer = render_settings.choose_view_layer(scene, [])
+    render_settings.neutralize(scene, layer, camera, [])
+    render_settings.set_resolution(scene, *size)
+    render_settings.enable_passes(layer, ("combined",))
+    scene.cycles.samples, scene.cycles.seed = samples, 3
+    scene.cycles.use_denoising, scene.cycles.denoiser = denoise, "OPENIMAGEDENOISE"
+    with render_settings.pinned_pixel_filter(scene):
+        render_settings.render_exr(scene, output)
+
+
+def rendered(path) -> np.ndarray:
+    """The combined pass (H, W, 3) of a file that `render` wrote."""
+    channels = imaging.read_channels(path)
+    names = [next(name for name in channels if name.endswith(f"Combined.{letter}")) for letter in "RGB"]
+    return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Error:
+    """Relative, without noise: the estimate, and what it is above and below with 97.5 % each."""
+
+    estimate: float
+    least: float
+    limit: float
+
+    def __str__(self):
+        return f"{self.estimate:6.2%} (< {self.limit:.2%})"
+
+
+def unbiased(first, second, halves, mask) -> Error:
+    """Of two independent images (H, W, 3) against two independent halves (2, H, W, 3)."""
+    first, second, (a, b) = first[mask], second[mask], halves[:, mask].astype(np.float64)
+    products = 0.5 * ((first - a) * (second - b) + (first - b) * (second - a)).sum(axis=1)
+    norm = (a * b).sum()
+    squared, deviation = products.sum() / norm, products.std() * math.sqrt(len(products)) / norm
+    values = squared, squared - 1.96 * deviation, squared + 1.96 * deviation
+    return Error(*(math.sqrt(max(0.0, value)) for value in values))
+
+
+def own_noise(first, second, mask):
+    """Of one of two independent images."""
+    return np.linalg.norm((first - second)[mask]) / np.linalg.norm((first + second)[mask]) * math.sqrt(2.0)
+
+
+class Measured:
+    """A scene with its Cycles reference, and our own pictures of it in this process."""
+
+    def __init__(self, path, settings):
+        self.settings = settings
+        width, height = settings.size
+        options = client.ExtractOptions(
+            path, width=width, height=height, cycles_samples=settings.cycles_samples, shadows="on"
+        )
+        self.extraction = client.extract(options)
+        self.halves = self.extraction.reference
+        self.mask = self.extraction.film.coverage() > 0.0
+
+    @cached_property
+    def unshadowed(self):
+        return self._images({name: 1.0 for name in PASSES})
+
+    def pictures(self, rays, count=2):
+        """`count` times what was found with different rays."""
+        found = []
+        for number in range(count):
+            tracer, samples = self.tracer(number)
+            with tracer:
+                found.append(tracer.trace(samples, PASSES, rays, film=self.extraction.film))
+        return [self._images(shadows.shares) for shadows in found], found
+
+    def exact_specular(self, shadows):
+        """The specular image (H, W, 3) of shadows, by quadrature of the light."""
+        return self._image("specular", shadows.shares["specular"], self._by_quadrature)
+
+    def tracer(self, number):
+        """A tracer of the scene, moved by `number` times SHIFT, and the samples there."""
+        extraction, shift = self.extraction, number * SHIFT
+        occluders = extraction.occluders
+        matrices = occluders.matrices.copy()
+        matrices[:, :, 3] += shift
+        lights = [light.moved(shift) for light in extraction.lights]
+        tracer = lighting.ShadowTracer(replace(occluders, matrices=matrices), lights, extraction.origin)
+        return tracer, replace(extraction.samples, position=extraction.samples.position + shift)
+
+    @cached_property
+    def _by_technique(self):
+        return self._by_light("ltsh4", PASSES)
+
+    @cached_property
+    def _by_quadrature(self):
+        return self._by_light("reference", ("specular",))
+
+    def _by_light(self, technique, passes):
+        """Radiance (L, P, 3) of every light, all of it seen."""
+        lights = [lighting._in_group(light, str(number)) for number, light in enumerate(self.extraction.lights)]
+        return shading.shade(self.extraction.samples, lights, technique, passes=passes)
+
+    def _images(self, shares):
+        return {name: self._image(name, shares[name], self._by_technique) for name in PASSES}
+
+    def _image(self, name, shares, radiance):
+        values = (np.broadcast_to(shares, getattr(radiance, name).shape[:2])[..., None] * getattr(radiance, name)).sum(
+            0
+        )
+        return self.extraction.exposure * self.extraction.film.image(values).astype(np.float64)
+
+    def error(self, image, other=None, name=None) -> Error:
+        """Of images of a pass, or of their sum."""
+        halves = self.halves[name] if name else sum(self.halves.values())
+        return unbiased(image, image if other is None else other, halves, self.mask)
+
+
+def errors(scene: Measured):
+    """Print the errors by pass; the pictures with most rays, the mean of both."""
+    most, few, default = scene.settings.most_rays, FEW, scene.settings.rays
+    runs = {rays: scene.pictures(rays) for rays in sorted({few, default, most})}
+    counts = [f"bias at {most} rays (limit)", *(f"{rays}: bias, own noise (told)" for rays in (default, few))]
+    print(f"    {'':<9} {'unshadowed':>11}{counts[0]:>26}{counts[1]:>34}{counts[2]:>34}")
+    for name in PASSES:
+        cells = []
+        for rays in (default, few):
+            (first, second), shadows = runs[rays]
+            bias = scene.error(first[name], second[name], name).estimate
+            noise = own_noise(first[name], second[name], scene.mask)
+            cells.append(f"{bias:>16.2%} {noise:>8.2%} {shadows[0].noise[name]:>8.2%}")
+        first, second = (images[name] for images in runs[most][0])
+        bias = scene.error(first, second, name)
+        plain = scene.error(scene.unshadowed[name], name=name).estimate
+        verdict, most_bias = "", MOST_BIAS[name]
+        if bias.estimate > most_bias:
+            verdict = f"  MISSED{', or noise' if bias.least <= most_bias else ''}: target {most_bias:.1%};"
+        if name == "specular":
+            exact = scene.error(*map(scene.exact_specular, runs[most][1]), name)
+            verdict += f"  by quadrature instead of ltsh4: {exact}"
+        print(f"    {name:<9} {plain:>11.1%}{bias!s:>26}{cells[0]:>34}{cells[1]:>34}{verdict}")
+    every = [(name, images[name]) for pair, _ in runs.values() for images in pair for name in PASSES]
+    brighter = sum((image > scene.unshadowed[name] * (1.0 + 1e-5)).sum() for name, image in every)
+    finite = all(np.isfinite(image).all() for _, image in every)
+    print(f"    values above the unshadowed picture: {brighter}; all finite: {finite}")
+    first, second = runs[most][0]
+    return {name: 0.5 * (first[name] + second[name]) for name in PASSES}
+
+
+# -- equal time --------------------------------------------------------------------------------------------------------
+
+
+def equal_time(scene: Measured, path, folder):
+    """Print our error and those of Cycles in the same processor time; the pictures by label."""
+    settings, rays = scene.settings, ("--shadow-rays", scene.settings.rays)
+    ours = shade(path, folder / "ours", settings, *rays)
+    line, counts = {}, {}
+    for denoised in (False, True):
+        low, high = (cycles(path, folder / "c.exr", settings, count, denoised).processor for count in CALIBRATION)
+        slope = max((high - low) / (CALIBRATION[1] - CALIBRATION[0]), 1e-6)
+        line[denoised] = low - slope * CALIBRATION[0], slope
+    ours = [ours, shade(path, folder / "ours", settings, *rays)]
+    seconds = np.median([usage.processor for usage in ours])
+    images, found = {}, {}
+    layers = imaging.read_layers(folder / "ours" / "shade.exr")
+    images["LTSH"] = sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)
+    for denoised in (False, True):
+        fixed, slope = line[denoised]
+        counts[denoised] = max(1, round((seconds - fixed) / slope))
+        took = cycles(path, folder / "c.exr", settings, counts[denoised], denoised).processor
+        label = "Cycles and OIDN" if denoised else "Cycles"
+        images[label] = rendered(folder / "c.exr")
+        found[label] = scene.error(images[label]).estimate
+        print(f"    {label:<16}{found[label]:>8.2%}  {counts[denoised]:>5} samples, {took:.2f} s,"
+              f" of which {fixed:.2f} s whatever their number")  # fmt: skip
+    error = scene.error(images["LTSH"]).estimate
+    ratio = error / min(found.values())
+    verdict = "" if ratio <= MOST_OF_CYCLES else "  MISSED"
+    stages = json.loads((folder / "ours" / "timing.json").read_text())["seconds"]
+    parts = ", ".join(f"{name} {stages[name]:.2f} s" for name in ("start", "samples", "shadows", "total"))
+    print(f"    {'LTSH':<16}{error:>8.2%}  {settings.rays:>5} rays,    {seconds:.2f} s; wall: {parts}")
+    print(f"    LTSH against the better: {ratio:.2f} (target {MOST_OF_CYCLES}){verdict}")
+    many = shade(path, folder / "many", settings, "--shadow-rays", MANY).processor
+    layers = imaging.read_layers(folder / "many" / "shade.exr")
+    error = scene.error(sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)).estimate
+    print(
+        f"    {'LTSH':<16}{error:>8.2%}  {MANY:>5} rays,    {many:.2f} s, {many / seconds:.2f} times as long; "
+        f"against the better {error / min(found.values()):.2f}"
+    )
+    return images
+
+
+# -- cost --------------------------------------------------------------------------------------------------------------
+
+
+class TimedTracer:
+    """A tracer that counts its rays and the processor time that they take."""
+
+    def __init__(self, tracer):
+        self._tracer, self.rays, self.seconds = tracer, 0, 0.0
+
+    def __getattr__(self, name):
+        return getattr(self._tracer, name)
+
+    def transmittance(self, origins, *arguments, **options):
+        start = time.thread_time()
+        found = self._tracer.transmittance(origins, *arguments, **options)
+        self.seconds += time.thread_time() - start
+        self.rays += len(origins)
+        return found
+
+
+def terrain(triangles=300_000, seed=0):
+    """Hills of so many triangles, 10 m wide, and points (P, 3) a little above them."""
+    side = round(math.sqrt(triangles / 2)) + 1
+    x, y = np.meshgrid(np.linspace(-5.0, 5.0, side), np.linspace(-5.0, 5.0, side), indexing="ij")
+    z = 0.4 * np.sin(3.0 * x) * np.cos(2.6 * y) + 0.1 * np.sin(17.0 * x + 3.0 * y) * np.sin(13.0 * y)
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
+    faces = [corner, corner + side, corner + side + 1], [corner, corner + side + 1, corner + 1]
+    mesh = visibility.OccluderMesh(vertices, np.concatenate([np.stack(face, axis=-1) for face in faces]))
+    occluders = visibility.Occluders((mesh,), np.zeros(1, int), np.eye(3, 4)[None])
+    return occluders, vertices.reshape(side, side, 3)
+
+
+def ray_speed(blocks=6, size=1 << 16):
+    """Print how many rays one core traces in a second."""
+    generator = np.random.default_rng(0)
+    start = time.process_time()
+    occluders, grid = terrain()
+    with visibility.open_tracer(occluders, embree_libraries()) as tracer:
+        build, rates, blocked = time.process_time() - start, [], []
+        side = 1 << (size.bit_length() - 1) // 2
+        for number in range(blocks):
+            # A window of the grid, 1 ray for each of its points, to an area light: as a picture's rays are.
+            row, column = generator.integers(0, len(grid) - side // 2, 2)
+            points = grid[row : row + side // 2, column : column + side // 2].reshape(-1, 3)
+            points = np.repeat(points + (0.0, 0.0, 1e-3), size // len(points), axis=0)
+            target = np.array([4.0 * math.cos(number), 4.0 * math.sin(number), 2.0])
+            to_light = target + generator.uniform(-0.5, 0.5, points.shape) - points
+            length = np.linalg.norm(to_light, axis=1)
+            arguments = [v.astype(np.float32) for v in (points, to_light / length[:, None], length * 0.9999)]
+            start = time.process_time()
+            found = tracer.transmittance(*arguments)
+            rates.append(len(points) / (time.process_time() - start))
+            blocked.append(1.0 - found.mean())
+        rate = float(np.median(rates))
+        verdict = "" if rate >= RAYS_PER_SECOND else "  MISSED"
+        print(f"  {occluders.triangle_count} triangles: {rate / 1e6:.2f} million rays/s of one core, best "
+              f"{max(rates) / 1e6:.2f} (target {RAYS_PER_SECOND / 1e6:.0f}){verdict}; {np.mean(blocked):.0%} blocked; "
+              f"{build:.2f} s for the mesh and its tree; {tracer.description}")  # fmt: skip
+
+
+def ray_counts(scene: Measured):
+    """Print processor time by number of rays, and how much of it is not spent on them."""
+    rows = {}
+    for rays in (FEW, DEFAULT, MANY):
+        tracer, samples = scene.tracer(0)
+        start = time.process_time()
+        with tracer:
+            timed = TimedTracer(tracer._tracer)
+            samples = replace(samples, position=samples.position - scene.extraction.origin)
+            found = visibility.visible_shares(
+                samples, tracer._lights, timed, rays=rays, film=scene.extraction.film, workers=1
+            )
+        rows[rays] = time.process_time() - start, found.rays
+        numpy_share = rows[rays][0] / timed.seconds - 1.0 if timed.seconds else math.nan
+        verdict = "" if numpy_share <= MOST_NUMPY else "  MISSED"
+        print(f"  {rays:>4} rays: {rows[rays][0]:.2f} s, {rows[rays][1]:>9} traced, "
+              f"{rows[rays][0] / max(1, rows[rays][1]) * 1e9:.0f} ns each; rays {timed.seconds:.2f} s, "
+              f"numpy {numpy_share:.2f} times that (target {MOST_NUMPY:.0f}){verdict}")  # fmt: skip
+    (t0, n0), (t1, n1), (t2, n2) = rows.values()
+    print(f"  seconds per million rays more: {(t1 - t0) / (n1 - n0) * 1e6:.3f} from {FEW} to {DEFAULT}, "
+          f"{(t2 - t1) / (n2 - n1) * 1e6:.3f} from {DEFAULT} to {MANY} (linear: the same)")  # fmt: skip
+
+
+def memory_and_cores(path, folder, settings):
+    """Print peaks for two sizes with and without shadows, and the time with one core and two."""
+    width, height = settings.size
+    for factor in (1, 2):
+        larger = replace(settings, size=(factor * width, factor * height))
+        peaks = [shade(path, folder / "m", larger, "--shadows", way) for way in ("off", "on")]
+        print(f"  {larger.resolution}: peak of our process {peaks[1].own_peak:.0f} MiB, without shadows "
+              f"{peaks[0].own_peak:.0f} MiB; of the largest process {peaks[1].peak:.0f} MiB")  # fmt: skip
+    if cores() < 2:
+        print("  one core only: nothing to say about two")
+        return
+    times, totals = {1: [], 2: []}, {1: [], 2: []}
+    larger = replace(settings, size=(2 * width, 2 * height))
+    for _ in range(2):
+        for number in times:
+            usage = shade(path, folder / "m", larger, "--shadows", "on", cores_used=number)
+            stages = json.loads((folder / "m" / "timing.json").read_text())["seconds"]
+            times[number].append(stages["shadows"])
+            totals[number].append(usage.seconds)
+    gain, whole = (min(found[1]) / min(found[2]) for found in (times, totals))
+    verdict = "" if gain >= LEAST_SPEED_UP else "  MISSED"
+    print(f"  {larger.resolution}: shadows {min(times[1]):.2f} s on one core, {min(times[2]):.2f} s on two: {gain:.2f} "
+          f"times as fast (target {LEAST_SPEED_UP}){verdict}; the whole command {whole:.2f}; load "
+          f"{os.getloadavg()[0]:.1f}")  # fmt: skip
+
+
+# -- pictures ----------------------------------------------------------------------------------------------------------
+
+
+def error_sheet(name, scene, ours, folder):
+    """Write NAME_errors.png: signed errors of our picture with most rays, by pass."""
+    sheets = []
+    for part in PASSES:
+        mean = scene.halves[part].mean(axis=0)
+        tile = imaging.Tile(f"LTSH, {scene.settings.most_rays} rays", ours[part], np.where(
+            scene.mask[..., None], ours[part] - mean, 0.0), [])  # fmt: skip
+        sheets.append(imaging.comparison_sheet(f"{name}: {part}", ("Cycles", mean), [tile]))
+    imaging.write_png(folder / f"{name}_errors.png", np.concatenate(sheets))
+
+
+_GAP, _LABEL = 6, 24
+
+
+def side_by_side(rows, path):
+    """Write pictures (H, W, 3), lists of {label: linear image}, one below the other, each with one exposure."""
+    columns = []
+    for images in rows:
+        exposure = imaging.exposure_factor(images["Cycles, converged"])
+        tiles = [imaging.to_srgb8(exposure * image) for image in images.values()]
+        gap = np.full((len(tiles[0]), _GAP, 3), 255, np.uint8)
+        columns.append(np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1))
+    width = columns[0].shape[1]
+    head = np.full((_LABEL, width, 3), 255, np.uint8)
+    step = rows[0]["LTSH"].shape[1] + _GAP
+    for number, label in enumerate(rows[0]):
+        draw_text(head, number * step, 4, label, 14.0)
+    gap = np.full((_GAP, width, 3), 255, np.uint8)
+    imaging.write_png(path, np.concatenate([head, *(part for row in columns for part in (row, gap))][:-1]))
+
+
+def scene_file(name, folder) -> Path:
+    """The file of a scene, built by a process of its own."""
+    path = folder / f"{name}.blend"
+    if name == "demo":
+        client.build_demo(path)
+    else:
+        run([sys.executable, Path(__file__).with_name("shadow_scenes.py"), name, path])
+    return path
+
+
+def report(settings: Settings, names=NAMES):
+    """Print all of it."""
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
+        folder = Path(name)
+        for name in names:
+            start, path = time.perf_counter(), scene_file(name, folder)
+            scene = Measured(path, settings)
+            extraction = scene.extraction
+            noise = [f"{imaging.reference_noise(*scene.halves[part], scene.mask):.2%} {part}" for part in PASSES]
+            counts = f"{len(extraction.samples)} samples, {len(extraction.lights)} lights"
+            counts += f", {extraction.occluders.triangle_count} triangles"
+            print(f"  {name}, {settings.resolution}, {counts}; noise of"
+                  f" Cycles, {settings.cycles_samples} samples: {', '.join(noise)}")  # fmt: skip
+            ours = errors(scene)
+            images = equal_time(scene, path, folder)
+            images["Cycles, converged"] = sum(scene.halves.values()).mean(axis=0)
+            rows.append(images)
+            if settings.pictures:
+                error_sheet(name, scene, ours, settings.pictures)
+            print(f"    {time.perf_counter() - start:.0f} s", flush=True)
+        if settings.pictures:
+            side_by_side(rows, settings.pictures / "shadows.png")
+        print(f"  cost, scene {name}")
+        ray_counts(scene)
+        memory_and_cores(path, folder, settings)
+    ray_speed()
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"default: {', '.join(NAMES)}")
+    parser.add_argument("--size", default="320x180")
+    parser.add_argument("--cycles-samples", type=int, default=Settings.cycles_samples)
+    parser.add_argument("--rays", type=int, default=DEFAULT, help="of the comparison at equal time")
+    parser.add_argument("--most-rays", type=int, default=Settings.most_rays, help="where our noise is to vanish")
+    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write signed errors, and all side by side")
+    parser.add_argument("--render", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--denoise", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    size = tuple(map(int, options.size.split("x")))
+    if options.render:
+        render(options.scenes[0], options.render, size, options.cycles_samples, options.denoise)
+        return
+    if unknown := set(options.scenes) - set(NAMES):
+        parser.error(f"unknown scenes {', '.join(sorted(unknown))}; expected some of {', '.join(NAMES)}")
+    if options.pictures:
+        options.pictures.mkdir(parents=True, exist_ok=True)
+    settings = Settings(size, options.cycles_samples, options.most_rays, options.rays, options.pictures)
+    report(settings, options.scenes or NAMES)
+
+
+if __name__ == "__main__":
+    main()

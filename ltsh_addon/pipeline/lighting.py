@@ -87,7 +87,14 @@ class ShadowTracer:
         """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        settings = {"passes": passes, "rays": rays, "film": film, "workers": workers, "progress": progress}
+        settings = {
+            "passes": passes,
+            "rays": rays,
+            "film": film,
+            "is_baked": film is None,
+            "workers": workers,
+            "progress": progress,
+        }
         found = visibility.visible_shares(samples, self._lights, self._tracer, **settings)
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}

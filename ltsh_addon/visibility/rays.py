@@ -19,7 +19,7 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
+from .occluders import ALL_RAYS, ChosenBy, OccluderMesh, Occluders, Transparency
 
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
@@ -448,6 +448,10 @@ class Tracer:
         """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
         return self.occluders.mask_of(light)
 
+    def chosen_by(self, light: str) -> ChosenBy:
+        """Which rays to the light of that name there are."""
+        return self.occluders.chosen_by(light)
+
     def starts(self, samples: SurfaceSamples) -> Starts:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
 
@@ -565,6 +569,14 @@ class Starts:
         found += self.position[index].T[:, None]
         if lift is not None:
             found[:, :, part] += lift
+        return found
+
+    def at_surface(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, R) of rays along unit `directions` (3, R) that start at the samples `index` (R,) themselves, as
+        those that Cycles sends on from a surface."""
+        normal = self.geometric_normal[index].T
+        found = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
+        found += self.position[index].T
         return found
 
     def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:

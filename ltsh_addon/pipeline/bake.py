@@ -96,7 +96,7 @@ def _shadow_tracer(options, manifest, folder):
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]))
+    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]), is_baked=True)
 
 
 def lights_of(manifest) -> tuple[AreaLight, ...]:

@@ -57,8 +57,11 @@ def rays_of_point(rays: int, points: int) -> int:
 class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+    def __init__(
+        self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray, is_baked: bool = False
+    ):
         self.warnings: list[str] = []
+        self._is_baked = is_baked
         self._occluders, self._origin = occluders, origin
         self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
 
@@ -91,7 +94,7 @@ class ShadowTracer:
             "passes": passes,
             "rays": rays,
             "film": film,
-            "is_baked": film is None,
+            "is_baked": self._is_baked,
             "workers": workers,
             "progress": progress,
         }

@@ -375,6 +375,11 @@ class Choices:
 
     def __init__(self, samples: SurfaceSamples, lights: Sequence[AreaLight], is_baked: bool):
         self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
+        self._first = None
+
+    def _prepare(self):
+        """What is needed once something is asked for, which in most scenes is never."""
+        samples = self._samples
         moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
         # The samples of a hit follow one another.
         self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
@@ -386,6 +391,8 @@ class Choices:
     def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
         """Share (R,) of the light of light `number`, which has the `solid_angle` (R,), that a pass gets because the
         surface chose the unit directions (3, R), from the samples `index` (R,)."""
+        if self._first is None:
+            self._prepare()
         by_light = self._chance(number, index) / np.maximum(solid_angle, 1e-12)
         by_surface = self._density(name, index, directions.T.astype(np.float64))
         return (by_surface**2 / np.maximum(by_surface**2 + by_light**2, 1e-30)).astype(np.float32)

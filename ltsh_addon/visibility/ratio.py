@@ -410,9 +410,12 @@ class Pairs:
     def _chosen_by_surface(self, view, rays, flat, origins, arriving):
         """What those of the `rays` at the places `flat` (R,) meet that the surface chooses: of those for which this is
         not what rays from `origins` (3, R) have met, which the light chooses."""
+        starts = self.surface.starts
+        if self.chosen_by.light and not starts.terminator[view.index].any():
+            return None
         directions, distance = (_taken(rows, flat) for rows in rays)
         column = flat % arriving.shape[1]
-        index, starts = view.index[column], self.surface.starts
+        index = view.index[column]
         start = starts.at_surface(index, directions)
         # The light chooses directions above the smooth horizon, the surface those above that of the mesh.
         smooth, flat_facing = (

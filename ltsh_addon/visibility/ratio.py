@@ -12,7 +12,7 @@ Nothing hangs on where a sample stands in a picture or a block but which samples
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -101,8 +101,8 @@ def visible_shares(
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
     emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
-    typical = typical_radiance(samples, emitters, passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical, is_baked)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), is_baked)
+    task = replace(task, typical=typical_radiance(samples, task, tracer))
     shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
@@ -155,17 +155,12 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, emitters: Sequence[Emitter], passes: Sequence[str]) -> dict[str, float]:
-    """By pass, the root mean square of what samples reflect of all lights without shadows, from some of them."""
-    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(emitters), 1)), 1)
-    surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
-    radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
-    for emitter in emitters:
-        pairs = Pairs(surface, emitter)
-        pairs.weigh()
-        for name in passes:
-            radiance[name][pairs.index] += pairs.unshadowed(name)
-    return {name: float(np.sqrt(np.square(values).mean())) if len(values) else 0.0 for name, values in radiance.items()}
+def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect, from some of them and the first rays alone."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
+    some = samples.take(slice(None, None, -(-len(samples) // most) or 1))
+    found = replace(task, rays=PROBES).shares(some, None, tracer)
+    return {name: float(np.sqrt(np.square(found.radiance[name]).mean())) if len(some) else 0.0 for name in task.passes}
 
 
 @dataclass(frozen=True)
@@ -300,10 +295,6 @@ class Pairs:
                     self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
 
-    def weigh(self) -> None:
-        """Weights alone, without a ray."""
-        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
-
     def _plan(self, rays, typical):
         """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
@@ -358,7 +349,7 @@ class Pairs:
         masks = np.broadcast_to(self.mask, distances.shape)
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
-    def _add_rays(self, members, first, last, split, trace=True):
+    def _add_rays(self, members, first, last, split):
         """Rays `first` to `last` for the pairs `members` (M,); `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
@@ -372,28 +363,27 @@ class Pairs:
                     rays = Rays(
                         number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
                     )
-                    self._add_block(block, view, rays, trace)
+                    self._add_block(block, view, rays)
         self.count[members] = last
 
-    def _add_block(self, block, view, rays, trace):
+    def _add_block(self, block, view, rays):
         """Some rays for the pairs `block` (B,) of a view."""
         directions, distance, weights = view.rays(rays)
         arriving, others = np.zeros(distance.shape, np.float32), None
-        if trace:
-            met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
-            flat = np.flatnonzero(met)
-            aimed = self.surface.starts.aimed(view.index, directions, distance)
-            origins, *rest = (_taken(rows, flat) for rows in aimed)
-            arriving.ravel()[flat] = self._transmittance(origins, *rest) if self.chosen_by.light else _ONE
-            if self.chosen_by.surface:
-                others = self._chosen_by_surface(view, (directions, distance), flat, origins, arriving)
-            least, most = arriving, arriving
-            if others is not None:
-                least, most = arriving.copy(), arriving.copy()
-                least.ravel()[others.place] = np.minimum(others.arriving, arriving.ravel()[others.place])
-                most.ravel()[others.place] = np.maximum(others.arriving, arriving.ravel()[others.place])
-            self.visible[block] |= most.sum(axis=0) > 0.0
-            self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
+        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+        flat = np.flatnonzero(met)
+        aimed = self.surface.starts.aimed(view.index, directions, distance)
+        origins, *rest = (_taken(rows, flat) for rows in aimed)
+        arriving.ravel()[flat] = self._transmittance(origins, *rest) if self.chosen_by.light else _ONE
+        if self.chosen_by.surface:
+            others = self._chosen_by_surface(view, (directions, distance), flat, origins, arriving)
+        least, most = arriving, arriving
+        if others is not None:
+            least, most = arriving.copy(), arriving.copy()
+            least.ravel()[others.place] = np.minimum(others.arriving, arriving.ravel()[others.place])
+            most.ravel()[others.place] = np.maximum(others.arriving, arriving.ravel()[others.place])
+        self.visible[block] |= most.sum(axis=0) > 0.0
+        self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
         for name, weight in weights.items():
             number, passing = PASSES.index(name), arriving
             if others is not None:

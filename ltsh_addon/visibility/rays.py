@@ -436,9 +436,10 @@ class Tracer:
             rays = origins[index], directions[index], near[index], distances[index], masks[index]
             hits = self._caster.closest(True, *rays)
             index = index[hits.ray]
-            for number in np.unique(hits.instance):
-                here = hits.instance == number
-                clear = self.occluders.meshes[self.occluders.mesh[number]].transparency
+            mesh = self.occluders.mesh[hits.instance]
+            for number in np.unique(mesh):
+                here = mesh == number
+                clear = self.occluders.meshes[number].transparency
                 shares[index[here]] *= clear.shares(hits.triangle[here], hits.u[here], hits.v[here])
             near[index] = hits.distance * STEP
             index = index[shares[index] > 0.0]

@@ -21,7 +21,7 @@ BLENDER_MODULES = frozenset(
 # A room imports only from itself and from rooms to its left. Rooms are files and folders of the package; what no line
 # names belongs to the room of its folder.
 ROOMS = """
-    interruption scene reading files shading visibility cycles imaging
+    interruption scene reading files shading cycles visibility imaging
     blender.process blender.evaluated blender.render_settings blender.saving blender.materials blender.lights
     blender.extract blender.demo_meshes blender.demo blender.viewport
     pipeline cli panel_job

@@ -18,7 +18,7 @@ import numpy as np
 from .. import imaging
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
-from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Progress, SurfaceSamples, listed
+from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Film, Progress, SurfaceSamples, listed
 from ..shading.parallel import cores
 from ..visibility import Occluders
 from . import lighting, picture
@@ -96,7 +96,7 @@ def _shadow_tracer(options, manifest, folder):
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]))
+    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]), is_baked=True)
 
 
 def lights_of(manifest) -> tuple[AreaLight, ...]:
@@ -285,7 +285,9 @@ class ObjectBaker:
             passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
             rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
             workers = 1 if self._threads() > 1 else None
-            shares = self.tracer.trace(samples, sorted(passes), rays, workers=workers).shares
+            rows = min(block_rows(options), options.size[1] - first)
+            film = Film(options.size[0], rows, texels.index[texel])
+            shares = self.tracer.trace(samples, sorted(passes), rays, film=film, workers=workers).shares
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)

@@ -57,8 +57,11 @@ def rays_of_point(rays: int, points: int) -> int:
 class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+    def __init__(
+        self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray, is_baked: bool = False
+    ):
         self.warnings: list[str] = []
+        self._is_baked = is_baked
         self._occluders, self._origin = occluders, origin
         self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
 
@@ -87,7 +90,14 @@ class ShadowTracer:
         """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        settings = {"passes": passes, "rays": rays, "film": film, "workers": workers, "progress": progress}
+        settings = {
+            "passes": passes,
+            "rays": rays,
+            "film": film,
+            "is_baked": self._is_baked,
+            "workers": workers,
+            "progress": progress,
+        }
         found = visibility.visible_shares(samples, self._lights, self._tracer, **settings)
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}

@@ -10,10 +10,14 @@ All is in single precision, arrays are (S, Q): S directions from each of Q point
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..scene import AreaLight
-from ..shading import light_cone
+from ..cycles.horizons import SMALLEST_ALPHA, lobe_chances
+from ..cycles.light_tree import light_chances
+from ..scene import AreaLight, SurfaceSamples
+from ..shading import brdf, light_cone
 from ..shading.lookup_table import WARP_REGULARIZATION
 from ..shading.polygon import convex_pieces
 
@@ -359,3 +363,75 @@ def dot(a, b):
 
 def _cross(a, b):
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+class Choices:
+    """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
+
+    Both see the light past different things. Rays that the light chose start above a curved surface, and nothing
+    blocks them where the light casts no shadow; rays that the surface chose start at the surface, and are always
+    blocked.
+    """
+
+    def __init__(self, samples: SurfaceSamples, lights: Sequence[AreaLight], is_baked: bool):
+        self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
+        self._first = None
+
+    def _prepare(self):
+        """What is needed once something is asked for, which in most scenes is never."""
+        samples = self._samples
+        moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
+        # The samples of a hit follow one another.
+        self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
+        self._count = np.bincount(self._hit)
+        self._first = np.cumsum(self._count) - self._count
+        self._lobes = lobe_chances(samples, self._hit, is_baked=False)
+        self._chances = np.full((len(self._lights), len(samples)), np.nan, np.float32)
+
+    def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
+        """Share (R,) of the light of light `number`, which has the `solid_angle` (R,), that a pass gets because the
+        surface chose the unit directions (3, R), from the samples `index` (R,)."""
+        if self._first is None:
+            self._prepare()
+        by_light = self._chance(number, index) / np.maximum(solid_angle, 1e-12)
+        by_surface = self._density(name, index, directions.T.astype(np.float64))
+        return (by_surface**2 / np.maximum(by_surface**2 + by_light**2, 1e-30)).astype(np.float32)
+
+    def _chance(self, number, index):
+        unknown = np.unique(index[np.isnan(self._chances[number, index])])
+        if len(unknown):
+            position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
+            self._chances[:, unknown] = light_chances(position, normal, self._lights)
+        return self._chances[number, index]
+
+    def _density(self, name, index, directions):
+        """Probability (R,) per sr that the lobes of a hit choose the directions (R, 3)."""
+        hit, density = self._hit[index], np.zeros(len(index))
+        for number in range(self._count[hit].max(initial=0)):
+            here = np.flatnonzero(self._count[hit] > number)
+            own = self._first[hit[here]] + number
+            specular, diffuse = self._lobes[:, own]
+            # Bakes of a pass choose by its lobes alone.
+            if self._is_baked:
+                whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
+                specular, diffuse = (
+                    specular / whole if name == "specular" else 0.0 * specular,
+                    diffuse / whole if name == "diffuse" else 0.0 * diffuse,
+                )
+            density[here] += specular * self._lobe_density(own, directions[here])
+            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[own])
+            density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
+        return density
+
+    def _sum_of_hit(self, name, hit):
+        return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
+
+    def _lobe_density(self, own, directions):
+        samples = self._samples
+        normal, view = samples.normal[own], samples.view[own]
+        half = directions + view
+        vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
+        horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
+        alpha2 = np.square(np.maximum(samples.roughness[own] ** 2, SMALLEST_ALPHA))
+        cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
+        return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

@@ -126,12 +126,22 @@ class OccluderMesh:
 
 
 @dataclass(frozen=True)
+class ChosenBy:
+    """Which shadow rays Cycles sends to a light: those that the light chooses, without Cast Shadow none, and those that
+    the surface chooses, without multiple importance sampling none."""
+
+    light: bool = True
+    surface: bool = True
+
+
+@dataclass(frozen=True)
 class Occluders:
     """`meshes` and I instances: `mesh` (I,) is the number of each one's mesh, `matrices` (I, 3, 4) take it to world
     space. An instance blocks rays that have a bit of its `masks` (I,) uint32; left out: all.
 
     `terminators` (I,) are as `shadow_terminator_geometry_offset` of Cycles; left out: its default.
-    A ray through more than `transparent_surfaces` ends. `light_masks` are the masks of rays to lights, by their names.
+    A ray through more than `transparent_surfaces` ends. `light_masks` are the masks of rays to lights, by their names,
+    and `lone_choices` says which lights are met by rays that the "light" or the "surface" chooses alone.
     """
 
     meshes: tuple[OccluderMesh, ...]
@@ -141,6 +151,7 @@ class Occluders:
     terminators: np.ndarray | None = None
     transparent_surfaces: int = TRANSPARENT_SURFACES
     light_masks: dict[str, int] = field(default_factory=dict)
+    lone_choices: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self):
         mesh = np.asarray(self.mesh, np.int64)
@@ -171,6 +182,11 @@ class Occluders:
         """Mask of the rays to the light of that name; 0: nothing is in its way."""
         return self.light_masks.get(light, 1)
 
+    def chosen_by(self, light: str) -> ChosenBy:
+        """Which rays to the light of that name there are."""
+        alone = self.lone_choices.get(light)
+        return ChosenBy(light=alone != "surface", surface=alone != "light")
+
     @property
     def triangle_count(self) -> int:
         """Number of triangles, those of each instance counted."""
@@ -198,7 +214,10 @@ class Occluders:
                 arrays[f"uv{number}"] = clear.uv
             about.append(record)
         arrays |= {f"image{number}": image for number, image in enumerate(images.values())}
-        head = {"meshes": about, **{name: getattr(self, name) for name in ("transparent_surfaces", "light_masks")}}
+        head = {
+            "meshes": about,
+            **{name: getattr(self, name) for name in ("transparent_surfaces", "light_masks", "lone_choices")},
+        }
         arrays["about"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -222,5 +241,5 @@ class Occluders:
             more = (arrays.get(f"{name}{number}") for name in ("normals", "thickness"))
             meshes.append(OccluderMesh(*shape, clear, *more))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
-        own = {name: head[name] for name in ("transparent_surfaces", "light_masks")}
+        own = {name: head[name] for name in ("transparent_surfaces", "light_masks", "lone_choices")}
         return cls(tuple(meshes), **instances, **own)

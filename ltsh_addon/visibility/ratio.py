@@ -12,7 +12,7 @@ Nothing hangs on where a sample stands in a picture or a block but which samples
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from ..shading import light_cone
 from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.light_polygons import has_lobe
 from . import crew
-from .directions import Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .directions import Choices, Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -87,20 +87,22 @@ def visible_shares(
     passes: Sequence[str] = PASSES,
     rays: int = 256,
     film: Film | None = None,
+    is_baked: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
-    `film` says which samples are neighbors; left out: those before and after. `tracer` is as `visibility.open_tracer`
+    `film` says which samples are neighbors; left out: those before and after. Where the passes are baked, each by
+    itself, Cycles chooses rays by its lobes alone. `tracer` is as `visibility.open_tracer`
     returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
     process. `progress` may return False to stop: Cancelled is raised.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
     emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
-    typical = typical_radiance(samples, emitters, passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), is_baked)
+    task = replace(task, typical=typical_radiance(samples, task, tracer))
     shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
@@ -126,6 +128,7 @@ class ShadowTask:
     passes: tuple[str, ...]
     rays: int
     typical: dict[str, float]
+    is_baked: bool
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
@@ -134,8 +137,10 @@ class ShadowTask:
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
+        choices = Choices(samples, [emitter.light for emitter in self.emitters], self.is_baked)
         for number, emitter in enumerate(self.emitters):
             pairs = Pairs(surface, emitter)
+            pairs.number, pairs.by_surface = number, choices.by_surface
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
@@ -150,17 +155,12 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, emitters: Sequence[Emitter], passes: Sequence[str]) -> dict[str, float]:
-    """By pass, the root mean square of what samples reflect of all lights without shadows, from some of them."""
-    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(emitters), 1)), 1)
-    surface = Surface(samples.take(slice(None, None, -(-len(samples) // most) or 1)), passes, None)
-    radiance = {name: np.zeros(len(surface.seeds)) for name in passes}
-    for emitter in emitters:
-        pairs = Pairs(surface, emitter)
-        pairs.weigh()
-        for name in passes:
-            radiance[name][pairs.index] += pairs.unshadowed(name)
-    return {name: float(np.sqrt(np.square(values).mean())) if len(values) else 0.0 for name, values in radiance.items()}
+def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> dict[str, float]:
+    """By pass, the root mean square of what samples reflect, from some of them and the first rays alone."""
+    most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
+    some = samples.take(slice(None, None, -(-len(samples) // most) or 1))
+    found = replace(task, rays=PROBES).shares(some, None, tracer)
+    return {name: float(np.sqrt(np.square(found.radiance[name]).mean())) if len(some) else 0.0 for name in task.passes}
 
 
 @dataclass(frozen=True)
@@ -233,6 +233,18 @@ def _different(first, second):
     return (first,) if first is second else (first, second)
 
 
+@dataclass(frozen=True)
+class _Others:
+    """Rays (R,) that meet other things where the surface chooses them than where the light does."""
+
+    place: np.ndarray  # in the flat (S, Q) of all rays
+    arriving: np.ndarray  # of the light, where the surface chooses them
+    index: np.ndarray  # of the sample
+    directions: np.ndarray  # (3, R)
+    solid_angle: np.ndarray  # of the light
+    is_alone: np.ndarray  # the light does not choose them
+
+
 class Pairs:
     """The samples that a light may reach, and what their rays have found so far."""
 
@@ -240,6 +252,8 @@ class Pairs:
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
+        self.chosen_by = surface.tracer and surface.tracer.chosen_by(light.name)
+        self.number, self.by_surface = None, None
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
         if light.is_focused:
@@ -280,10 +294,6 @@ class Pairs:
                     members = np.flatnonzero(chosen & (number == last) & (choice == split))
                     self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
-
-    def weigh(self) -> None:
-        """Weights alone, without a ray."""
-        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, trace=False)
 
     def _plan(self, rays, typical):
         """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
@@ -328,7 +338,7 @@ class Pairs:
             distance = np.sqrt(dot(toward, toward))
             toward /= np.maximum(distance, _TINY)
             aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
-            found = self._transmittance(*(rows[..., 0, :] for rows in aimed))
+            found = self._transmittance(*(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             # Next to no light: it counts in no sum of samples.
             self.weights[number][:, unmet] = _TINY
             self.arriving[number][:, unmet] = found * _TINY
@@ -339,7 +349,7 @@ class Pairs:
         masks = np.broadcast_to(self.mask, distances.shape)
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
-    def _add_rays(self, members, first, last, split, trace=True):
+    def _add_rays(self, members, first, last, split):
         """Rays `first` to `last` for the pairs `members` (M,); `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
@@ -353,28 +363,64 @@ class Pairs:
                     rays = Rays(
                         number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
                     )
-                    self._add_block(block, view, rays, trace)
+                    self._add_block(block, view, rays)
         self.count[members] = last
 
-    def _add_block(self, block, view, rays, trace):
+    def _add_block(self, block, view, rays):
         """Some rays for the pairs `block` (B,) of a view."""
         directions, distance, weights = view.rays(rays)
-        arriving = np.zeros(distance.shape, np.float32)
-        if trace:
-            met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
-            flat = np.flatnonzero(met)
-            aimed = self.surface.starts.aimed(view.index, directions, distance)
-            arriving.ravel()[flat] = self._transmittance(*(_taken(rows, flat) for rows in aimed))
-            sums = arriving.sum(axis=0)
-            self.visible[block] |= sums > 0.0
-            self.blocked[block] |= sums < met.sum(axis=0)
+        arriving, others = np.zeros(distance.shape, np.float32), None
+        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+        flat = np.flatnonzero(met)
+        aimed = self.surface.starts.aimed(view.index, directions, distance)
+        origins, *rest = (_taken(rows, flat) for rows in aimed)
+        arriving.ravel()[flat] = self._transmittance(origins, *rest) if self.chosen_by.light else _ONE
+        if self.chosen_by.surface:
+            others = self._chosen_by_surface(view, (directions, distance), flat, origins, arriving)
+        least, most = arriving, arriving
+        if others is not None:
+            least, most = arriving.copy(), arriving.copy()
+            least.ravel()[others.place] = np.minimum(others.arriving, arriving.ravel()[others.place])
+            most.ravel()[others.place] = np.maximum(others.arriving, arriving.ravel()[others.place])
+        self.visible[block] |= most.sum(axis=0) > 0.0
+        self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
         for name, weight in weights.items():
-            number = PASSES.index(name)
+            number, passing = PASSES.index(name), arriving
+            if others is not None:
+                passing = arriving.copy()
+                share = self.by_surface(name, self.number, others.index, others.directions, others.solid_angle)
+                share[others.is_alone] = 1.0
+                passing.ravel()[others.place] += share * (others.arriving - arriving.ravel()[others.place])
             for sums in (self.weights[number], self.arriving[number]):
                 halves = sums[:, block]
                 rays.add_to(halves, weight)
                 sums[:, block] = halves
-                weight *= arriving
+                weight *= passing
+
+    def _chosen_by_surface(self, view, rays, flat, origins, arriving):
+        """What those of the `rays` at the places `flat` (R,) meet that the surface chooses: of those for which this is
+        not what rays from `origins` (3, R) have met, which the light chooses."""
+        directions, distance = (_taken(rows, flat) for rows in rays)
+        column = flat % arriving.shape[1]
+        index, starts = view.index[column], self.surface.starts
+        start = starts.at_surface(index, directions)
+        # The light chooses directions above the smooth horizon, the surface those above that of the mesh.
+        smooth, flat_facing = (
+            dot(np.take(normal, index, axis=0).T, directions)
+            for normal in (starts.smooth_normal, starts.geometric_normal)
+        )
+        is_alone = (smooth <= 0.0) & (flat_facing > 0.0)
+        chosen = (smooth <= 0.0) | (flat_facing > 0.0)
+        if self.chosen_by.light:
+            chosen &= (start != origins).any(axis=0)
+        chosen = np.flatnonzero(chosen)
+        found = self._transmittance(start[:, chosen], directions[:, chosen], distance[chosen])
+        differ = np.flatnonzero(found != arriving.ravel()[flat[chosen]])
+        if len(differ) == 0:
+            return None
+        chosen, found = chosen[differ], found[differ]
+        angle = view.quads.solid_angle[column[chosen]]
+        return _Others(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
         """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""

@@ -19,7 +19,7 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, OccluderMesh, Occluders, Transparency
+from .occluders import ALL_RAYS, ChosenBy, OccluderMesh, Occluders, Transparency
 
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
@@ -436,9 +436,10 @@ class Tracer:
             rays = origins[index], directions[index], near[index], distances[index], masks[index]
             hits = self._caster.closest(True, *rays)
             index = index[hits.ray]
-            for number in np.unique(hits.instance):
-                here = hits.instance == number
-                clear = self.occluders.meshes[self.occluders.mesh[number]].transparency
+            mesh = self.occluders.mesh[hits.instance]
+            for number in np.unique(mesh):
+                here = mesh == number
+                clear = self.occluders.meshes[number].transparency
                 shares[index[here]] *= clear.shares(hits.triangle[here], hits.u[here], hits.v[here])
             near[index] = hits.distance * STEP
             index = index[shares[index] > 0.0]
@@ -447,6 +448,10 @@ class Tracer:
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
         return self.occluders.mask_of(light)
+
+    def chosen_by(self, light: str) -> ChosenBy:
+        """Which rays to the light of that name there are."""
+        return self.occluders.chosen_by(light)
 
     def starts(self, samples: SurfaceSamples) -> Starts:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
@@ -565,6 +570,14 @@ class Starts:
         found += self.position[index].T[:, None]
         if lift is not None:
             found[:, :, part] += lift
+        return found
+
+    def at_surface(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, R) of rays along unit `directions` (3, R) that start at the samples `index` (R,) themselves, as
+        those that Cycles sends on from a surface."""
+        normal = self.geometric_normal[index].T
+        found = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
+        found += self.position[index].T
         return found
 
     def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:

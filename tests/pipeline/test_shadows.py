@@ -59,6 +59,7 @@ def test_light_is_what_the_samples_see_of_it(capsys, monkeypatch, room, out):
     assert (found <= whole).all() and ((found > 0.1 * whole) & (found < 0.9 * whole)).any()
 
 
+LIGHTS = fake_scene.lights()
 CHANGES = "--light", "Light 1", "--power", "x2", "--color", "1,.5,.25", "--light", "Light 0", "--power", "x0"
 
 
@@ -71,20 +72,34 @@ def changed(lights):
     )
 
 
-@pytest.mark.parametrize("some_wall", [None, wall(0.7, left=0.0)], ids=["lobes alone", "shadows"])
-def test_a_picture_lit_anew_is_that_of_other_lights(capsys, monkeypatch, room, out, some_wall):
-    shade(capsys, monkeypatch, room, out, "--keep-visibility", wall=some_wall)
-    rendered = shade(capsys, monkeypatch, room, out / "other", wall=some_wall, change=changed)
+def test_a_picture_lit_anew_is_that_of_other_lights(capsys, monkeypatch, room, out):
+    shade(capsys, monkeypatch, room, out, "--keep-visibility")
+    rendered = shade(capsys, monkeypatch, room, out / "other", change=changed)
     monkeypatch.undo()
     assert run(capsys, "relight", out, *CHANGES, "--quiet")[0] == 0
     found = read_channels(out / "relit" / "shade.exr")
     assert set(found) == set(rendered)
     for name, values in rendered.items():
-        # The dark light has no share of its own to be filtered or traced; all else is the same computation.
-        if "visibility" not in name:
-            np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
     report = json.loads((out / "relit" / "report.json").read_text(encoding="utf-8"))
     assert report["relit"][0] == {"light": "Light 1", "power": 2.0, "color": [1.0, 0.5, 0.25]}
+
+
+def test_a_picture_lit_anew_keeps_its_shadows(capsys, monkeypatch, room, out):
+    """Radiance is linear in that of each light, and each fake light is a group of its own."""
+    first = shade(capsys, monkeypatch, room, out, "--keep-visibility", wall=wall(0.7, left=0.0))
+    assert run(capsys, "relight", out, *CHANGES, "--quiet")[0] == 0
+    found = read_channels(out / "relit" / "shade.exr")
+    assert set(found) == set(first)
+    factors = [after.radiance / before.radiance for before, after in zip(LIGHTS, changed(LIGHTS), strict=True)]
+    for name, values in found.items():
+        layer, _, channel = name.rpartition(".")
+        if layer not in ("ltsh4.specular", "ltsh4.diffuse", "reference.specular"):
+            continue
+        groups = (first[f"{layer}@{group}.{channel}"] for group in ("Key", "Fill.001", "ungrouped"))
+        expected = sum(factor["RGB".index(channel)] * part for factor, part in zip(factors, groups, strict=True))
+        np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-9, err_msg=name)
+    assert all(np.array_equal(found[name], first[name]) for name in parts(first, "visibility."))
 
 
 def test_cycles_picture_of_the_former_lights_is_left_out_with_a_word(capsys, monkeypatch, room, out):

@@ -10,6 +10,7 @@ from ltsh_addon import shading
 from ltsh_addon.scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import ratio
 from ltsh_addon.visibility.directions import Emitter
+from ltsh_addon.visibility.occluders import ChosenBy
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light) for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS)
@@ -26,6 +27,9 @@ class Tracer:
 
     def mask_of(self, name):
         return 0xFFFFFFFF
+
+    def chosen_by(self, name):
+        return ChosenBy(surface=False)
 
     def starts(self, samples):
         self.position = samples.position

@@ -80,12 +80,6 @@ class _Collector:
                 f"shadows: all objects block lights {listed(map(repr, self._blockers.unnumbered), NAMED)}: more than "
                 f"{MOST_BLOCKER_SETS} blocker collections are not told apart"
             )
-        free = [name for name, mask in self._blockers.light_masks.items() if mask == 0]
-        if free:
-            warn(
-                f"shadows: lights {listed(map(repr, free), NAMED)} cast none; Cycles still blocks some of their light "
-                "in sharp reflections, unless their multiple importance sampling is off"
-            )
         return self._joined()
 
     def _joined(self) -> Occluders:
@@ -102,6 +96,7 @@ class _Collector:
             terminators,
             int(cycles_setting(self._depsgraph.scene, "transparent_max_bounces")),
             {name: mask for name, mask in self._blockers.light_masks.items() if mask != OTHER_LIGHTS},
+            self._blockers.lone_choices,
         )
 
     def _note(self, kind: str, block) -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import bpy
 
 from ..materials.aovs import RECEIVER_PROPERTY
+from ..render_settings import cycles_setting
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class Blockers:
 
     def __init__(self, emitters: list):
         """`emitters` are the original objects that light."""
-        self._sets, self.light_masks, self.unnumbered = [], {}, []
+        self._sets, self.light_masks, self.lone_choices, self.unnumbered = [], {}, {}, []
         numbers: dict[str, int] = {}
         for ob in emitters:
             linking = getattr(ob, "light_linking", None)
@@ -69,8 +70,12 @@ class Blockers:
                     mask = 1 << numbers[collection.name_full]
                 else:
                     self.unnumbered.append(ob.name)
-            if ob.type == "LIGHT" and not ob.data.use_shadow:
-                mask = 0
+            if ob.type == "LIGHT":
+                is_met = cycles_setting(ob.data, "use_multiple_importance_sampling")
+                if not ob.data.use_shadow and not is_met:
+                    mask = 0
+                elif not (ob.data.use_shadow and is_met):
+                    self.lone_choices[ob.name] = "surface" if is_met else "light"
             self.light_masks[ob.name] = mask
         self._named = frozenset().union(*(linked.included | linked.excluded for linked in self._sets))
 

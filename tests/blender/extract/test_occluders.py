@@ -542,14 +542,17 @@ def test_more_sets_of_blockers_than_a_mask_has_bits_are_named():
     assert len(warnings) == 1 and "'Light 31', 'Light 32'" in warnings[0]
 
 
-def test_a_light_without_shadows_is_not_blocked(tmp_path):
+@pytest.mark.parametrize("shadow, is_met", [(False, False), (False, True), (True, False)])
+def test_which_rays_go_to_a_light_is_told(shadow, is_met):
     start()
     cube()
-    bpy.data.objects["Key"].data.use_shadow = False
+    key = bpy.data.objects["Key"].data
+    key.use_shadow, key.cycles.use_multiple_importance_sampling = shadow, is_met
     occluders, warnings = scene_parts.collected_occluders()
-    assert seen_by_rays(occluders)[0].min() == 1.0
-    assert np.abs(seen_by_cycles(tmp_path) - 1.0).max() < 2e-3
-    assert len(warnings) == 1 and "'Key'" in warnings[0] and "sharp reflections" in warnings[0]
+    chosen = occluders.chosen_by("Key")
+    assert warnings == [] and (occluders.mask_of("Key") == 0) == (not shadow and not is_met)
+    if shadow or is_met:
+        assert (chosen.light, chosen.surface) == (shadow, is_met)
 
 
 def test_the_scene_is_left_as_it_was(tmp_path):

@@ -51,7 +51,7 @@ CALIBRATION = (4, 32)
 class Settings:
     """How long the measurement takes, and how much can be believed of it."""
 
-    size: tuple[int, int] = (256, 144)
+    size: tuple[int, int] = (192, 108)
     cycles_samples: int = 1024
     most_rays: int = MANY
     rays: int = DEFAULT

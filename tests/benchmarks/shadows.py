@@ -162,6 +162,11 @@ class Error:
     def __str__(self):
         return f"{self.estimate:6.2%} (< {self.limit:.2%})"
 
+    @property
+    def figure(self) -> float:
+        """The estimate, or what it is below where nothing but noise is seen."""
+        return self.estimate or self.limit
+
 
 def unbiased(first, second, halves, mask) -> Error:
     """Of two independent images (H, W, 3) against two independent halves (2, H, W, 3)."""
@@ -300,10 +305,10 @@ def equal_time(scene: Measured, path, folder):
         took = cycles(path, folder / "c.exr", settings, counts[denoised], denoised).processor
         label = "Cycles and OIDN" if denoised else "Cycles"
         images[label] = rendered(folder / "c.exr")
-        found[label] = scene.error(images[label]).estimate
+        found[label] = scene.error(images[label]).figure
         print(f"    {label:<16}{found[label]:>8.2%}  {counts[denoised]:>5} samples, {took:.2f} s,"
               f" of which {fixed:.2f} s whatever their number")  # fmt: skip
-    error = scene.error(images["LTSH"]).estimate
+    error = scene.error(images["LTSH"]).figure
     ratio = error / min(found.values())
     verdict = "" if ratio <= MOST_OF_CYCLES else "  MISSED"
     stages = json.loads((folder / "ours" / "timing.json").read_text())["seconds"]
@@ -312,7 +317,7 @@ def equal_time(scene: Measured, path, folder):
     print(f"    LTSH against the better: {ratio:.2f} (target {MOST_OF_CYCLES}){verdict}")
     many = shade(path, folder / "many", settings, "--shadow-rays", MANY).processor
     layers = imaging.read_layers(folder / "many" / "shade.exr")
-    error = scene.error(sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)).estimate
+    error = scene.error(sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)).figure
     print(
         f"    {'LTSH':<16}{error:>8.2%}  {MANY:>5} rays,    {many:.2f} s, {many / seconds:.2f} times as long; "
         f"against the better {error / min(found.values()):.2f}"

@@ -174,7 +174,7 @@ def unbiased(first, second, halves, mask) -> Error:
     products = 0.5 * ((first - a) * (second - b) + (first - b) * (second - a)).sum(axis=1)
     norm = (a * b).sum()
     squared, deviation = products.sum() / norm, products.std() * math.sqrt(len(products)) / norm
-    values = squared, squared - 1.96 * deviation, squared + 1.96 * deviation
+    values = squared, squared - 1.96 * deviation, max(squared, 0.0) + 1.96 * deviation
     return Error(*(math.sqrt(max(0.0, value)) for value in values))
 
 

@@ -139,8 +139,7 @@ class ShadowTask:
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
         choices = Choices(samples, [emitter.light for emitter in self.emitters], self.is_baked)
         for number, emitter in enumerate(self.emitters):
-            pairs = Pairs(surface, emitter)
-            pairs.number, pairs.by_surface = number, choices.by_surface
+            pairs = Pairs(surface, emitter, number, choices)
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
@@ -195,7 +194,7 @@ class Surface:
     """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
 
     def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
-        self.tracer, self.starts = tracer, tracer and tracer.starts(samples)
+        self.tracer, self.starts = tracer, tracer.starts(samples)
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)
@@ -234,7 +233,7 @@ def _different(first, second):
 
 
 @dataclass(frozen=True)
-class _Others:
+class _ChosenBySurface:
     """Rays (R,) that meet other things where the surface chooses them than where the light does."""
 
     place: np.ndarray  # in the flat (S, Q) of all rays
@@ -246,14 +245,13 @@ class _Others:
 
 
 class Pairs:
-    """The samples that a light may reach, and what their rays have found so far."""
+    """The samples that a light, `number` of all, may reach, and what their rays have found so far."""
 
-    def __init__(self, surface: Surface, emitter: Emitter):
+    def __init__(self, surface: Surface, emitter: Emitter, number: int, choices: Choices):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
-        self.mask = np.uint32(surface.tracer.mask_of(light.name) if surface.tracer else 0)
-        self.chosen_by = surface.tracer and surface.tracer.chosen_by(light.name)
-        self.number, self.by_surface = None, None
+        self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
         offset = (light.center[:, None] - surface.position).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
         if light.is_focused:
@@ -388,7 +386,7 @@ class Pairs:
             number, passing = PASSES.index(name), arriving
             if others is not None:
                 passing = arriving.copy()
-                share = self.by_surface(name, self.number, others.index, others.directions, others.solid_angle)
+                share = self.choices.by_surface(name, self.number, others.index, others.directions, others.solid_angle)
                 share[others.is_alone] = 1.0
                 passing.ravel()[others.place] += share * (others.arriving - arriving.ravel()[others.place])
             for sums in (self.weights[number], self.arriving[number]):
@@ -423,7 +421,7 @@ class Pairs:
             return None
         chosen, found = chosen[differ], found[differ]
         angle = view.quads.solid_angle[column[chosen]]
-        return _Others(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
+        return _ChosenBySurface(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
         """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""

@@ -171,7 +171,8 @@ def textbook_ggx(cosine_h, cosine_i, cosine_o, alpha):
 
 def with_all_rays(samples, light, tracer):
     """The pairs of a light after as many rays as there can be, for each."""
-    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), Emitter(light))
+    choices = ratio.Choices(samples, [light], is_baked=False)
+    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), Emitter(light), 0, choices)
     pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
     return pairs
 

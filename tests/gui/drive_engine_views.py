@@ -152,6 +152,7 @@ def beside_cycles(rig):
     pixels = yield from eyes.settled(rig, "views_8_no_cycles.png")
     rig.check(is_picture(pixels), "without a Cycles picture the technique is seen")
     settings().techniques, settings().cycles_samples = {"ltsh4"}, 64
+    settings().shadows = False  # as in the view
     operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
     yield from wait_for_job(rig, 900)
     pixels = yield from eyes.settled(rig, "views_8_difference.png")

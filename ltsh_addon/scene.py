@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -189,7 +190,7 @@ class AreaLight:
         """Mask (Q,) of the samples `index` whose `receiver` (P,) the light lights; None: it lights all."""
         return None if self.receivers is None else np.isin(receiver[index], self.receivers)
 
-    @property
+    @cached_property
     def area_vector(self) -> np.ndarray:
         """Normal (3,), the area in m^2 long, around which `corners`, or half_u and half_v, run counterclockwise."""
         if self.corners is not None:

@@ -18,7 +18,7 @@ from . import float64, light_cone, moments32
 from .light_polygons import integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
-from .tails import TailLimits
+from .tails import SeenLight, TailLimits
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
@@ -67,13 +67,14 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
         for index in _chunks(members):
-            rows, clip_rows, weights = _lobe_rows(samples, index, ridges, vectors, scratch)
+            axes = _columns(samples.normal, index), _columns(samples.view, index)
+            rows, clip_rows, weights = _lobe_rows(samples, index, axes, ridges, vectors, scratch)
             integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
             limits = None
             if table.family == "ltsh":
-                geometric = rows[clip_rows[0]] if len(clip_rows) > 1 else None
-                kinds = 1 in vectors, not isinstance(vectors[-1], int)
-                limits = TailLimits.of(samples, index, geometric, kinds, np.float32)
+                ior = None if isinstance(vectors[-1], int) else samples.ior[index]
+                second = rows[clip_rows[0]] if len(clip_rows) > 1 else None
+                limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
             lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width, limits))
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
@@ -129,7 +130,8 @@ class _Lighting:
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width):
                 offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
-                facing = dot(offset, light.direction.astype(np.float32)) < 0.0
+                toward = dot(offset, light.direction.astype(np.float32))
+                facing = toward < 0.0
                 if allowed is not None:
                     facing &= allowed[part]
                 axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
@@ -139,7 +141,7 @@ class _Lighting:
                 polygons = local_corners(light, outline, offset, axes, self.scratch)
                 found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
                 if lobes.limits is not None:
-                    lobes.limits.apply(found, part, offset, light, self.scratch)
+                    lobes.limits.apply(found, part, SeenLight.of(light, offset, toward), self.scratch)
                 if redo.any():
                     found[:, redo] = 0.0
                     needs_float64.append(index[part][redo])
@@ -300,9 +302,10 @@ def _normal_frame(normal):
     return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
 
 
-def _lobe_rows(samples, index, ridges, vectors, scratch):
-    """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q)."""
-    normal, view = _columns(samples.normal, index), _columns(samples.view, index)
+def _lobe_rows(samples, index, axes, ridges, vectors, scratch):
+    """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q), of
+    samples with the normals and views `axes`."""
+    normal, view = axes
     cosine = dot(normal, view)
     # The difference of vectors that are close is exact, so that nothing of it runs along the normal.
     tangent = view - normal

@@ -15,9 +15,10 @@ from .edge_integrals import vector_irradiance
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
 from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import Lobe, LookupTable
+from .polygon import dot
 from .reference import reference_integrals
 from .spherical_harmonics import coefficient_index
-from .tails import TailLimits
+from .tails import SeenLight, TailLimits
 
 # Of the roughness by which the effort for a lobe is chosen.
 LEAST_ROUGHNESS = 1e-3
@@ -128,12 +129,11 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 (index, _table_integrals(table, lobe, samples, frame, light, effort, index, polygon))
                 for index, polygon, effort in visible
             )
+            if light.is_profiled and light.shape == "POLYGON":
+                parts = _joined(parts, len(samples))
         for index, integrals in parts:
             if table != REFERENCE and table.family == "ltsh":
-                offset = (_of(light.center, index) - samples.position[index]).T
-                limits = TailLimits.of(samples, index, samples.geometric_normal[index].T, (True, True), np.float64)
-                own = light if np.ndim(light.center) == 1 else light.take(index)
-                limits.apply(integrals, slice(None), offset, own, _fresh_array)
+                _limit(integrals, samples, index, light)
             plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
@@ -141,9 +141,23 @@ def shade_specular(samples, lights, table, radiance, error=None):
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
-def _fresh_array(name, shape):
-    """In place of a Scratch."""
-    return np.empty(shape)
+def _joined(parts, count):
+    """Yield (index, integrals (4, Q)) of a light of `count` samples as a whole, from those of its convex pieces."""
+    total = np.zeros((4, count))
+    for index, integrals in parts:
+        total[:, index] += integrals
+    index = np.nonzero(total[0] > 0.0)[0]
+    yield index, total[:, index]
+
+
+def _limit(integrals, samples, index, light):
+    """Limit integrals (4, Q) over the light of the samples `index` as `TailLimits` does."""
+    own = light if light.center.ndim == 1 else light.take(index)
+    axes = samples.normal[index].T, samples.view[index].T
+    offset = (own.center - samples.position[index]).T
+    toward = dot(offset, own.direction.T)
+    limits = TailLimits.of(axes, samples.roughness[index], samples.geometric_normal[index].T, True, samples.ior[index])
+    limits.apply(integrals, slice(None), SeenLight.of(own, offset, toward), lambda name, shape: np.empty(shape))
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:

@@ -60,6 +60,14 @@ class Profile:
         """The factor at `radius` from the foot of a point that is at `distance` from the plane of the light."""
         return self._spread(radius / distance) * self._falloff(distance * distance + radius * radius)
 
+    def range(self, nearest, farthest, distance):
+        """The least and the greatest factor where the radius is from `nearest` to `farthest`."""
+        squared = distance * distance
+        return tuple(
+            self._spread(shaded / distance) * self._falloff(squared + faded * faded)
+            for shaded, faded in ((farthest, nearest), (nearest, farthest))
+        )
+
     def descent(self, radius, distance):
         """By how much the factor sinks per `radius`, inside of the cone."""
         squared = np.maximum(distance * distance + radius * radius, _TINY)

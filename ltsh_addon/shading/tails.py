@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .brdf import dielectric_reflectance, schlick_curve
+from .light_cone import Profile
 from .lookup_table import MIN_ALPHA
 from .polygon import dot
 
@@ -20,113 +21,141 @@ NEAR_RADII = 2.0
 
 
 @dataclass(frozen=True)
-class LightExtent:
-    """Where lights are: the half diagonals of the parallelograms around them, and their areas times the direction to
-    which they shine; all (3, 1), or (3, Q) for a light of each point."""
+class SeenLight:
+    """A light as Q points see it, or one of each; for "..." stands Q or 1."""
 
-    diagonals: tuple[np.ndarray, np.ndarray]
-    area: np.ndarray
+    offset: np.ndarray  # (3, Q) of its center
+    toward: np.ndarray  # (Q,) product of that with the direction to which it shines, negative
+    diagonals: np.ndarray  # (2, 3, ...) half of those of the parallelogram around it
+    squares: np.ndarray  # (2, ...) of their lengths
+    area: np.ndarray  # (...)
+    profile: Profile | None
 
     @classmethod
-    def of(cls, light, dtype) -> LightExtent:
-        """That of an AreaLight, or of a `float64.LightOfEachSample`."""
-        vectors = light.half_u, light.half_v, light.direction, light.area_vector
-        half_u, half_v, direction, area = (vector[None].T if vector.ndim == 1 else vector.T for vector in vectors)
-        area = np.sqrt(dot(area, area)) * direction
-        return cls(tuple(vector.astype(dtype) for vector in (half_u + half_v, half_u - half_v)), area.astype(dtype))
+    def of(cls, light, offset, toward) -> SeenLight:
+        """That of an AreaLight, or of a `float64.LightOfEachSample`, in the precision of `offset`."""
+        vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
+        vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
+        squares = (vectors * vectors).sum(axis=1).astype(offset.dtype)
+        profile = Profile.of(light) if light.is_profiled else None
+        return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
-    def take(self, index) -> LightExtent:
-        """Those of the points `index` (Q',)."""
-        if self.area.shape[1] == 1:
-            return self
-        return LightExtent(tuple(diagonal[:, index] for diagonal in self.diagonals), self.area[:, index])
+    def along_diagonals(self, vectors, out, product):
+        """Products (2, Q) of vectors (3, Q) with the half diagonals."""
+        np.multiply(self.diagonals[:, 0], vectors[0], out=out)
+        for axis in (1, 2):
+            out += np.multiply(self.diagonals[:, axis], vectors[axis], out=product)
+        return out
+
+    def range_of_profile(self, distance_squared):
+        """The least and the greatest value (Q,) of the profile within the circle around the light."""
+        beside = np.sqrt(np.maximum(distance_squared - self.toward * self.toward, 0.0))
+        radius = np.sqrt(np.maximum(*self.squares))
+        return self.profile.range(np.maximum(beside - radius, 0.0), beside + radius, -self.toward)
 
 
 @dataclass(frozen=True)
 class TailLimits:
     """Limits for the lobes of Q samples."""
 
-    rows: np.ndarray  # (9, Q) normal, view, their product, alpha^2, ior; (12, Q) with the normal of a second horizon
-    head_on: np.ndarray | None  # (Q,) the least reflectance, where the last integral is that of a dielectric
+    normal: np.ndarray  # (3, Q)
+    view: np.ndarray  # (3, Q)
+    cosine: np.ndarray  # (Q,) their product
+    alpha_squared: np.ndarray  # (Q,)
+    second: np.ndarray | None  # (3, Q) normals of second horizons
     schlick: bool  # whether the second integral is that of Schlick's curve
+    ior: np.ndarray | None  # (Q,), where the last integral is that of a dielectric
 
     @classmethod
-    def of(cls, samples, index, geometric, kinds, dtype) -> TailLimits:
-        """Those of the samples `index` (Q,), with normals `geometric` (3, Q) or None; `kinds`: whether there are
-        integrals for Schlick's curve, and for a dielectric."""
-        schlick, dielectric = kinds
-        normal, view = samples.normal[index].T, samples.view[index].T
-        alpha = np.maximum(samples.roughness[index] ** 2, MIN_ALPHA)
-        ior = np.maximum(samples.ior[index], 1.0)
-        second = () if geometric is None else geometric
-        cosine = dot(normal, view)
-        rows = np.stack([*normal, *view, cosine, alpha * alpha, ior, *second], dtype=dtype, casting="same_kind")
-        head_on = (((ior - 1.0) / (ior + 1.0)) ** 2).astype(dtype) if dielectric else None
-        return cls(rows, head_on, schlick)
+    def of(cls, axes, roughness, second, schlick, ior) -> TailLimits:
+        """Those of samples with the normals and views `axes`, which tell the precision, `roughness` (Q,), and `ior`
+        (Q,) or None."""
+        normal, view = axes
+        roughness = roughness.astype(normal.dtype)
+        alpha = np.maximum(roughness * roughness, normal.dtype.type(MIN_ALPHA))
+        ior = None if ior is None else np.maximum(ior, 1.0).astype(normal.dtype)
+        return cls(normal, view, dot(normal, view), alpha * alpha, second, schlick, ior)
 
-    def apply(self, integrals, part, offset, light, scratch) -> None:
-        """Limit integrals (F, Q') over lights whose centers are at `offset` (3, Q') from the samples `part`.
+    def take(self, part) -> TailLimits:
+        """Those of the samples `part`: integers (Q',) or a slice."""
+        values = self.normal, self.view, self.cosine, self.alpha_squared, self.second, self.ior
+        *values, ior = (value if value is None else value[..., part] for value in values)
+        return TailLimits(*values, self.schlick, ior)
+
+    def apply(self, integrals, part, light: SeenLight, scratch) -> None:
+        """Limit integrals (F, Q') over the light as the samples `part` see it.
 
         In the tail the first, for F = 1, is brought between the least and the greatest integrand over the area, of
-        those at the center and the corners, times the area; not for profiled lights. The others are at most the
-        greatest reflectance there times the first, and nowhere more than the first. That of a dielectric is at least
-        its reflectance head on times the first.
+        those at the center and the corners, times the area and the least and the greatest value of a profile. The
+        others are at most the greatest reflectance there times the first, and nowhere more than the first. That of a
+        dielectric is at least its reflectance head on times the first.
         scratch(name, shape) gives an array whose content does not matter.
         """
-        rows = self.rows[:, part] if isinstance(part, slice) else np.take(self.rows, part, axis=1)
-        extent = LightExtent.of(light, rows.dtype)
-        center = scratch("center of light", (6, rows.shape[1]))
-        for number, vectors in enumerate((rows[:3], rows[3:6], offset)):
-            _dot(vectors, offset, center[number], scratch)
-        center[3:] = offset
-        chosen = np.nonzero(_is_tail(rows[6], center, extent) & (integrals[0] > 0.0))[0]
-        if len(chosen):
-            rows, center = np.take(rows, chosen, axis=1), np.take(center, chosen, axis=1)
-            found = np.take(integrals, chosen, axis=1)
-            points = _LightPoints(rows, center, extent.take(chosen), scratch)
-            far = points.least_half_angle_cosine()
-            if not light.is_profiled:
-                least, most = points.limits()
-                np.minimum(np.maximum(found[0], least, out=least), most, out=found[0])
-            if self.schlick:
-                np.minimum(found[1], schlick_curve(far) * found[0], out=found[1])
-            if self.head_on is not None:
-                np.minimum(found[-1], dielectric_reflectance(far, rows[8]) * found[0], out=found[-1])
-            integrals[:, chosen] = found
-        if self.schlick:
-            np.minimum(integrals[1], integrals[0], out=integrals[1])
-        if self.head_on is not None:
-            np.minimum(integrals[-1], integrals[0], out=integrals[-1])
-            np.maximum(integrals[-1], self.head_on[part] * integrals[0], out=integrals[-1])
-
-
-def _is_tail(cosine, center, extent):
-    """Mask (Q,) of the lights that the mirrored view ray misses far enough."""
-    mirrored = cosine * center[0]
-    mirrored += mirrored
-    mirrored -= center[1]
-    beyond = center[2] - NEAR_RADII**2 * np.maximum(*(dot(diagonal, diagonal) for diagonal in extent.diagonals))
-    tail = beyond > 0.0
-    tail &= mirrored * np.abs(mirrored) < beyond
-    return tail
+        # Outside of the tail, where nothing is limited, points may coincide.
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            _LightPoints(self.take(part), light, scratch).limit(integrals)
 
 
 class _LightPoints:
-    """The centers and corners of lights as seen from samples: (5, Q) heights over the horizons, products with the
-    views, squared distances."""
+    """The centers of lights as seen from samples, then also their corners: (5, Q) heights over the horizons, products
+    with the views, squared distances."""
 
-    def __init__(self, rows, center, extent, scratch):
-        self.rows, self.offset, self.extent, self.scratch = rows, center[3:], extent, scratch
-        self.heights = self._products("heights", rows[:3], center[0])
-        self.views = self._products("views", rows[3:6], center[1])
-        self.squares = self._products("squares", self.offset, center[2])
-        for number, diagonal in enumerate(extent.diagonals):
-            # |offset +- diagonal|^2
-            corners = self.squares[1 + 2 * number : 3 + 2 * number]
-            corners += corners
-            corners += dot(diagonal, diagonal)
-            corners -= center[2]
-        self.distances = np.sqrt(self.squares, out=self._array("distances"))
+    def __init__(self, lobes, light, scratch):
+        self.lobes, self.light = lobes, light
+        count = len(lobes.cosine)
+        self.heights, self.views, self.squares = scratch("unit", (3, 5, count))
+        others = scratch("corners", (12, count))
+        self.distances, self.work, self.one, self.two = others[:5], others[5:10], others[10], others[11]
+        for values, vectors in ((self.heights, lobes.normal), (self.views, lobes.view), (self.squares, light.offset)):
+            self._add_center(values, vectors)
+
+    def limit(self, integrals) -> None:
+        """As `TailLimits.apply`."""
+        plain, cosine = integrals[0], np.zeros(1, integrals.dtype)
+        tail = self.are_in_tail()
+        if tail.any():
+            self.add_corners()
+            others = ~tail
+            if len(integrals) > 1:
+                cosine = self.least_half_angle_cosine()
+                np.copyto(cosine, 0.0, where=others)
+            least, most = self.limits()
+            others |= plain <= 0.0
+            np.copyto(least, 0.0, where=others)
+            np.copyto(most, np.inf, where=others)
+            np.minimum(np.maximum(plain, least, out=plain), most, out=plain)
+        if self.lobes.schlick:
+            np.minimum(integrals[1], schlick_curve(cosine) * plain, out=integrals[1])
+        ior = self.lobes.ior
+        if ior is not None:
+            np.minimum(integrals[-1], dielectric_reflectance(cosine, ior) * plain, out=integrals[-1])
+            head_on = (ior - 1.0) / (ior + 1.0)
+            head_on *= head_on
+            head_on *= plain
+            np.maximum(integrals[-1], head_on, out=integrals[-1])
+
+    def are_in_tail(self) -> np.ndarray:
+        """Mask (Q,) of the lights that the mirrored view ray misses far enough."""
+        mirrored = np.multiply(self.lobes.cosine, self.heights[0], out=self.one)
+        mirrored += mirrored
+        mirrored -= self.views[0]
+        mirrored *= np.abs(mirrored, out=self.two)
+        beyond = np.subtract(self.squares[0], NEAR_RADII**2 * np.maximum(*self.light.squares), out=self.two)
+        tail = beyond > 0.0
+        tail &= mirrored < beyond
+        return tail
+
+    def add_corners(self) -> None:
+        """Fill in what is of the corners, and what follows from it."""
+        self._add_corners(self.heights, self.lobes.normal)
+        self._add_corners(self.views, self.lobes.view)
+        # |offset +- diagonal|^2
+        along = self.light.along_diagonals(self.light.offset, *self.work[:4].reshape(2, 2, -1))
+        along += along
+        middle = np.add(self.squares[0], self.light.squares, out=self.work[2:4])
+        np.add(middle, along, out=self.squares[1:3])
+        np.subtract(middle, along, out=self.squares[3:])
+        np.sqrt(self.squares, out=self.distances)
         # Half the squared length of the half vector, times the squared distance.
         self.halves = self.views
         self.halves *= self.distances
@@ -134,38 +163,45 @@ class _LightPoints:
 
     def least_half_angle_cosine(self) -> np.ndarray:
         """The least cosine (Q,) of the angle between the view and the half vector."""
-        work = np.divide(self.halves, self.squares, out=self._array("work"))
-        return np.sqrt((0.5 * np.minimum.reduce(work, axis=0)).clip(0.0, 1.0))
+        least = np.minimum.reduce(np.divide(self.halves, self.squares, out=self.work), axis=0)
+        least *= 0.5
+        np.minimum(np.maximum(least, 0.0, out=least), 1.0, out=least)
+        return np.sqrt(least, out=least)
 
     def limits(self):
-        """The least and the greatest integrand over the area (Q,), times the area. Changes all arrays."""
-        alpha_squared = self.rows[7]
-        values = self._integrands(self.rows[6], alpha_squared)
-        factor = dot(self.offset, self.extent.area)
-        factor *= alpha_squared
-        factor *= -0.5 / np.pi
-        least, most = (bound.reduce(values, axis=0) for bound in (np.minimum, np.maximum))
+        """The least and the greatest integrand over the area (Q,), times the area and a profile. Changes all arrays."""
+        cosine, alpha_squared = self.lobes.cosine, self.lobes.alpha_squared
+        profile = None if self.light.profile is None else self.light.range_of_profile(self.squares[0])
+        values = self._integrands(cosine, alpha_squared)
+        least = np.minimum.reduce(values, axis=0, out=self.squares[0])
+        most = np.maximum.reduce(values, axis=0, out=self.squares[1])
+        factor = np.multiply(alpha_squared, self.light.toward, out=self.one)
+        factor *= (-0.5 / np.pi) * self.light.area
         least *= factor
         most *= factor
-        if len(self.rows) > 9:
+        # Those below the horizon are negative.
+        np.maximum(most, 0.0, out=most)
+        if profile is not None:
+            least *= profile[0]
+            most *= profile[1]
+        if self.lobes.second is not None:
             # What is below the second horizon is not seen.
-            second = self.rows[9:]
-            heights = self._products("heights", second, dot(second, self.offset))
-            least *= np.minimum.reduce(heights, axis=0) > 0.0
+            self._add_center(self.heights, self.lobes.second)
+            self._add_corners(self.heights, self.lobes.second)
+            least *= np.minimum.reduce(self.heights, axis=0) > 0.0
         return least, most
 
     def _integrands(self, cosine, alpha_squared):
-        """GGX's BRDF times both cosines by the squared distance (5, Q), but for constants."""
+        """GGX's BRDF times both cosines by the squared distance (5, Q), but for constants; negative below horizons."""
         rest = 1.0 - alpha_squared
         heights, distances, squares = self.heights, self.distances, self.squares
-        ratio = np.multiply(cosine, distances, out=self._array("work"))
+        ratio = np.multiply(cosine, distances, out=self.work)
         ratio += heights
         ratio *= ratio
         ratio *= -0.5 * rest
         ratio += self.halves
         np.divide(self.halves, ratio, out=ratio)
         ratio *= ratio
-        np.maximum(heights, np.zeros_like(rest), out=heights)
         ratio *= heights
         masking = np.multiply(heights, heights, out=self.halves)
         masking *= rest
@@ -174,29 +210,22 @@ class _LightPoints:
         masking += squares
         np.sqrt(masking, out=masking)
         masking *= cosine
+        np.abs(heights, out=heights)
         heights *= np.sqrt(alpha_squared + rest * cosine * cosine)
         masking += heights
         masking *= distances
         ratio /= masking
         return ratio
 
-    def _array(self, name):
-        return self.scratch(name, (5, self.offset.shape[1]))
+    def _add_center(self, values, vectors):
+        """Products of vectors (3, Q) with the offset of the center."""
+        offset = self.light.offset
+        np.multiply(vectors[0], offset[0], out=values[0])
+        for axis in (1, 2):
+            values[0] += np.multiply(vectors[axis], offset[axis], out=self.two)
 
-    def _products(self, name, vectors, at_center):
-        """Products (5, Q) of vectors (3, Q) with the offsets of the points."""
-        result, along = self._array(name), self.scratch("along", at_center.shape)
-        result[0] = at_center
-        for number, diagonal in enumerate(self.extent.diagonals):
-            _dot(vectors, diagonal, along, self.scratch)
-            np.add(at_center, along, out=result[1 + 2 * number])
-            np.subtract(at_center, along, out=result[2 + 2 * number])
-        return result
-
-
-def _dot(a, b, out, scratch):
-    """Scalar products (Q,) of vectors (3, Q)."""
-    work = scratch("dot", out.shape)
-    np.multiply(a[0], b[0], out=out)
-    for axis in (1, 2):
-        out += np.multiply(a[axis], b[axis], out=work)
+    def _add_corners(self, values, vectors):
+        """Products of vectors (3, Q) with the offsets of the corners, where that of the center is there."""
+        along = self.light.along_diagonals(vectors, *self.work[:4].reshape(2, 2, -1))
+        np.add(values[0], along, out=values[1:3])
+        np.subtract(values[0], along, out=values[3:])

@@ -105,6 +105,55 @@ def test_lights_that_the_geometric_horizon_cuts_have_no_lower_bound():
     assert darker > 10
 
 
+FACTORS = {"linear": {"falloff": 1}, "constant": {"falloff": 2}, "smooth": {"smooth": 0.5}, "spread": {"spread": 2.5}}
+
+
+def profile_range(light):
+    """(least, greatest) factor of a light's profile at the origin: of its spread, and of its falloff, each over the
+    circle around the light."""
+    distance = -light.direction @ light.center
+    beside = np.sqrt(max(light.center @ light.center - distance**2, 0.0))
+    radius = max(np.linalg.norm(light.half_u + light.half_v), np.linalg.norm(light.half_u - light.half_v))
+    radii = np.array([max(beside - radius, 0.0), beside + radius])
+    squared = distance**2 + radii**2
+    falloff = squared ** (0.5 * light.falloff) * squared / (light.smooth + squared)
+    half = 0.5 * light.spread
+    spread = np.maximum((np.tan(half) - radii[::-1] / distance) / (np.tan(half) - half), 0.0) if half < 1.5 else 1.0
+    return spread * falloff
+
+
+@pytest.mark.parametrize("name", FACTORS)
+def test_profiled_lights_are_within_the_bounds_times_the_range_of_their_profile(name):
+    """The fitted lobe by the limits, the true one by itself; in single precision, and in double precision too."""
+    changed = 0
+    for view, roughness, light, (least, most) in cases(25):
+        sample = single_sample(view=view, roughness=roughness, **WHITE)
+        light = replace(light, **FACTORS[name])
+        low, high = profile_range(light) * (least, most)
+        exact = shaded(sample, light, shading.REFERENCE)
+        # The quadrature stops at 1e-4 of the value plus 1e-6.
+        assert 0.9998 * low - 2e-6 <= exact <= 1.0002 * high + 2e-6, (view, roughness, light)
+        for dtype in (np.float32, np.float64):
+            found = shaded(sample, light, "ltsh2", dtype)
+            margin = 1e-4 * high + 1e-9
+            assert low - margin <= found <= high + margin, (view, roughness, light)
+        changed += min(abs(found - low), abs(found - high)) < margin
+    assert changed > 3
+
+
+def test_a_profiled_polygon_in_several_pieces_is_limited_as_a_whole():
+    """The light is a dart, of two convex pieces."""
+    for view, roughness, light, _ in cases(25):
+        u, v = light.half_u, light.half_v
+        corners = light.center + np.stack([-u - v, u - v, u + v, 0.3 * u - 0.3 * v])
+        dart = replace(light, shape="POLYGON", corners=corners, falloff=2)
+        # Its share of the area of the rectangle
+        share = np.linalg.norm(dart.area_vector) / np.linalg.norm(light.area_vector)
+        low, high = profile_range(dart) * bounds(view, roughness, light) * share
+        found = shaded(single_sample(view=view, roughness=roughness, **WHITE), dart, "ltsh2")
+        assert low - 1e-4 * high - 1e-9 <= found <= 1.0001 * high + 1e-9, (view, roughness, light)
+
+
 def test_a_profiled_light_is_not_limited_by_its_area():
     """A falloff leaves a millionth of the light."""
     for view, roughness, light, _ in cases(10):

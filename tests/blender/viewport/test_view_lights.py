@@ -152,7 +152,9 @@ def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.
     on_ball = np.abs(distance - 0.7) < 0.01
     for name, (picture, notes) in zip(shading.PASSES, pictures, strict=True):
-        shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=(name,), workers=1).combined
+        reflected = shading.shade(found.samples, found.lights, "ltsh4", passes=(name,), workers=1).combined
+        # A lobe that ends at two horizons is two samples of one pixel.
+        shaded = found.film.image(reflected).reshape(-1, 3)[found.film.pixel]
         seen_there = picture.reshape(-1, 3)[found.film.pixel]
         for part in (on_ball, ~on_ball):
             error = np.abs(seen_there - shaded)[part].max(axis=1) / (1e-3 + shaded[part].max(axis=1))

@@ -52,7 +52,11 @@ void main()
         values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
 #endif
 #ifndef LTSH_COSINE
-        values = specular_limited(values, point, shining, ltsh_light_texel(header + 6).z, focused);
+        vec2 profile = vec2(1.0);
+#ifdef LTSH_FOCUSED
+        profile = focused ? ltsh_range_of_profile(shining, header) : profile;
+#endif
+        values = specular_limited(values, point, shining, ltsh_light_texel(header + 6).z, profile);
 #endif
         reflected += ltsh_reflected(point, values);
 #endif

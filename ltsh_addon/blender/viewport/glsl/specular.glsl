@@ -159,8 +159,8 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
 }
 
 #ifndef LTSH_COSINE
-/* As `tails.TailLimits.apply`; of a profiled light only the reflectances are limited. */
-vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float area, bool profiled)
+/* As `tails.TailLimits.apply`; `profile` are the least and the greatest value of that of the light. */
+vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float area, vec2 profile)
 {
     ltsh_extent extent;
     extent.center = light.offset;
@@ -171,8 +171,8 @@ vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float are
     float ior = max(point.ior, 1.0);
     float complement = 1.0 - limits.cosine;
     float squared = complement * complement;
-    bool limited = !profiled && values.x > 0.0;
-    values.x = limited ? ltsh_between(values.x, limits.least, limits.most) : values.x;
+    float between = ltsh_between(values.x, profile.x * limits.least, profile.y * limits.most);
+    values.x = values.x > 0.0 ? between : values.x;
     values.y = min(values.y, squared * squared * complement * values.x);
     values.w = min(values.w, ltsh_dielectric_reflectance(limits.cosine, ior) * values.x);
     values.w = max(values.w, ltsh_dielectric_reflectance(1.0, ior) * values.x);

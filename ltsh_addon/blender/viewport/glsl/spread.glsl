@@ -24,6 +24,23 @@ float ltsh_profile(vec4 cone, vec2 falloff, float radius, float distance)
     return max((cone.x - radius / distance) * cone.y, 0.0) * ltsh_falloff(falloff, distance * distance + radius * radius);
 }
 
+/* The least and the greatest value of the profile within the circle around the light. */
+vec2 ltsh_range_of_profile(ltsh_light light, int header)
+{
+    vec4 cone = ltsh_light_texel(header + 5);
+    vec2 falloff = ltsh_light_texel(header + 6).xy;
+    float distance = max(-dot(light.offset, light.direction), 1e-30);
+    float squared = distance * distance;
+    float beside = sqrt(max(dot(light.offset, light.offset) - squared, 0.0));
+    vec3 sum = light.half_u + light.half_v;
+    vec3 difference = light.half_u - light.half_v;
+    float radius = sqrt(max(dot(sum, sum), dot(difference, difference)));
+    float near = max(beside - radius, 0.0);
+    float far = beside + radius;
+    vec2 spread = max((vec2(cone.x) - vec2(far, near) / distance) * cone.y, vec2(0.0));
+    return spread * vec2(ltsh_falloff(falloff, squared + near * near), ltsh_falloff(falloff, squared + far * far));
+}
+
 float ltsh_descent(vec4 cone, vec2 falloff, float radius, float distance)
 {
     float squared = max(distance * distance + radius * radius, 1e-30);

@@ -155,8 +155,8 @@ class AreaLight:
 
     def record(self) -> dict:
         """This light as JSON has it; AreaLight(**record) reads it back."""
-        values = vars(self).items()
-        record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values}
+        values = {item.name: getattr(self, item.name) for item in fields(self)}
+        record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
         return {**record, "detail": [part.record() for part in self.detail]}
 
     @property

@@ -262,8 +262,7 @@ def content(mirror) -> str:
     """A digest of what the scene mirror `mirror` shows: lights, places, sizes and materials."""
     digest = hashlib.blake2b(digest_size=16)
     for light in mirror.lights:
-        for value in vars(light).values():
-            digest.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+        digest.update(repr(light.record()).encode())
     for instance in mirror.instances:
         digest.update(np.array(instance.model).tobytes())
         digest.update(repr((instance.mesh.triangles, instance.receiver)).encode())

@@ -123,11 +123,12 @@ def check(value: Any, shape: Any, place: str = "") -> None:
         _expect(value, dict, place)
         missing = [key for key in shape if key is not str and not key.endswith("?") and key not in value]
         if missing:
-            raise Malformed(f"{place or 'the document'} has no {missing[0]!r}")
+            raise Malformed(f"{place or 'the document'} has no {_shown(missing[0])}")
         for key, item in value.items():
             inner = shape.get(key, shape.get(f"{key}?", shape.get(str)))
             if inner is not None:
-                check(item, inner, f"{place}.{key}" if place else key)
+                name = shortened(key, 60)
+                check(item, inner, f"{place}.{name}" if place else name)
     elif isinstance(shape, list):
         _expect(value, list, place)
         for number, item in enumerate(value):

@@ -117,6 +117,12 @@ def test_what_is_no_file_is_refused_and_what_is_missing_is_an_os_error(tmp_path,
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array("text"), "c": np.zeros((2, 0)), "d": np.array(3, ">i2")}
 
 
+def test_long_names_are_shortened():
+    with pytest.raises(Malformed) as error:
+        reading.check({"a" * 5000: {}}, {str: {"b" * 5000: int}})
+    assert len(str(error.value)) < 200
+
+
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 def test_arrays_are_read_as_numpy_reads_them(tmp_path, save):
     save(tmp_path / "x.npz", **ARRAYS, f=np.asfortranarray(ARRAYS["a"]))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ..files import write_bytes
 from ..reading import NUMBER, Malformed, check, file_name, read_json, some
+from ..scene import shortened
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
@@ -185,7 +186,7 @@ def _check_group(group, place) -> None:
     rows = [name for figures in group.get("figures", {}).values() for name in figures["techniques"]]
     for names, known in (((*group["names"], *rows), "labels"), (group["passes"], "scales")):
         if missing := [name for name in names if name not in group[known]]:
-            raise Malformed(f"{place}.{known} has no {missing[0]!r}")
+            raise Malformed(f"{place}.{known} has no {shortened(missing[0], 60)!r}")
 
 
 _REPORT = {"warnings?": [str], "problems?": [str]}

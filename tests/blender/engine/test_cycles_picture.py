@@ -12,6 +12,7 @@ from mathutils import Vector
 from ltsh_addon.blender.engine.view import Reference, averaged, camera_frame, content, is_outdated, reference_of
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.imaging.report import write_index
+from ltsh_addon.scene import AreaLight
 
 SIZE = parts.SIZE
 PIXELS = np.random.default_rng(3).random((SIZE[1], SIZE[0], 3)).astype(np.float32)
@@ -97,12 +98,15 @@ def lit_by(*lights):
 
 
 def lamp(x=0.0):
-    return SimpleNamespace(name="Lamp", center=np.array([x, 0.0, 1.0]), radiance=np.ones(3))
+    sides = {"half_u": (0.5, 0.0, 0.0), "half_v": (0.0, 0.5, 0.0), "direction": (0.0, 0.0, -1.0)}
+    return AreaLight("Lamp", "SQUARE", center=(x, 0.0, 1.0), radiance=np.ones(3), **sides)
 
 
 def test_a_change_of_the_scene_makes_the_picture_outdated_until_it_is_undone(tmp_path):
     reference = Reference(np.ones((2, 2, 3)), (0.0, 0.0, 2.0, 2.0), (str(tmp_path), 1))
     assert not is_outdated(reference, lit_by(lamp()))
+    known = lamp()
+    assert known.area_vector.any() and not is_outdated(reference, lit_by(known))  # what was computed of it is no change
     assert is_outdated(reference, lit_by(lamp(0.1)))
     assert is_outdated(reference, lit_by())
     assert not is_outdated(reference, lit_by(lamp()))

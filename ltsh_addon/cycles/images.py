@@ -6,6 +6,7 @@ blends towards it within half a pixel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,21 +29,13 @@ class ImageTexture:
     def colors(self, uv: np.ndarray) -> np.ndarray:
         """Linear colors (Q, 3) at uv (Q, 2)."""
         height, width = self.pixels.shape[:2]
-        place = np.asarray(uv, dtype=np.float64) * (width, height)
-        if self.interpolation == "Closest":
-            found = self._at(*np.floor(place).astype(np.int64).T)
-        else:
-            corner = np.floor(place - 0.5)
-            (tx, ty), (x, y) = (place - 0.5 - corner).T[:, :, None], corner.astype(np.int64).T
-            below = (1.0 - tx) * self._at(x, y) + tx * self._at(x + 1, y)
-            above = (1.0 - tx) * self._at(x, y + 1) + tx * self._at(x + 1, y + 1)
-            found = (1.0 - ty) * below + ty * above
+        found = interpolated(np.asarray(uv, dtype=np.float64), (width, height), self.interpolation, self._at)
         return _decoded(found) if self.srgb else found
 
     def _at(self, x, y):
         """Values (Q, 3) of pixels anywhere in the plane."""
         height, width = self.pixels.shape[:2]
-        columns, rows = (_within(index, size, self.extension) for index, size in ((x, width), (y, height)))
+        columns, rows = (within(index, size, self.extension) for index, size in ((x, width), (y, height)))
         found = self.pixels[rows, columns].astype(np.float64)
         if self.pixels.dtype == np.uint8:
             found /= 255.0
@@ -51,7 +44,21 @@ class ImageTexture:
         return found
 
 
-def _within(index, size, extension):
+def interpolated(uv: np.ndarray, size: tuple[int, int], interpolation: str, pixel: Callable) -> np.ndarray:
+    """Values at uv (Q, 2) of an image of `size` (width, height); `pixel(x, y)` gives those of pixels in the plane."""
+    place = uv * np.array(size, uv.dtype)
+    if interpolation == "Closest":
+        return pixel(*np.floor(place).astype(np.int64).T)
+    corner = np.floor(place - 0.5)
+    x, y = corner.astype(np.int64).T
+    corners = [pixel(x, y), pixel(x + 1, y), pixel(x, y + 1), pixel(x + 1, y + 1)]
+    tx, ty = ((place - 0.5 - corner)[:, axis].reshape(-1, *[1] * (corners[0].ndim - 1)) for axis in (0, 1))
+    below, above = ((1.0 - tx) * left + tx * right for left, right in (corners[:2], corners[2:]))
+    return (1.0 - ty) * below + ty * above
+
+
+def within(index: np.ndarray, size: int, extension: str) -> np.ndarray:
+    """The columns or rows (Q,) of an image that stand for those at `index` (Q,) anywhere in the plane."""
     if extension == "REPEAT":
         return index % size
     if extension == "MIRROR":

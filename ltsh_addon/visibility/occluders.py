@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..cycles.images import EXTENSIONS, INTERPOLATIONS, interpolated, within
 from ..files import replacing
 
-EXTENSIONS = ("REPEAT", "EXTEND", "CLIP", "MIRROR")
-INTERPOLATIONS = ("Linear", "Closest")
 # Bits of a mask: all kinds of rays.
 ALL_RAYS = 0xFFFFFFFF
 # Cycles' default of `Object.cycles.shadow_terminator_geometry_offset`.
@@ -58,33 +57,16 @@ class Transparency:
 
     def _image_at(self, uv):
         height, width = self.image.shape
-        place = uv * np.array((width, height), uv.dtype)
-        if self.interpolation == "Closest":
-            x, y = np.floor(place).astype(np.int64).T
-            return self._pixel(x, y)
-        corner = np.floor(place - 0.5)
-        (tx, ty), (x, y) = (place - 0.5 - corner).T, corner.astype(np.int64).T
-        below = (1.0 - tx) * self._pixel(x, y) + tx * self._pixel(x + 1, y)
-        above = (1.0 - tx) * self._pixel(x, y + 1) + tx * self._pixel(x + 1, y + 1)
-        return (1.0 - ty) * below + ty * above
+        return interpolated(uv, (width, height), self.interpolation, self._pixel)
 
     def _pixel(self, x, y):
         """Shares of pixels anywhere in the plane; all light passes where there is no image."""
         height, width = self.image.shape
-        columns, rows = _within(x, width, self.extension), _within(y, height, self.extension)
+        columns, rows = within(x, width, self.extension), within(y, height, self.extension)
         found = self.image[rows, columns]
         if self.extension == "CLIP":
             found = np.where((x == columns) & (y == rows), found, self.outside)
         return found
-
-
-def _within(index, size, extension):
-    if extension == "REPEAT":
-        return index % size
-    if extension == "MIRROR":
-        folded = index % (2 * size)
-        return np.where(folded < size, folded, 2 * size - 1 - folded)
-    return np.clip(index, 0, size - 1)
 
 
 @dataclass(frozen=True)

@@ -247,18 +247,12 @@ def _color(text: str) -> tuple[float, ...]:
 def _relight(arguments, bar, open_file) -> int:
     from ..pipeline.relight import LightChange, relight
 
-    changes = [LightChange(**change) for change in arguments.changes]
-    report = relight(arguments.folder, changes, arguments.output, bar)
-    bar.finish()
     output = arguments.output or arguments.folder / "relit"
-    reports = report.get("reports", [report])
-    files = [str(output / name) for one in reports for name in one["files"]]
-    return _printed(arguments, report, 0) if arguments.json else _said(files)
-
-
-def _said(lines: list[str]) -> int:
-    print_out("\n".join(lines))
-    return 0
+    report = relight(arguments.folder, [LightChange(**change) for change in arguments.changes], output, bar)
+    bar.finish()
+    if not arguments.json:
+        print_out("\n".join(str(output / name) for one in report.get("reports", [report]) for name in one["files"]))
+    return _printed(arguments, report, 0)
 
 
 RUN = "Do the jobs of a file, each a shade, compare or bake, one after another."

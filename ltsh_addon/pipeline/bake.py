@@ -282,7 +282,9 @@ class ObjectBaker:
         layers, shares = {}, None
         if self.tracer is not None:
             options = self.options
-            passes = shaded_passes(options) | ({"diffuse"} & {name[:7] for name in options.passes})
+            passes = shaded_passes(options)
+            if "diffuse_light" in options.passes:
+                passes = passes | {"diffuse"}
             rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
             workers = 1 if self._threads() > 1 else None
             rows = min(block_rows(options), options.size[1] - first)

@@ -44,8 +44,8 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
-    hidden = ("cycles_", ERROR), UNSHADOWED
-    names = [name for name in _techniques(layers) if not name.startswith(hidden[0]) and not name.endswith(hidden[1])]
+    names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
+    names = [name for name in names if not name.endswith(UNSHADOWED)]
     passes = [name for name in BAKE_PASSES if f"{names[0]}.{name}" in layers]
     _add_combined(layers, names, passes)
     written = {}

@@ -90,15 +90,17 @@ class ShadowTracer:
         """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        settings = {
-            "passes": passes,
-            "rays": rays,
-            "film": film,
-            "is_baked": self._is_baked,
-            "workers": workers,
-            "progress": progress,
-        }
-        found = visibility.visible_shares(samples, self._lights, self._tracer, **settings)
+        found = visibility.visible_shares(
+            samples,
+            self._lights,
+            self._tracer,
+            passes=passes,
+            rays=rays,
+            film=film,
+            is_baked=self._is_baked,
+            workers=workers,
+            progress=progress,
+        )
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
@@ -146,7 +148,7 @@ def shade_lights(
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = tuple(_in_group(light, str(number)) for number, light in enumerate(part))
+        own = tuple(replace(light, group=str(number)) for number, light in enumerate(part))
         found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
         if found.quadrature_error is not None:
             error = found.quadrature_error if error is None else error + found.quadrature_error
@@ -159,10 +161,6 @@ def shade_lights(
                     seen[name][group] += shares[name][first + number][:, None] * radiance
     unshadowed = _shading(groups, plain, error)
     return Lit(unshadowed) if shares is None else Lit(_shading(groups, seen, error), unshadowed)
-
-
-def _in_group(light: AreaLight, group: str) -> AreaLight:
-    return replace(light, group=group, detail=tuple(_in_group(part, group) for part in light.detail))
 
 
 def _shading(groups, radiance, error) -> shading.Shading:

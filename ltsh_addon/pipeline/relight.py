@@ -26,34 +26,31 @@ class LightChange:
     color: tuple[float, float, float] | None = None  # in place of its own, whose brightest channel counts as 1
 
 
-def relight(
-    folder: Path, changes: Sequence[LightChange], output: Path | None = None, progress: Progress | None = None
-) -> dict:
-    """Write the pictures that `folder` has kept samples of with changed lights into `output` (default: relit in it).
+def relight(folder: Path, changes: Sequence[LightChange], output: Path, progress: Progress | None = None) -> dict:
+    """Write the pictures that `folder` has kept samples of with changed lights into `output`.
 
     Files and layers have the same names, but for those of Cycles. Returns report.json of the only picture, else
     {"reports": [...]}. Raises ValueError for an unknown light or where nothing was kept, OSError, TableError.
     """
-    folder = Path(folder)
-    output = folder / "relit" if output is None else Path(output)
-    files = sorted(path for path in folder.rglob(f"*{KEPT_SUFFIX}") if folder / "relit" not in path.parents)
+    folder, output = Path(folder), Path(output)
+    files = sorted(folder.rglob(f"*{KEPT_SUFFIX}"))
     if not files:
         raise ValueError(f"{folder}: no picture kept its samples there; run shade or compare with --keep-visibility")
-    reports = [_relit(path, changes, output / path.parent.relative_to(folder), progress) for path in files]
+    reports = [_relit(path, path.relative_to(folder), changes, output, progress) for path in files]
     report = reports[0] if len(reports) == 1 else {"reports": reports}
     imaging.write_json(output / "report.json", report)
     return report
 
 
-def _relit(path: Path, changes, output: Path, progress) -> dict:
+def _relit(path: Path, place: Path, changes, output: Path, progress) -> dict:
+    """The report of the picture that kept its samples in `path`; its files are at the same `place` below `output`."""
     kept = KeptPicture.load(path)
     lights = changed_lights(kept.extraction.lights, changes)
-    name = path.name.removesuffix(KEPT_SUFFIX)
+    name = place.as_posix().removesuffix(KEPT_SUFFIX)
     options = PictureOptions(output=output, name=name, **kept.options)
     tables = picture.prepare(options)
-    warnings = [line for line in kept.extraction.warnings if line != NO_CYCLES]
-    warnings += [NO_CYCLES] if kept.had_cycles else []
-    extraction = replace(kept.extraction, lights=lights, warnings=tuple(warnings))
+    warnings = kept.extraction.warnings + ((NO_CYCLES,) if kept.had_cycles else ())
+    extraction = replace(kept.extraction, lights=lights, warnings=warnings)
     results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
     comparison = picture.Comparison(options, extraction, results, kept.shadows)
     changed = [{"light": change.name, "power": change.power, "color": change.color} for change in changes]

@@ -100,7 +100,10 @@ class Task:
         for index, patches in fitting_patches(light, samples, name == "specular"):
             own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
-            self._add(samples.take(index), self._prepared(patches), own, own_error, scratch, {})
+            # Of the group of the whole light, whatever theirs are.
+            group = self.groups.index(light.group)
+            prepared = [(patch, group, patch.polygon()) for patch in patches]
+            self._add(samples.take(index), prepared, own, own_error, scratch, {})
             radiance[:, index] += own[name]
             if error is not None:
                 error[index] += own_error

@@ -197,9 +197,11 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     )
     extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
     names = list(dict.fromkeys(job.shaded_as().values()))
-    share, start, shares = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE, None
+    share, start = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE
+    shares, warnings = None, extraction.warnings
     if extraction.occluders is not None:
-        shares = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share)).shares
+        shadows = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share))
+        shares, warnings = shadows.shares, warnings + shadows.warnings
     images = {
         name: _images(extraction, name, shares, _part(progress, start + (index + 1) * share, share))
         for index, name in enumerate(names)
@@ -217,7 +219,7 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
         color = color + emission
     coverage = inside_border(extraction.film.coverage(), extraction.border)
     combined = _over_background(color, coverage, job, extraction.exposure)
-    return FinalPicture(combined, passes, extraction.warnings, extraction.problems)
+    return FinalPicture(combined, passes, warnings, extraction.problems)
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -68,6 +68,7 @@ def bake_objects(
     start = time.perf_counter()
     _check(options)
     client.check_readable(options.scene)
+    picture.check_named(options.techniques, "a bake that is resumed")
     tables = picture.prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:

@@ -125,7 +125,7 @@ class Lit:
 def shade_lights(
     samples: SurfaceSamples,
     lights: Sequence[AreaLight],
-    table: str | shading.LookupTable,
+    table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
     shares: dict[str, np.ndarray] | None = None,
     *,

@@ -323,7 +323,8 @@ class PictureOptions:
     camera: str | None = _camera()
     name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
     output: Path = _output()
-    techniques: tuple[str, ...] = _techniques(tuple(TECHNIQUES))
+    # Names, paths of tables, or from Python a `shading.OwnTechnique`.
+    techniques: tuple[Any, ...] = _techniques(tuple(TECHNIQUES))
     passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
     resolution: tuple[int, int] | None = option(
         "--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file"

@@ -85,7 +85,11 @@ def _with_report(options, with_cycles, progress):
     return {**picture.report, "seconds": picture.seconds}
 
 
-def prepare(options) -> dict[str, str | shading.LookupTable]:
+# What shades: the reference by its name, a table, or what a script has given.
+Shader = str | shading.LookupTable | shading.OwnTechnique
+
+
+def prepare(options) -> dict[str, Shader]:
     """Tables by the names under which techniques appear in results; proves that the output folder takes files.
 
     Done before anything takes long. Raises TableError, OSError.
@@ -99,13 +103,13 @@ def prepare(options) -> dict[str, str | shading.LookupTable]:
     return tables
 
 
-def load_tables(techniques: Sequence[str]) -> dict[str, str | shading.LookupTable]:
+def load_tables(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, Shader]:
     """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
     return {name: _table(given) for name, given in technique_names(techniques).items()}
 
 
-def _table(given: str) -> str | shading.LookupTable:
-    if given == REFERENCE:
+def _table(given) -> Shader:
+    if shading.is_own(given) or given == REFERENCE:
         return given
     # A job of many frames needs the shipped ones for each; a table of the user may change meanwhile.
     return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
@@ -114,18 +118,28 @@ def _table(given: str) -> str | shading.LookupTable:
 _shipped_table = cache(shading.load_table)
 
 
-def technique_names(techniques: Sequence[str]) -> dict[str, str]:
+def technique_names(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, str | shading.OwnTechnique]:
     """What was given, by the names under which techniques appear in results: those of tables are short."""
     names = {}
     for given in techniques:
-        name = given if given in TECHNIQUES else _short_name(given, names)
-        names[name] = given
+        own = shading.is_own(given)
+        stem = str(getattr(given, "name", type(given).__name__)) if own else Path(given).stem
+        names[given if not own and given in TECHNIQUES else _short_name(stem, names)] = given
     return names
 
 
-def _short_name(path: str, taken) -> str:
-    """The name of a table's file without folder and dots, which separate the parts of a layer's name."""
-    stem = Path(path).stem.replace(".", "_")
+def check_named(techniques: Sequence, what: str) -> None:
+    """Raises ValueError where `what` would have to call a technique of the user later."""
+    if own := [_described(given) for given in techniques if shading.is_own(given)]:
+        raise ValueError(
+            f"technique {own[0]}: {what} cannot call it later, expected {', '.join(TECHNIQUES)} or the path of a table "
+            "(.npz); leave it out"
+        )
+
+
+def _short_name(stem: str, taken) -> str:
+    """A name without dots, which separate the parts of a layer's name, that nothing else has."""
+    stem = stem.replace(".", "_")
     candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
     reserved = {*TECHNIQUES, CYCLES, *taken}
     return next(name for name in candidates if name not in reserved)
@@ -140,6 +154,8 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     if with_cycles and options.cycles_samples < 2:
         raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
+    if options.keep_visibility:
+        check_named(options.techniques, "with keep_visibility, relight")
     start = time.perf_counter()
     tables = prepare(options)
     width, height = options.resolution or (None, None)
@@ -310,7 +326,7 @@ class Comparison:
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": [_light_report(light) for light in extraction.lights],
             "versions": versions(extraction.blender_version),
-            "tables": dict(zip(self.results, options.techniques, strict=True)),
+            "tables": {name: _described(given) for name, given in technique_names(options.techniques).items()},
             "reference": self._reference_facts(),
             "shadows": None if self.shadows is None else self.shadows.report(),
             "passes": {name: self._pass_report(name) for name in options.passes},
@@ -523,6 +539,11 @@ def _light_report(light) -> dict:
         "radiance": light.radiance.tolist(),
         "patches": len(light.patches),
     }
+
+
+def _described(given) -> str:
+    """A technique in report.json: its name, the path of its table, or the class of a user's own."""
+    return f"{type(given).__module__}.{type(given).__qualname__}" if shading.is_own(given) else str(given)
 
 
 def _title(name: str) -> str:

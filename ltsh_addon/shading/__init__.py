@@ -12,7 +12,7 @@ functions have space as the last axis, kernels work on (3, V, P).
 """
 
 from ..scene import PASSES, REFERENCE, SHIPPED_TABLES
-from .integrator import Shading, shade
+from .integrator import OwnTechnique, Shading, is_own, shade
 from .lobes import clamped_form_factor, evaluate_lobe, integrate_polygon
 from .lookup_table import LookupTable, TableError, load_table
 
@@ -21,11 +21,13 @@ __all__ = [
     "REFERENCE",
     "SHIPPED_TABLES",
     "LookupTable",
+    "OwnTechnique",
     "Shading",
     "TableError",
     "clamped_form_factor",
     "evaluate_lobe",
     "integrate_polygon",
+    "is_own",
     "load_table",
     "shade",
 ]

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
-from ..scene import PASSES, REFERENCE, AreaLight, SurfaceSamples
+from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, SurfaceSamples
 from . import float32, float64, light_cone, moments32, parallel
 from .light_polygons import fitting_patches
 from .lobes import FLOAT64_CHUNK
@@ -153,10 +154,27 @@ class Shading:
         return sum(part.sum(axis=0) for part in (self.specular, self.diffuse) if part is not None)
 
 
+class OwnTechnique(Protocol):
+    """A technique of the user: anything with this method, and a `name` if it shall have another than its class."""
+
+    def evaluate(self, samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> Shading:
+        """Radiance of `samples` (P) under `lights` together: its light groups are added up.
+
+        The lights have no `detail`. What is left to the caller: whether the passes or the receivers of a light
+        include a sample, and a diffuse pass that is None, which then is the exact one.
+        """
+        ...
+
+
+def is_own(technique: Any) -> bool:
+    """True for an `OwnTechnique`."""
+    return callable(getattr(technique, "evaluate", None))
+
+
 def shade(
     samples: SurfaceSamples,
     lights: Iterable[AreaLight],
-    technique: str | Path | LookupTable = "ltsh4",
+    technique: str | Path | LookupTable | OwnTechnique = "ltsh4",
     *,
     passes: Sequence[str] = PASSES,
     workers: int | None = None,
@@ -165,21 +183,60 @@ def shade(
 ) -> Shading:
     """Direct, unoccluded reflected radiance of `samples` (P) under `lights`.
 
-    `technique` is "reference" (quadrature of the true BRDF), a shipped table, a table's path or a LookupTable. Diffuse
-    is exact for polygons in every technique. `workers` processes (default: all cores) give the same result bit for bit;
-    few samples are shaded in this process. `progress(fraction)` may return False to stop: Cancelled is raised.
+    `technique` is "reference" (quadrature of the true BRDF), a shipped table, a table's path, a LookupTable or an
+    OwnTechnique. Diffuse is exact for polygons in every technique but those. `workers` processes (default: all
+    cores) give the same result bit for bit; few samples are shaded in this process. `progress(fraction)` may return
+    False to stop: Cancelled is raised.
     With `dtype` float32 radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance,
     for lights with a spread of that straight ahead; their spread is exact to 0.3 % (see `light_cone`);
     points where single precision does not suffice are computed in double, and so are lights a thousand times as long
     as wide, which in single have an error of 4e-4 of their light. "reference" and degrees above 4 always are.
     Raises TableError and ValueError.
     """
+    if is_own(technique):
+        return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype))
     task = _task(tuple(lights), technique, passes, dtype)
     count = len(samples)
     result = _Result(task, count, np.dtype(dtype))
     blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
     parallel.run(task, samples, blocks, workers, result, progress)
     return Shading(task.groups, result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
+
+
+def _shade_with(technique, samples, lights, passes, how) -> Shading:
+    """What an OwnTechnique gives, one light after another."""
+    _check_passes(passes)
+    workers, progress, dtype = how
+    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
+    radiance = {name: np.zeros((len(groups), len(samples), 3), dtype) for name in passes}
+    for number, light in enumerate(lights):
+        found = technique.evaluate(samples, light.patches) if light.area_vector.any() else None
+        for name in passes if found is not None else ():
+            if not getattr(light, f"affects_{name}"):
+                continue
+            own = _own_pass(technique, found, name, len(samples))
+            if own is None:
+                own = shade(samples, [light], passes=(name,), workers=workers, dtype=dtype).diffuse
+            received = light.receives(samples.receiver)
+            own = np.asarray(own).sum(axis=0)
+            radiance[name][groups.index(light.group)] += own if received is None else own * received[:, None]
+        if progress is not None and progress((number + 1) / len(lights)) is False:
+            raise Cancelled("shading was stopped")
+    return Shading(groups, radiance.get("specular"), radiance.get("diffuse"))
+
+
+def _own_pass(technique, found, name, count) -> np.ndarray | None:
+    """A pass (G, P, 3) of what an OwnTechnique has returned. Raises ValueError where it is not fit."""
+    subject = f"technique {type(technique).__name__}: evaluate"
+    if not isinstance(found, Shading):
+        raise ValueError(f"{subject} returned {type(found).__name__}, expected a ltsh_addon.shading.Shading")
+    values = getattr(found, name)
+    if values is None and name == "diffuse":
+        return None
+    shape = np.shape(values)
+    if len(shape) != 3 or shape[1:] != (count, 3):
+        raise ValueError(f"{subject} returned {name} of shape {shape}, expected (groups, {count}, 3)")
+    return values
 
 
 class _Result:
@@ -233,10 +290,13 @@ def _blocks(count: int, least: int, most: int) -> list[slice]:
     return blocks
 
 
-def _task(lights, technique, passes, dtype) -> Task:
-    unknown = [name for name in passes if name not in PASSES]
-    if unknown or not passes:
+def _check_passes(passes) -> None:
+    if not passes or not set(passes) <= set(PASSES):
         raise ValueError(f"passes are {list(passes)}, expected some of {', '.join(PASSES)}")
+
+
+def _task(lights, technique, passes, dtype) -> Task:
+    _check_passes(passes)
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise ValueError(f"dtype is {np.dtype(dtype)}, expected float32 or float64")
     table = technique

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -289,3 +290,68 @@ def test_shade_writes_its_layers_and_report_and_nothing_else(child, tmp_path):
     compare_scene(options(tmp_path))
     compared = written(tmp_path)
     assert set(shaded) < set(compared) and all(np.array_equal(shaded[name], compared[name]) for name in shaded)
+
+
+def own_technique():
+    """The class that docs/reference.md shows."""
+    text = (TABLES.parent / "docs" / "reference.md").read_text(encoding="utf-8")
+    code = next(block for block in re.findall(r"^```python\n(.*?)^```", text, re.M | re.S) if "class Center" in block)
+    names: dict = {}
+    exec(code, names)
+    return names["Center"]()
+
+
+def test_the_technique_that_the_reference_shows_takes_part_in_a_comparison(child, tmp_path):
+    technique = own_technique()
+    report = compare_scene(options(tmp_path, techniques=("ltsh4", technique)))
+    assert list(report["tables"]) == ["ltsh4", "center"] and report["tables"]["center"].endswith(".Center")
+    error = report["passes"]["specular"]["techniques"]["center"]["against_cycles"]["unbiased_relative_error"]
+    assert 0.0 < error < 2.0
+    layers, film = written(tmp_path), fake_scene.film()
+    expected = technique.evaluate(fake_scene.samples(len(film.pixel)), fake_scene.lights()).specular.sum(axis=0)
+    assert np.allclose(layers["center.specular"], film.image(expected), rtol=1e-5)
+    assert np.array_equal(layers["center.diffuse"], layers["ltsh4.diffuse"])
+    assert {"center.specular@Key", "error_center.specular"} <= set(layers)
+
+
+def test_the_technique_that_the_reference_shows_is_right_for_small_lights():
+    """The integral over a light of the side h is lobe x solid angle, but for terms of h^2."""
+    samples, light = fake_scene.samples(40), fake_scene.lights()[0]
+    ones = np.ones((40, 3))
+    samples = replace(samples, specular_f0=ones, specular_f90=ones, dielectric=0.0 * ones)
+    light = replace(light, half_u=light.half_u / 100.0, half_v=light.half_v / 100.0)
+    found = shading.shade(samples, [light], own_technique()).specular
+    expected = shading.shade(samples, [light], "ltsh4", dtype=np.float64).specular
+    bright = expected > 0.05 * expected.max()
+    assert bright.sum() > 20 and np.allclose(found[bright], expected[bright], rtol=2e-3)
+
+
+def test_light_linking_and_the_passes_of_a_light_hold_for_techniques_of_ones_own():
+    samples = replace(fake_scene.samples(6), receiver=np.array([0, 1, 0, 1, 0, 1]))
+    light = replace(fake_scene.lights()[0], receivers=(1,), affects_diffuse=False)
+    found = shading.shade(samples, [light], own_technique())
+    assert not found.specular[0, ::2].any() and not found.diffuse.any()
+
+
+@pytest.mark.parametrize(
+    ("returned", "problem"),
+    [
+        (np.zeros(3), "returned ndarray, expected a ltsh_addon.shading.Shading"),
+        (
+            shading.Shading(("",), np.zeros((5, 3)), None),
+            r"returned specular of shape \(5, 3\), expected \(groups, 5, 3",
+        ),
+    ],
+)
+def test_a_technique_that_returns_something_else_is_named(returned, problem):
+    class Mine:
+        def evaluate(self, samples, lights):
+            return returned
+
+    with pytest.raises(ValueError, match=f"technique Mine: evaluate {problem}"):
+        shading.shade(fake_scene.samples(5), fake_scene.lights(), Mine())
+
+
+def test_techniques_of_ones_own_are_refused_where_they_would_be_called_later(child, tmp_path):
+    with pytest.raises(ValueError, match=r"Center: with keep_visibility, relight cannot call it later"):
+        compare_scene(options(tmp_path, techniques=(own_technique(),), keep_visibility=True))

@@ -222,6 +222,64 @@ def test_table_scripts_use_the_core_scipy_and_matplotlib_only():
     assert scripts and not problems, problems
 
 
+def names_of(path: Path) -> set[str]:
+    """What stands at the top level of a file, and the modules of its folder where it is a package."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    found = {part.stem for part in path.parent.iterdir()} if path.name == "__init__.py" else set()
+    inner = ast.FunctionDef, ast.ClassDef, ast.AsyncFunctionDef, ast.Lambda
+
+    def visit(node):
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Name) and isinstance(child.ctx, ast.Store):
+                found.add(child.id)
+            elif isinstance(child, ast.alias):
+                found.add((child.asname or child.name).split(".")[0])
+            if isinstance(child, inner):
+                found.add(getattr(child, "name", ""))
+            else:
+                visit(child)
+
+    visit(tree)
+    return found
+
+
+def missing_names(source: str, modules: dict[str, set[str]]) -> list[str]:
+    """What a script asks of `modules`, names by dotted name, that they do not have."""
+    known, asked = {}, []
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            known |= {alias.asname or alias.name: alias.name for alias in node.names if alias.name in modules}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for alias in node.names:
+                whole = f"{node.module}.{alias.name}"
+                if whole in modules:
+                    known[alias.asname or alias.name] = whole
+                elif node.module in modules:
+                    asked.append((node.module, alias.name, node.lineno))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known:
+            asked.append((known[node.value.id], node.attr, node.lineno))
+    return [f"line {line}: {module}.{name}" for module, name, line in asked if name not in modules[module]]
+
+
+def test_missing_names_are_found():
+    modules = {"a.b": {"c"}, "d": {"e"}}
+    assert missing_names("from a import b\nimport d\nb.c, d.e, b.x\nfrom d import y", modules) == [
+        "line 4: d.y", "line 3: a.b.x"
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("folder", ["benchmarks", "soak"])
+def test_long_scripts_ask_only_for_what_there_is(folder):
+    """`make test` does not run them."""
+    scripts = sources(ROOT / "tests" / folder)
+    modules = {dotted(path): names_of(path) for path in sources(PACKAGE)}
+    modules |= {path.stem: names_of(path) for path in scripts}
+    problems = [f"{path.name} {line}" for path in scripts for line in missing_names(path.read_text("utf-8"), modules)]
+    assert scripts and not problems, "\n".join(problems)
+
+
 @pytest.mark.parametrize(
     "module",
     "scene shading cycles.texels imaging pipeline pipeline.picture cli __main__ blender.process.client".split(),

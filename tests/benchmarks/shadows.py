@@ -233,7 +233,7 @@ class Measured:
 
     def _by_light(self, technique, passes):
         """Radiance (L, P, 3) of every light, all of it seen."""
-        lights = [lighting._in_group(light, str(number)) for number, light in enumerate(self.extraction.lights)]
+        lights = [replace(light, group=str(number)) for number, light in enumerate(self.extraction.lights)]
         return shading.shade(self.extraction.samples, lights, technique, passes=passes)
 
     def _images(self, shares):

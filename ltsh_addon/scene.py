@@ -90,6 +90,8 @@ class AreaLight:
     by max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
     At the distance t from its points it is also multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
     Falloff node: 0 is quadratic, 1 linear, 2 constant.
+    A light that `is_distant` is infinitely far away: center, half_u, half_v and corners are directions to it, of any
+    length, and every point is where it is seen from.
     """
 
     name: str
@@ -108,6 +110,7 @@ class AreaLight:
     detail: tuple[AreaLight, ...] = ()
     falloff: int = 0  # power of the distance in m
     smooth: float = 0.0  # m^2
+    is_distant: bool = False
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -137,6 +140,8 @@ class AreaLight:
                 f"light {self.name!r}: falloff is {self.falloff!r} and smooth is {self.smooth!r}, expected 0, 1 or 2 "
                 "and a finite number that is not negative"
             )
+        if self.is_distant and self.is_profiled:
+            raise ValueError(f"light {self.name!r}: it is distant, expected neither spread nor falloff")
         if self.receivers is not None:
             object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
         detail = tuple(part if isinstance(part, AreaLight) else AreaLight(**part) for part in self.detail)
@@ -149,9 +154,15 @@ class AreaLight:
 
     def moved(self, offset: np.ndarray) -> AreaLight:
         """The same light elsewhere by `offset` (3,) in m."""
+        if self.is_distant:
+            return self
         corners = None if self.corners is None else self.corners + offset
         detail = tuple(part.moved(offset) for part in self.detail)
         return replace(self, center=self.center + offset, corners=corners, detail=detail)
+
+    def origins(self, position: np.ndarray) -> np.ndarray:
+        """From where the light is seen at `position` (...): there, or where directions start."""
+        return np.zeros_like(position) if self.is_distant else position
 
     def record(self) -> dict:
         """This light as JSON has it; AreaLight(**record) reads it back."""

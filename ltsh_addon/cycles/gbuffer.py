@@ -133,6 +133,7 @@ def coarse_meshes(samples: SurfaceSamples) -> list[str]:
 def rounded_positions(position: np.ndarray, lights) -> list[str]:
     """The warning about positions (P, 3) so far from the origin that single precision tells them badly apart."""
     some = position[:: max(1, len(position) // FEW_SAMPLES)]
+    lights = [light for light in lights if not light.is_distant]
     if len(some) == 0 or not lights:
         return []
     apart = np.spacing(np.abs(some).max(axis=1).astype(np.float32)).astype(np.float64)

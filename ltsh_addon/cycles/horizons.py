@@ -170,7 +170,7 @@ def horizon_excess(
 def _solid_angle(position, light) -> np.ndarray:
     """Solid angle (P,) of the light in sr, 0 from behind it."""
     axes = np.concatenate([_plane_axes(light), -light.direction[None]])
-    corners = np.einsum("ak,pvk->avp", axes, light.polygon() - position[:, None])
+    corners = np.einsum("ak,pvk->avp", axes, light.polygon() - light.origins(position)[:, None])
     whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
     return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
 
@@ -184,11 +184,11 @@ def _plane_axes(light) -> np.ndarray:
 
 def _crosses(samples, light) -> np.ndarray:
     """Mask (P,): from where the light is not wholly on one side of both horizons."""
-    corners, above = light.polygon(), []
+    corners, above, position = light.polygon(), [], light.origins(samples.position)
     for normal in (samples.smooth_normal, samples.geometric_normal):
-        above.append(normal @ corners.T > (normal * samples.position).sum(axis=1, keepdims=True))
+        above.append(normal @ corners.T > (normal * position).sum(axis=1, keepdims=True))
     above = np.concatenate(above, axis=1)
-    return above.any(axis=1) & ~above.all(axis=1) & ((light.center - samples.position) @ light.direction < 0.0)
+    return above.any(axis=1) & ~above.all(axis=1) & ((light.center - position) @ light.direction < 0.0)
 
 
 def _lobe_density(samples, towards) -> np.ndarray:
@@ -235,7 +235,7 @@ def _directions(samples):
 
 def _hits(light, position, towards) -> np.ndarray:
     """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
-    axes = _plane_axes(light)
+    axes, position = _plane_axes(light), light.origins(position)
     outline = (light.polygon() - light.center) @ axes.T
     steepness = towards @ light.direction
     height = ((light.center - position) @ light.direction)[:, None, None]

@@ -105,6 +105,16 @@ def light_chances(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLi
         own[number] = light_bounds(light, position, normal)
     if len(lights) > MOST_LIGHTS:
         return chances_of(own)
+    distant = np.array([light.is_distant for light in lights], dtype=bool)
+    if distant.all():
+        return chances_of(own)
+    if distant.any():
+        # Next to the tree of the others, as one of the halves of the whole.
+        near, chances = np.flatnonzero(~distant), np.zeros((len(lights), len(position)))
+        shares = chances_of(np.stack([own[near].sum(axis=0), own[distant].sum(axis=0)]))
+        chances[near] = shares[0] * light_chances(position, normal, tuple(lights[number] for number in near))
+        chances[distant] = shares[1] * chances_of(own[distant])
+        return chances
     chances = np.zeros((len(lights), len(position)))
     clusters = [(_tree(np.array([_row(light) for light in lights]).tobytes(), len(lights)), np.ones(len(position)))]
     while clusters:
@@ -130,7 +140,7 @@ def chances_of(bounds: np.ndarray) -> np.ndarray:
 
 def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """The most and the least (2, P) that points (P, 3) with normals may get from one light, by its rectangle."""
-    offset = light.center - position
+    offset = light.center - light.origins(position)
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
     corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]

@@ -129,7 +129,7 @@ class _Lighting:
                 needs_float64.append(index if allowed is None else index[allowed])
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width):
-                offset = np.subtract(light.center[:, None], position[:, part]).astype(np.float32)
+                offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
                 toward = dot(offset, light.direction.astype(np.float32))
                 facing = toward < 0.0
                 if allowed is not None:
@@ -192,7 +192,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.is_profiled or light.is_round else (0, len(corners))
+        own = (1, position) if light.is_profiled or light.is_round else (0, len(corners) + 1j * light.is_distant)
         batches.setdefault(own, []).append(position)
     for (alone, _), chosen in sorted(batches.items()):
         among = np.full(len(lights), -1)
@@ -214,7 +214,8 @@ def _light_of_each(items, number):
         for name in ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
     }
     corners = np.stack([corners for _, _, corners in items])
-    return float64.LightOfEachSample(**fields), 0, corners[number].transpose(1, 0, 2)
+    distant = items[0][0].is_distant
+    return float64.LightOfEachSample(**fields, is_distant=distant), 0, corners[number].transpose(1, 0, 2)
 
 
 def _is_narrow(light, corners) -> bool:

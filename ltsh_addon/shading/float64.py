@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,11 +41,16 @@ class LightOfEachSample:
     is_focused: bool = False
     is_profiled: bool = False
     is_round: bool = False
+    is_distant: bool = False
 
     def take(self, index) -> LightOfEachSample:
         """The lights of the samples `index`."""
         names = ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
-        return LightOfEachSample(**{name: getattr(self, name)[index] for name in names})
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+    def origins(self, position: np.ndarray) -> np.ndarray:
+        """As of an AreaLight."""
+        return np.zeros_like(position) if self.is_distant else position
 
     def receives(self, receiver, index):
         """None, as of a light without receivers: those that the light does not reach were left out before."""
@@ -154,7 +159,7 @@ def _limit(integrals, samples, index, light):
     """Limit integrals (4, Q) over the light of the samples `index` as `TailLimits` does."""
     own = light if light.center.ndim == 1 else light.take(index)
     axes = samples.normal[index].T, samples.view[index].T
-    offset = (own.center - samples.position[index]).T
+    offset = (own.center - own.origins(samples.position[index])).T
     toward = dot(offset, own.direction.T)
     limits = TailLimits.of(axes, samples.roughness[index], samples.geometric_normal[index].T, True, samples.ior[index])
     limits.apply(integrals, slice(None), SeenLight.of(own, offset, toward), lambda name, shape: np.empty(shape))

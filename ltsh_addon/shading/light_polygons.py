@@ -57,6 +57,7 @@ def light_levels(light, corners, position, width):
 def round_levels(light, position, width):
     """Yield (corners (V, 3), chosen (Q',), None for all) of a round light for points with x, y, z in `position`
     (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    position = light.origins(position)
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     height = np.abs(sum(offset[axis] * light.direction[axis] for axis in range(3)))
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
@@ -163,7 +164,7 @@ def in_front(samples, light, candidates):
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )
-    facing = ((samples.position[candidates] - center) * direction).sum(axis=1) > 0.0
+    facing = ((light.origins(samples.position[candidates]) - center) * direction).sum(axis=1) > 0.0
     if light.is_focused:
         facing &= light_cone.may_reach(light, samples.position[candidates].T)
     allowed = light.receives(samples.receiver, candidates)
@@ -192,7 +193,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
         ends = np.stack([part.position.min(axis=0, initial=np.inf), part.position.max(axis=0, initial=-np.inf)])
         for light in lights:
             # How far the box around the samples reaches in front of the light.
-            ahead = ((ends - light.center) * light.direction).max(axis=0).sum()
+            ahead = ((light.origins(ends) - light.center) * light.direction).max(axis=0).sum()
             if light.name not in reached and ahead > 0.0:
                 pairs += len(part)
                 if pairs > MOST_PAIRS or _reaches(light, part, lobes):
@@ -209,7 +210,7 @@ def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bo
         candidates = np.flatnonzero(lobe)
         for start in range(0, len(candidates), CHUNK):
             index = in_front(samples, light, candidates[start : start + CHUNK])
-            offset = corners - samples.position[index]
+            offset = corners - light.origins(samples.position[index])
             heights = [(offset * normal[index]).sum(axis=-1).max(axis=0) for normal in horizons]
             if (np.minimum(*heights) > 0.0).any():
                 return True
@@ -231,7 +232,7 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
     if len(index) == 0:
         return
     corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
-    offset = (corners - samples.position[index]).transpose(2, 0, 1)
+    offset = (corners - light.origins(samples.position[index])).transpose(2, 0, 1)
     local = to_local(frame[:, :, index], offset)
     if light.is_profiled:
         local = np.concatenate([local, to_local(light_cone.plane_axes(light), offset)])
@@ -259,7 +260,7 @@ def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:
     """The view of a profiled light from the points `index`; the first three coordinates are those of the lobe,
     to_lobe(vectors (3, Q)), the others local."""
     axes = frame[:, :, index]
-    offset = (light.center - samples.position[index]).T
+    offset = (light.center - light.origins(samples.position[index])).T
 
     def along(vector):
         local = to_local(axes, np.broadcast_to(vector[:, None], offset.shape))
@@ -304,7 +305,7 @@ def _largest_size(patch, brightness: float) -> float:
 
 def _sizes(patch, samples, specular) -> np.ndarray:
     """Half the diagonal of `patch` (P,) by the length over which the rest of the integrand changes."""
-    offset = patch.center - samples.position
+    offset = patch.center - patch.origins(samples.position)
     distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
     size = np.hypot(np.linalg.norm(patch.half_u), np.linalg.norm(patch.half_v)) / distance
     width = np.ones(len(samples))

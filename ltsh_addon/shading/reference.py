@@ -300,7 +300,7 @@ def _uncut_ellipses(samples, frame, light, candidates):
     """Split the candidates: (those whose light is cut by the geometric horizon, the others that see it, for these the
     center and half axes in local frames)."""
     index = in_front(samples, light, candidates)
-    offset = (light.center - samples.position[index]).T
+    offset = (light.center - light.origins(samples.position[index])).T
     height, swing = _ellipse_extent(samples.geometric_normal[index].T, offset, light)
     cut = index[(height < swing) & (height > -swing)]
     index, offset = index[height >= swing], offset[:, height >= swing]

@@ -252,7 +252,7 @@ class Pairs:
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
-        offset = (light.center[:, None] - surface.position).astype(np.float32)
+        offset = (light.center[:, None] - light.origins(surface.position)).astype(np.float32)
         ahead = dot(light.direction.astype(np.float32), offset) < 0.0
         if light.is_focused:
             ahead &= light_cone.may_reach(light, surface.position)
@@ -314,7 +314,7 @@ class Pairs:
     def _corner_heights(self, name, members):
         """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
         surface, index = self.surface, self.index[members]
-        center = self.light.center[:, None] - surface.position[:, index]
+        center = self.light.center[:, None] - self.light.origins(surface.position[:, index])
         offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
         heights = [dot(offset, normal[:, None, index]) for normal in surface.horizons(name)]
         return np.minimum.reduce(heights), offset
@@ -335,6 +335,8 @@ class Pairs:
             toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
             distance = np.sqrt(dot(toward, toward))
             toward /= np.maximum(distance, _TINY)
+            if self.light.is_distant:
+                distance[:] = _FARTHEST
             aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
             found = self._transmittance(*(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             # Next to no light: it counts in no sum of samples.
@@ -490,7 +492,7 @@ class View:
     def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter, lobes: tuple[str, ...]):
         self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
-        offset = light.center[:, None] - np.take(surface.position, index, axis=1)
+        offset = light.center[:, None] - light.origins(np.take(surface.position, index, axis=1))
         self.height = (-dot(light.direction, offset)).astype(np.float32)
         self.offset = offset.astype(np.float32)
         corners = emitter.corners_from(self.offset, self.height)
@@ -541,6 +543,8 @@ class View:
         brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
         if brightness is not None:
             factor *= brightness
+        if light.is_distant:
+            distance[:] = _FARTHEST
         weights = {}
         if "specular" in self.lobes:
             weights["specular"] = self._specular(directions, local)

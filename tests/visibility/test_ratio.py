@@ -375,3 +375,19 @@ def test_the_number_of_rays_has_limits():
 def test_tracing_can_be_stopped():
     with pytest.raises(Cancelled):
         ratio.visible_shares(floor(4)[0], [panel()], OPEN, progress=lambda stage, share: False)
+
+
+def test_rays_to_distant_lights_have_no_end():
+    """A wall far behind where the light is written down covers what it covers of the directions, from everywhere."""
+    samples, film = floor(12)
+    light = panel(is_distant=True)
+    half = Tracer(lambda origins, directions, distances: (directions[:, 0] > 0.0) | (distances < 1e9))
+    found = ratio.visible_shares(samples, [light], half, rays=256, film=film)
+    here = dataclasses.replace(samples, position=np.zeros_like(samples.position))
+    near = Tracer(lambda origins, directions, distances: directions[:, 0] > 0.0)
+    expected = ratio.visible_shares(here, [dataclasses.replace(light, is_distant=False)], near, rays=256)
+    assert found.mixed.all()
+    for name in PASSES:
+        # Other places, other rays: about 2 % each.
+        difference = getattr(found, name) - getattr(expected, name)
+        assert np.sqrt(np.square(difference).mean()) < 0.04 and abs(difference.mean()) < 0.01

@@ -40,9 +40,9 @@ class ShownPicture:
 
 def _origin_of(lights, view: View) -> np.ndarray:
     """Near what is seen: single precision tells places far from the origin badly apart."""
-    if not lights:
+    places = np.array([light.center for light in lights if not light.is_distant])
+    if len(places) == 0:
         return np.zeros(3)
-    places = np.array([light.center for light in lights])
     return new_origin(places, places.mean(axis=0) if view.is_parallel else view.eye)
 
 

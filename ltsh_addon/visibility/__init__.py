@@ -1,14 +1,15 @@
 """Which share of a light is seen: occluders, rays through them, and what they leave of each light.
 
-`occluders` is what stands in the way, `rays` traces it. `directions` chooses where rays go, `ratio` makes shares of
-what they meet (`visible_shares`), and `crew` does all of it on several cores.
+`occluders` is what stands in the way, `rays` traces it, `starts` tells where rays start. `directions` chooses where
+they go, `ratio` makes shares of what they meet (`visible_shares`), and `crew` does all of it on several cores.
 """
 
 from __future__ import annotations
 
-from .occluders import OccluderMesh, Occluders, Transparency
+from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import Visibility, visible_shares
-from .rays import Hits, Starts, Tracer, open_tracer
+from .rays import Tracer, open_tracer
+from .starts import Starts
 
 __all__ = [
     "Hits",

@@ -18,6 +18,8 @@ ALL_RAYS = 0xFFFFFFFF
 TERMINATOR_OFFSET = 0.1
 # Cycles' default of transparent bounces: further transparent surfaces block.
 TRANSPARENT_SURFACES = 8
+# A ray goes on from a transparent surface by so much of its distance.
+STEP = np.float32(1.0 + 2.0**-21)
 
 
 @dataclass(frozen=True)
@@ -225,3 +227,15 @@ class Occluders:
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
         own = {name: head[name] for name in ("transparent_surfaces", "light_masks", "lone_choices")}
         return cls(tuple(meshes), **instances, **own)
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What H of R rays meet: the `ray`, how far away, which triangle of which instance, where on it."""
+
+    ray: np.ndarray  # (H,)
+    distance: np.ndarray  # (H,) m
+    instance: np.ndarray  # (H,)
+    triangle: np.ndarray  # (H,)
+    u: np.ndarray  # (H,) share of the second corner
+    v: np.ndarray  # (H,) share of the third

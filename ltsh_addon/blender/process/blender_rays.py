@@ -40,6 +40,7 @@ class BlenderCaster:
         self._occluders = self._folder / "occluders.npz"
         occluders.save(self._occluders)
         self._process = BlenderProcess(self._folder)
+        self.has = tuple(len(index) > 0 for index in occluders.split())
 
     def close(self) -> None:
         """End that Blender."""

@@ -1,0 +1,273 @@
+"""Where shadow rays start: on the triangle that a sample lies on, or as far above it as Cycles lets them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ..scene import SurfaceSamples
+from .occluders import ALL_RAYS, STEP, Hits, Occluders
+
+# Of the size of coordinates: 8 times their rounding in single precision; 2 times are too few, 4 seem to suffice.
+CLEARANCE = 2.0**-21
+# A sample is looked for so far from its place, in m for one near the origin, in so many surfaces, until it is as near
+# to one as that share of the way.
+NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
+
+
+class StartFinder:
+    """Finds the triangles of `occluders` that samples lie on; `caster` is as `rays.EmbreeCaster`."""
+
+    def __init__(self, occluders: Occluders, caster):
+        self._occluders, self._caster = occluders, caster
+        uses = np.bincount(occluders.mesh, minlength=len(occluders.meshes))
+        self._is_applied = uses[occluders.mesh] == 1
+        self._thickness = np.zeros(len(occluders.mesh))  # the largest of each instance, in m
+        thick = [mesh.thickness is not None and len(mesh.triangles) > 0 for mesh in occluders.meshes]
+        for number in np.flatnonzero(np.array(thick, bool)[occluders.mesh]):
+            self._thickness[number] = self._thickness_of(number, slice(None)).max()
+
+    def starts(self, samples: SurfaceSamples) -> Starts:
+        """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
+
+        Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
+        from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
+        occluders keeps a small distance from its surface. Triangles have their own normals here: that of a sample is
+        the smooth one where a lobe ends at the smooth horizon.
+        """
+        position, normal, smooth_normal = (
+            np.array(values, np.float32, order="C")
+            for values in (samples.position, samples.geometric_normal, samples.smooth_normal)
+        )
+        count, chunk = len(position), self._caster.chunk
+        reach = np.abs(position).max(axis=1, initial=0.0)
+        clearance = (CLEARANCE * 8.0 * reach).astype(np.float32)
+        lift, terminator = np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32)
+        for start in range(0, count, chunk):
+            part = slice(start, start + chunk)
+            found = self._triangles_at(position[part], normal[part], (NEARBY * (1.0 + reach[part])).astype(np.float32))
+            for number in np.unique(found.instance):
+                here = found.instance == number
+                shape = _Shape.of(self._occluders, found, here, self._is_applied[number])
+                index = start + found.ray[here]
+                clearance[index] = CLEARANCE * (reach[index] + shape.size)
+                if self._thickness[number] > 0.0:
+                    clearance[index] += self._thickness_of(number, found.triangle[here])
+                else:
+                    normal[index] = shape.face_normals(normal[index], smooth_normal[index])
+                if shape.normals is not None:
+                    lifts = shape.lifts(normal[index])
+                    lift[:, index] = lifts
+                    terminator[index] = self._occluders.terminators[number] * np.any(lifts, axis=(0, 2))
+        return Starts(position, normal, smooth_normal, clearance, lift, terminator)
+
+    def _thickness_of(self, instance, triangle) -> np.ndarray:
+        """World-space thickness (Q,) of triangles of an instance that has one, in m."""
+        thickness = self._occluders.meshes[self._occluders.mesh[instance]].thickness
+        scale = np.linalg.norm(self._occluders.matrices[instance][:, :3], axis=0).max()
+        return thickness[triangle] * np.float32(scale)
+
+    def _triangles_at(self, position, normal, reach) -> Hits:
+        """Which triangles samples lie on, within `reach` (P,) m or their thickness, as if rays had met them."""
+        found = self._nearest(position, normal, reach)
+        thickest = np.float32(self._thickness.max(initial=0.0))
+        if thickest == 0.0:
+            return found
+        rest = np.ones(len(position), bool)
+        rest[found.ray] = False
+        rest = np.flatnonzero(rest)
+        wider = self._nearest(position[rest], normal[rest], np.full(len(rest), thickest))
+        within = np.zeros(len(wider.ray), bool)
+        for number in np.unique(wider.instance[self._thickness[wider.instance] > 0.0]):
+            here = np.flatnonzero(wider.instance == number)
+            within[here] = wider.distance[here] <= self._thickness_of(number, wider.triangle[here])
+        wider = Hits(rest[wider.ray], *(getattr(wider, field.name) for field in fields(Hits)[1:]))
+        joined = zip(*((getattr(hits, field.name) for field in fields(Hits)) for hits in (found, wider)), strict=True)
+        return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
+
+    def _nearest(self, position, normal, reach) -> Hits:
+        """The triangles nearest to samples along their normals, up to `reach`; `distance` is how near."""
+        count = len(position)
+        origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
+        off = np.full(count, np.inf, np.float32)
+        best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))
+        for is_clear in (False, True):
+            near, index = np.zeros(count, np.float32), np.arange(count)
+            # The first triangle may be that of another surface, close above.
+            for _ in range(LAYERS if self._caster.has[is_clear] else 0):
+                rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
+                hits = self._caster.closest(is_clear, *rays)
+                index = index[hits.ray]
+                found = np.abs(hits.distance - reach[index])
+                closer = found < off[index]
+                for field in fields(Hits)[2:]:
+                    getattr(best, field.name)[index[closer]] = getattr(hits, field.name)[closer]
+                off[index[closer]] = found[closer]
+                near[index] = hits.distance * STEP
+                index = index[off[index] > CERTAIN * reach[index]]
+        there = np.isfinite(off)
+        return Hits(*(getattr(best, field.name)[there] for field in fields(Hits)))
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where shadow rays of P samples start, see `StartFinder.starts`; `origins` tells it for each ray."""
+
+    position: np.ndarray  # (P, 3) float32
+    geometric_normal: np.ndarray  # (P, 3)
+    smooth_normal: np.ndarray  # (P, 3)
+    clearance: np.ndarray  # (P,) m, so far from its plane a ray surely does not meet the sample's own triangle
+    lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
+    terminator: np.ndarray  # (P,) as Occluders.terminators, 0 for all that is flat
+
+    def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
+        return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
+
+    def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, S, Q) of S rays each from the samples `index` (Q,), along unit `directions` (3, S, Q)."""
+        normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
+        facing = _dot_rows(normal, directions)
+        side = np.copysign(self.clearance[index], facing)
+        smooth = np.flatnonzero(terminator)
+        lift = None
+        if len(smooth):
+            part = slice(None) if len(smooth) == len(index) else smooth
+            rays = directions[:, :, part], facing[:, part], terminator[part]
+            lift, own = self._lifts(index[part], *rays)
+            side[:, part] = np.where(own, np.abs(side[:, part]) * own, side[:, part])
+        found = side * normal
+        found += self.position[index].T[:, None]
+        if lift is not None:
+            found[:, :, part] += lift
+        return found
+
+    def at_surface(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Origins (3, R) of rays along unit `directions` (3, R) that start at the samples `index` (R,) themselves, as
+        those that Cycles sends on from a surface."""
+        normal = self.geometric_normal[index].T
+        found = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
+        found += self.position[index].T
+        return found
+
+    def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
+
+        They end at `distances`, finite, along `directions` from the sample, wherever they start.
+        """
+        origins = self.origins_of_rows(index, directions)
+        moved = origins - self.position[index].T[:, None]
+        lifted = np.flatnonzero(_dot_rows(moved, moved) > 4.0 * self.clearance[index] ** 2)
+        if len(lifted):
+            directions, distances = directions.copy(), distances.copy()
+            rows = directions.reshape(3, -1)
+            toward = rows[:, lifted] * distances.ravel()[lifted] - moved.reshape(3, -1)[:, lifted]
+            length = np.sqrt(_dot_rows(toward, toward))
+            rows[:, lifted] = toward / np.maximum(length, np.float32(1e-30))
+            distances.ravel()[lifted] = length
+        return origins, directions, distances
+
+    def _lifts(self, index, directions, facing, terminator):
+        """How far (3, S, Q) rays of smooth samples start from the sample, and where they start not to pass their own
+        triangle (S, Q): above it (1), below (-1) or where the direction tells (0)."""
+        smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
+        is_inside = smooth_facing < 0.0
+        flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
+        facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
+        grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
+        amount = np.clip(grazing, 0.0, 1.0)
+        outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
+        # As in Cycles, light from behind the own triangle meets it.
+        own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
+        return amount * np.where(is_inside, inside, outside), own
+
+
+def _dot_rows(first, second):
+    """Scalar products (S, Q) of vectors (3, S, Q)."""
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
+
+
+def _dot(first, second):
+    """Scalar products (R,) of vectors (R, 3)."""
+    return np.einsum("rk,rk->r", first, second)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """Q points on triangles of one instance: corners (Q, 3, 3) and normals there, all in the space in which Cycles has
+    them, or no normals where they are flat; shares (Q, 3) of the corners; and what takes directions to world space."""
+
+    corners: np.ndarray
+    normals: np.ndarray | None
+    shares: np.ndarray
+    to_world: np.ndarray | None
+    size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
+
+    @classmethod
+    def of(cls, occluders: Occluders, hits: Hits, here, is_applied: bool) -> _Shape:
+        """Those of the `hits` that are `here`, all on one instance."""
+        instance, triangle, u, v = hits.instance[here][0], hits.triangle[here], hits.u[here], hits.v[here]
+        mesh, matrix = occluders.meshes[occluders.mesh[instance]], occluders.matrices[instance]
+        named = mesh.triangles[triangle]
+        corners, normals = mesh.vertices[named].astype(np.float64), mesh.normals
+        if normals is not None:
+            normals = (normals[named] if normals.ndim == 2 else normals[triangle]).astype(np.float64)
+        shares = np.stack([1.0 - u - v, u, v], axis=-1)
+        in_world = corners @ matrix[:, :3].T
+        size = np.abs(in_world - in_world[:, :1]).max(axis=(1, 2))
+        if not is_applied:
+            return cls(corners, normals, shares, matrix[:, :3], size + np.abs(in_world).max(axis=(1, 2)))
+        if normals is not None:
+            normals = normals @ _cofactors(matrix[:, :3]).T
+            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+        return cls(in_world + matrix[:, 3], normals, shares, None, size)
+
+    def face_normals(self, geometric_normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
+        """Unit normals (Q, 3) of the triangles in world space: on the side of `geometric_normal` (Q, 3) where they are
+        flat, else of the side that has `smooth_normal` (Q, 3), which may point to the other side of its triangle.
+
+        Where a triangle has no area it is the former.
+        """
+        edges = self.corners[:, 1:] - self.corners[:, :1]
+        if self.to_world is not None:
+            edges = edges @ self.to_world.T
+        normal = np.cross(edges[:, 0], edges[:, 1])
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        if self.normals is None:
+            facing = _dot(normal, geometric_normal)
+        else:
+            own = np.einsum("qc,qck->qk", self.shares, self.normals)
+            facing = _dot(own if self.to_world is None else own @ _cofactors(self.to_world).T, smooth_normal)
+        normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
+        return np.divide(normal, length, out=geometric_normal.astype(np.float64), where=length > 0.0)
+
+    def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
+        """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
+        (Q, 3), and from the other: `shadow_ray_smooth_surface_offset` of Cycles."""
+        (v0, v1, v2), (n0, n1, n2) = np.moveaxis(self.corners, 1, 0), np.moveaxis(self.normals, 1, 0)
+        point, normal = (np.einsum("qc,qck->qk", self.shares, values) for values in (self.corners, self.normals))
+        s, t = self.shares[:, 0], self.shares[:, 1]
+        a, b, c = _dot(n2 - n0, v0 - v2), _dot(n2 - n1, v1 - v2), _dot(n1 - n0, v1 - v0)
+        parabola = 0.5 * (a * s * (s - 1.0) + (a + b + c) * s * t + b * t * (t - 1.0))
+        corners = ((v0, v1, v2, n0), (v1, v0, v2, n1), (v2, v0, v1, n2))
+        heights = []
+        for side in (1.0, -1.0):
+            envelope = [
+                np.maximum(
+                    side * _dot(own - point, n)
+                    + np.maximum(np.maximum(side * _dot(one - own, n), side * _dot(other - own, n)), 0.0),
+                    0.0,
+                )
+                for own, one, other, n in corners
+            ]
+            heights.append(side * np.maximum(np.minimum.reduce(envelope), side * parabola))
+        normal = normal if self.to_world is None else normal @ self.to_world.T
+        above = _dot(normal, geometric_normal) > 0.0
+        heights = np.where(above, heights, heights[::-1])
+        return heights[:, :, None] * normal
+
+
+def _cofactors(matrix):
+    """What takes normals (3,) along with points: the inverse transposed times the determinant."""
+    return np.array([np.cross(matrix[1], matrix[2]), np.cross(matrix[2], matrix[0]), np.cross(matrix[0], matrix[1])])

@@ -18,6 +18,10 @@ ALL_RAYS = 0xFFFFFFFF
 TERMINATOR_OFFSET = 0.1
 # Cycles' default of transparent bounces: further transparent surfaces block.
 TRANSPARENT_SURFACES = 8
+# So many transparent surfaces are as good as any number: what lets all light through need not be counted.
+UNLIMITED = 1024
+# Of all meshes with an image
+MOST_PARTS = 1 << 17
 # A ray goes on from a transparent surface by so much of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 
@@ -239,3 +243,135 @@ class Hits:
     triangle: np.ndarray  # (H,)
     u: np.ndarray  # (H,) share of the second corner
     v: np.ndarray  # (H,) share of the third
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Triangles (T) to be traced for a mesh: the `triangle` (T,) of it that each is a part of, and where: the numbers
+    u, v of its corners there, (T, 3, 2)."""
+
+    triangle: np.ndarray
+    corners: np.ndarray
+
+    def vertices(self, mesh: OccluderMesh) -> np.ndarray:
+        """Corners (T, 3, 3) in float64."""
+        return _placed(mesh.vertices[mesh.triangles[self.triangle]].astype(np.float64), self.corners)
+
+    def take(self, mask: np.ndarray) -> Parts:
+        """Those where `mask` (T,) is true."""
+        return Parts(self.triangle[mask], self.corners[mask])
+
+    def quarters(self) -> Parts:
+        """The four parts (4 T) of each into which the middles of its sides cut it."""
+        middles = 0.5 * (self.corners + self.corners[:, [1, 2, 0]])
+        a, b, c = (np.stack([self.corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3))
+        return Parts(np.tile(self.triangle, 4), np.concatenate([a, b, c, middles]))
+
+
+def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
+    """By number, for meshes with an image: the parts that block all light, and those that may let some through.
+
+    So that few rays have to look at the image. Parts overlap a little: no ray slips between those of different sizes.
+    """
+    cut = [
+        number
+        for number, mesh in enumerate(occluders.meshes)
+        if mesh.transparency is not None
+        and mesh.transparency.image is not None
+        and mesh.transparency.extension != "MIRROR"
+    ]
+    drops_clear = occluders.transparent_surfaces >= UNLIMITED
+    return {number: _cut_out(occluders.meshes[number], MOST_PARTS // len(cut), drops_clear) for number in cut}
+
+
+def _cut_out(mesh, most, drops_clear):
+    clear = mesh.transparency
+    values = clear.share * np.clip(clear.image, 0.0, 1.0)
+    kinds = [_Counts.of(values <= 0.0, clear, clear.outside <= 0.0)]
+    if drops_clear:
+        kinds.append(_Counts.of(values >= 1.0, clear, clear.share * clear.outside >= 1.0))
+    overlap, left = _overlaps(mesh), Parts(np.arange(len(mesh.triangles)), np.tile(_WHOLE, (len(mesh.triangles), 1, 1)))
+    blocking, mixed, count = [], [], 0
+    for level in range(_LEVELS + 1):
+        grown = left.corners
+        if level:
+            middle = left.corners.mean(axis=1, keepdims=True)
+            grown = grown + (2.0**level * overlap[left.triangle, None, None]) * (grown - middle)
+        place = _placed(clear.uv[left.triangle].astype(np.float64), grown) * clear.image.shape[::-1]
+        low, high = place.min(axis=1), place.max(axis=1)
+        is_one = [kind.all_within(low, high) for kind in kinds]
+        blocking.append(Parts(left.triangle, grown).take(is_one[0]))
+        rest = ~np.logical_or.reduce(is_one)
+        count += int(is_one[0].sum())
+        is_last = level == _LEVELS or count + 4 * int(rest.sum()) > most
+        fine = rest & (is_last | ((high - low).max(axis=1) < _FINEST) | ~(overlap[left.triangle] <= _WIDEST))
+        mixed.append(Parts(left.triangle, grown).take(fine))
+        count += int(fine.sum())
+        left = left.take(rest & ~fine).quarters()
+    return tuple(
+        Parts(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("triangle", "corners")))
+        for parts in (blocking, mixed)
+    )
+
+
+# Corners of a triangle, how often one is cut into four, and how large in pixels it still is then.
+_WHOLE, _LEVELS, _FINEST = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 8, 1.5
+# The most that parts may overlap, as a share of their triangle
+_WIDEST = 2.0**-12
+
+
+def _overlaps(mesh):
+    """Shares (T,) of triangles by which their parts overlap: more than the rounding of coordinates."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
+    longest = np.sqrt(np.maximum.reduce([np.square(side).sum(axis=1) for side in (b - a, c - b, a - c)]))
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-30)
+    reach = np.maximum.reduce([np.abs(corner).max(axis=1) for corner in (a, b, c)])
+    return 2.0**-20 * np.divide(reach, height, out=np.full(len(a), np.inf), where=height > 0.0)
+
+
+def _placed(corners, places):
+    """Points (T, N, K) at the numbers u, v (T, N, 2) of triangles (T, 3, K)."""
+    a, b, c = np.moveaxis(corners[:, :, None], 1, 0)
+    u, v = places[..., :1], places[..., 1:]
+    return (1.0 - u - v) * a + u * b + v * c
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """How many pixels of an image are of a kind, left of and below each."""
+
+    sums: np.ndarray  # (H + 1, W + 1)
+    repeats: bool
+    reach: float  # of a pixel from its middle, beyond which it counts no more
+
+    @classmethod
+    def of(cls, mask, clear: Transparency, is_outside: bool) -> _Counts:
+        """Of a mask (H, W), with a pixel around it for what is beside the image."""
+        if clear.extension != "REPEAT":
+            mode = {"constant_values": is_outside} if clear.extension == "CLIP" else {"mode": "edge"}
+            mask = np.pad(mask, 1, **mode)
+        sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int32)
+        np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+        return cls(sums, clear.extension == "REPEAT", 0.5 if clear.interpolation == "Closest" else 1.0)
+
+    def all_within(self, low, high):
+        """Mask (T,) of boxes from `low` to `high` (T, 2), in pixels, that see nothing else."""
+        slack = 0.01 + 1e-6 * np.maximum(np.abs(low), np.abs(high))
+        first = np.ceil(low - 0.5 - self.reach - slack).astype(np.int64)
+        last = np.floor(high - 0.5 + self.reach + slack).astype(np.int64) + 1
+        height, width = self.sums.shape[0] - 1, self.sums.shape[1] - 1
+        if not self.repeats:
+            size = width, height
+            first, last = np.clip(first + 1, 0, np.subtract(size, 1)), np.clip(last + 1, 1, size)
+        found = 0
+        for y, sign in ((last[:, 1], 1), (first[:, 1], -1)):
+            found = found + sign * (self._below(last[:, 0], y) - self._below(first[:, 0], y))
+        return found == (last - first).prod(axis=1)
+
+    def _below(self, x, y):
+        """How many there are left of columns x (T,) and below rows y (T,)."""
+        if not self.repeats:
+            return self.sums[y, x]
+        (rows, y), (columns, x) = np.divmod(y, self.sums.shape[0] - 1), np.divmod(x, self.sums.shape[1] - 1)
+        sums = self.sums
+        return rows * columns * int(sums[-1, -1]) + rows * sums[-1, x] + columns * sums[y, -1] + sums[y, x]

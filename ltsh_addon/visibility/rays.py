@@ -18,7 +18,7 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Transparency
+from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Parts, Transparency, cut_outs
 from .starts import StartFinder, Starts
 
 # Names under which the system may know the library.
@@ -163,26 +163,28 @@ class _Packets:
 
 
 class _Scene:
-    """The instances `index` of `occluders` as a scene of Embree."""
+    """The instances `index` of `occluders` as a scene of Embree; of some meshes, by number, only `parts`."""
 
-    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray):
+    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray, parts: dict[int, Parts]):
         self._embree, self._kept, self._scenes = embree, [], []
-        self.scene, self.instances = None, index
-        uses = np.bincount(occluders.mesh[index], minlength=len(occluders.meshes))
-        parts: dict[int, int] = {}
+        self.scene, self.instances, self._parts = None, index, parts
+        self._mesh = occluders.mesh[index]
+        uses = np.bincount(self._mesh, minlength=len(occluders.meshes))
+        shared: dict[int, int] = {}
         self.scene = self._new_scene()
         try:
             for number in index:
                 mesh, mask = int(occluders.mesh[number]), int(occluders.masks[number])
-                matrix = occluders.matrices[number]
-                if uses[mesh] == 1:
-                    self._add_triangles(self.scene, occluders.meshes[mesh], matrix, mask)
+                matrix, shape = occluders.matrices[number], (occluders.meshes[mesh], parts.get(mesh))
+                # Parts keep the digits that they have in the space of their object.
+                if uses[mesh] == 1 and mesh not in parts:
+                    self._add_triangles(self.scene, shape, matrix, mask)
                 else:
-                    if mesh not in parts:
-                        parts[mesh] = self._new_scene()
-                        self._add_triangles(parts[mesh], occluders.meshes[mesh], None, ALL_RAYS)
-                        embree.CommitScene(parts[mesh])
-                    self._add_instance(parts[mesh], matrix, mask)
+                    if mesh not in shared:
+                        shared[mesh] = self._new_scene()
+                        self._add_triangles(shared[mesh], shape, None, ALL_RAYS)
+                        embree.CommitScene(shared[mesh])
+                    self._add_instance(shared[mesh], matrix, mask)
             embree.CommitScene(self.scene)
             embree.check()
         except BaseException:
@@ -195,8 +197,12 @@ class _Scene:
         self._embree.SetSceneFlags(scene, _ROBUST)
         return scene
 
-    def _add_triangles(self, scene, mesh: OccluderMesh, matrix, mask) -> None:
-        embree, vertices = self._embree, mesh.vertices
+    def _add_triangles(self, scene, shape, matrix, mask) -> None:
+        (mesh, parts), embree = shape, self._embree
+        vertices, triangles = mesh.vertices, mesh.triangles
+        if parts is not None:
+            vertices = parts.vertices(mesh).reshape(-1, 3)
+            triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         if matrix is not None:
             vertices = vertices.astype(np.float64) @ matrix[:, :3].T + matrix[:, 3]
         # Embree reads 4 bytes beyond the last vertex.
@@ -205,7 +211,7 @@ class _Scene:
         geometry = embree.NewGeometry(embree.device, _TRIANGLES)
         for kind, data, form, count in (
             (_VERTEX_BUFFER, buffer, _FLOAT3, len(vertices)),
-            (_INDEX_BUFFER, mesh.triangles, _UINT3, len(mesh.triangles)),
+            (_INDEX_BUFFER, triangles, _UINT3, len(triangles)),
         ):
             embree.SetSharedGeometryBuffer(geometry, kind, 0, form, data.ctypes.data, 0, 12, count)
             self._kept.append(data)
@@ -225,6 +231,17 @@ class _Scene:
         embree.AttachGeometry(scene, geometry)
         embree.ReleaseGeometry(geometry)
 
+    def hits(self, ray, distance, number, triangle, u, v) -> Hits:
+        """What rays have met, on the meshes themselves; `number` (H,) counts the instances here."""
+        own = self._mesh[number] if self._parts else ()
+        for mesh in self._parts.keys() & set(np.unique(own).tolist()):
+            here = np.flatnonzero(own == mesh)
+            corners = self._parts[mesh].corners[triangle[here]]
+            shares = np.stack([1.0 - u[here] - v[here], u[here], v[here]])
+            u[here], v[here] = np.einsum("cq,qck->kq", shares, corners)
+            triangle[here] = self._parts[mesh].triangle[triangle[here]]
+        return Hits(ray, distance, self.instances[number], triangle, u, v)
+
     def close(self) -> None:
         while self._scenes:
             self._embree.ReleaseScene(self._scenes.pop(0))
@@ -242,9 +259,14 @@ class EmbreeCaster:
     def __init__(self, occluders: Occluders, embree: _Embree):
         self.description, self.library = f"Embree {embree.version}", embree.path
         self._embree, self._scenes = embree, []
-        for index in occluders.split():
-            self._scenes.append(_Scene(embree, occluders, index))
-        self.has = tuple(len(index) > 0 for index in occluders.split())
+        parts = cut_outs(occluders)
+        for number, index in enumerate(occluders.split()):
+            own = {mesh: both[number] for mesh, both in parts.items()}
+            filled = [mesh for mesh, part in own.items() if len(part.triangle)]
+            whole = index[~np.isin(occluders.mesh[index], list(own))]
+            index = np.union1d(whole, np.flatnonzero(np.isin(occluders.mesh, filled)))
+            self._scenes.append(_Scene(embree, occluders, index, own))
+        self.has = tuple(len(scene.instances) > 0 for scene in self._scenes)
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
 
@@ -272,7 +294,7 @@ class EmbreeCaster:
         ray = np.flatnonzero(geometry != NONE)
         number = np.where(part == NONE, geometry, part)[ray]
         distance, u, v = (packets.get(row, count)[ray] for row in (FAR, U, V))
-        return Hits(ray, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[ray], u, v)
+        return scene.hits(ray, distance, number, packets.get(TRIANGLE, count, True)[ray], u, v)
 
 
 class Tracer:
@@ -313,31 +335,34 @@ class Tracer:
         masks = np.broadcast_to(np.uint32(ALL_RAYS), (count,)) if masks is None else np.asarray(masks, np.uint32)
         shares = np.ones(count, np.float32)
         with self._lock:
-            for start in range(0, count, chunk):
-                part = slice(start, start + chunk)
-                rays = origins[part], directions[part], distances[part], masks[part]
-                if self._caster.has[False]:
-                    shares[part][self._caster.blocked(*rays)] = 0.0
-                if self._caster.has[True]:
-                    self._attenuate(shares[part], *rays)
+            if self._caster.has[False]:
+                for start in range(0, count, chunk):
+                    part = slice(start, start + chunk)
+                    blocked = self._caster.blocked(origins[part], directions[part], distances[part], masks[part])
+                    shares[part][blocked] = 0.0
+            if self._caster.has[True]:
+                self._attenuate(shares, origins, directions, distances, masks)
         return shares
 
-    def _attenuate(self, shares, origins, directions, distances, masks):
+    def _attenuate(self, shares, *rays):
         """Multiply `shares` (R,) by those of the transparent surfaces that the rays meet."""
         near = np.zeros(len(shares), np.float32)
         index = np.flatnonzero(shares > 0.0)
         for _ in range(self.occluders.transparent_surfaces + 1):
-            if not len(index):
+            met = []
+            for start in range(0, len(index), self._caster.chunk):
+                part = index[start : start + self._caster.chunk]
+                origins, directions, distances, masks = (values[part] for values in rays)
+                hits = self._caster.closest(True, origins, directions, near[part], distances, masks)
+                near[part[hits.ray]] = hits.distance * STEP
+                met.append((part[hits.ray], self.occluders.mesh[hits.instance], hits.triangle, hits.u, hits.v))
+            if not met:
                 return
-            rays = origins[index], directions[index], near[index], distances[index], masks[index]
-            hits = self._caster.closest(True, *rays)
-            index = index[hits.ray]
-            mesh = self.occluders.mesh[hits.instance]
+            index, mesh, *places = map(np.concatenate, zip(*met, strict=True))
             for number in np.unique(mesh):
-                here = mesh == number
+                here = np.flatnonzero(mesh == number)
                 clear = self.occluders.meshes[number].transparency
-                shares[index[here]] *= clear.shares(hits.triangle[here], hits.u[here], hits.v[here])
-            near[index] = hits.distance * STEP
+                shares[index[here]] *= clear.shares(*(values[here] for values in places))
             index = index[shares[index] > 0.0]
         shares[index] = 0.0
 

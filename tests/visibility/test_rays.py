@@ -7,8 +7,10 @@ import pytest
 from occluder_scenes import answers, random_occluders, random_rays, samples_on, sphere, surface_samples
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
+from ltsh_addon.cycles.images import EXTENSIONS, INTERPOLATIONS
 from ltsh_addon.scene import SceneError
 from ltsh_addon.visibility import OccluderMesh, Occluders, Transparency, open_tracer, rays
+from ltsh_addon.visibility.occluders import cut_outs
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +121,69 @@ def test_a_ray_ends_after_as_many_transparent_surfaces_as_cycles_allows(librarie
         with open_tracer(Occluders((pane,), [0] * 8, stack, transparent_surfaces=most), libraries) as tracer:
             found = tracer.transmittance([[0, 0, 0]], [[0, 0, 1]], [np.inf])
         assert found == pytest.approx(0.9**8 if most >= 8 else 0.0, abs=1e-6)
+
+
+def blocky_image(rng, size):
+    """Blocks of 8 pixels that let nothing, something or everything through."""
+    return np.kron(rng.choice([0.0, 0.3, 1.0], (size // 8, size // 8)), np.ones((8, 8))).astype(np.float32)
+
+
+@pytest.mark.parametrize("interpolation", INTERPOLATIONS)
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_what_an_image_cuts_out_lets_through_what_its_pixels_say(libraries, extension, interpolation):
+    rng = np.random.default_rng(8)
+    for outside in (0.0, 1.0):
+        image = Transparency(
+            1.0, blocky_image(rng, 32), rng.uniform(-1, 2, (4, 3, 2)), extension, interpolation, outside
+        )
+        mesh = OccluderMesh(rng.uniform(-2, 2, (12, 3)), np.arange(12).reshape(4, 3), image)
+        for most in (8, 1024):
+            walls = Occluders((mesh,), [0, 0], [np.eye(3, 4), 1.2 * np.eye(3, 4)], transparent_surfaces=most)
+            cast = random_rays(rng, 3000)
+            expected, is_sure = answers(walls, *(values.astype(np.float64) for values in cast[:3]), cast[3])
+            with open_tracer(walls, libraries) as tracer:
+                found = tracer.transmittance(*cast)
+            # Single precision moves the place in an image by some 1e-5 pixels: with no interpolation that decides for
+            # as large a share of the rays times the number of borders on their way.
+            assert ((np.abs(found - expected) > 1e-4) & is_sure).mean() < 1e-3
+            assert {0.0, 1.0} < set(np.round(expected, 3)) and (extension == "MIRROR") == (not cut_outs(walls))
+
+
+def test_parts_block_where_the_image_is_black_and_cover_all_that_is_not_clear():
+    rng = np.random.default_rng(9)
+    image = Transparency(1.0, blocky_image(rng, 64), np.array([[[0, 0], [1, 0], [0, 1]]]) + 0.1)
+    mesh = OccluderMesh(np.eye(3), [[0, 1, 2]], image)
+    ((blocking, mixed),) = cut_outs(Occluders((mesh,), [0], [np.eye(3, 4)], transparent_surfaces=1024)).values()
+    places = rng.dirichlet((1.0, 1.0, 1.0), 20_000)[:, 1:]
+    shares = image.shares(np.zeros(len(places), int), *places.T)
+
+    def covers(parts):
+        inside = np.zeros(len(places), bool)
+        for a, b, c in parts.corners:
+            u, v = np.linalg.solve(np.stack([b - a, c - a], axis=1), (places - a).T)
+            inside |= (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+        return inside
+
+    assert (shares[covers(blocking)] == 0.0).all() and (shares[~covers(blocking) & ~covers(mixed)] == 1.0).all()
+    # Blocks of 8 pixels: what is seen from less than 2 pixels outside of them is 1 - (4 / 8)^2 of them.
+    assert covers(blocking).sum() > 0.5 * (shares == 0.0).sum() > 1000
+
+
+def test_no_ray_slips_between_parts_of_different_sizes(libraries):
+    rng = np.random.default_rng(10)
+    pixels = np.zeros((64, 64), np.float32)
+    pixels[tuple(rng.integers(0, 64, (2, 30)))] = 1e-9
+    vertices, triangles = sphere(4)
+    mesh = OccluderMesh(vertices, triangles, Transparency(1.0, pixels, rng.uniform(0, 1, (len(triangles), 3, 2))))
+    walls = Occluders((mesh,), [0], [np.eye(3, 4)])
+    ((parts, _),) = cut_outs(walls).values()
+    corners = parts.vertices(mesh)
+    assert len(corners) > 20 * len(triangles)
+    targets = np.concatenate([corners.reshape(-1, 3), corners[:, :2].mean(axis=1), corners[:, 1:].mean(axis=1)])
+    origins = rng.uniform(-0.3, 0.3, targets.shape)
+    directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1)[:, None]
+    with open_tracer(walls, libraries) as tracer:
+        assert tracer.transmittance(origins, directions, np.full(len(targets), np.inf)).max() <= 2e-9
 
 
 def test_occluders_come_back_from_their_file(tmp_path):

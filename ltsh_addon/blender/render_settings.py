@@ -16,7 +16,9 @@ from .evaluated import SURFACE_TYPES
 
 DEFAULTS = {
     "film_exposure": 1.0,
+    "filter_width": 1.5,
     "is_portal": False,
+    "pixel_filter_type": "BLACKMAN_HARRIS",
     "transparent_max_bounces": 8,
     "use_bump_map_correction": True,
     "use_camera_cull": False,
@@ -213,13 +215,13 @@ def filter_points(kind: str, width: float, count: int) -> np.ndarray:
 
 def sub_pixel_offsets(scene, count: int) -> np.ndarray:
     """`filter_points` of the scene's own filter. To be called outside `pinned_pixel_filter`, which replaces it."""
-    return filter_points(scene.cycles.pixel_filter_type, scene.cycles.filter_width, count)
+    return filter_points(cycles_setting(scene, "pixel_filter_type"), cycles_setting(scene, "filter_width"), count)
 
 
 def filter_name(scene) -> str:
     """The scene's filter for a report: its kind, and its width in pixels where it has one."""
-    kind = scene.cycles.pixel_filter_type
-    return kind if kind == "BOX" else f"{kind} {scene.cycles.filter_width:g} px"
+    kind = cycles_setting(scene, "pixel_filter_type")
+    return kind if kind == "BOX" else f"{kind} {cycles_setting(scene, 'filter_width'):g} px"
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Misuse
-from .commands import add_bake, add_compare, add_demo, add_merge, add_relight, add_run, add_shade, add_tables
+from .commands import add_bake, add_compare, add_demo, add_merge, add_relight, add_run, add_shade, add_tables, add_view
 from .job_file import Mistakes
 from .output import print_json
 from .progress import ProgressBar, RunLog, print_out
@@ -159,6 +159,7 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
         ("compare", add_compare, "techniques beside Cycles: EXR, sheet, report"),
         ("shade", add_shade, "shade per pixel of the camera"),
         ("bake", add_bake, "bake lighting and errors into the texels of UV maps"),
+        ("view", add_view, "the viewport's own picture, without a window"),
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),

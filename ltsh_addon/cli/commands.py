@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ..pipeline.options import BakeOptions, PictureOptions, options_from, table
+from ..pipeline.options import BakeOptions, PictureOptions, ViewOptions, options_from, table
 from ..pipeline.picture import prepare
 from ..pipeline.tasks import Job
 from ..scene import SHIPPED_TABLES, SceneError, error_line
@@ -69,6 +69,15 @@ BAKE_EXAMPLES = """examples:
 
 An object that cannot be baked is named at the end, and the exit code is 1; the others are baked all the same.
 """
+VIEW = """Draw what the camera sees as the viewport does, in a fraction of the time that shade
+takes. Needs OpenGL or Vulkan, with a graphics card or without. OUT gets view.exr, with
+a layer for each technique, combined and by pass, view.png, which shows the first
+technique through the scene's view transform, and report.json. --json also tells draw_s,
+the median seconds of a redraw, and refined_s, the seconds of the N redraws of --refine."""
+VIEW_EXAMPLES = """examples:
+  %(prog)s room.blend -o out/draft --resolution 480x270 --refine 1
+  %(prog)s room.blend -o out/playblast --frames 1-240 --resume
+"""
 
 
 def add_demo(parser) -> None:
@@ -97,6 +106,12 @@ def add_bake(parser) -> None:
     """`ltsh bake`."""
     with_examples(parser, BAKE, BAKE_EXAMPLES)
     _add_job(parser, BakeOptions)
+
+
+def add_view(parser) -> None:
+    """`ltsh view`."""
+    with_examples(parser, VIEW, VIEW_EXAMPLES)
+    _add_job(parser, ViewOptions)
 
 
 def _add_job(parser, kind, *, but=(), **changes) -> None:
@@ -132,8 +147,8 @@ def _demo(arguments, bar, open_file) -> int:
 
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
-    """The job that the arguments of demo, compare, shade or bake describe. Raises Misuse."""
-    kind = BakeOptions if arguments.command == "bake" else PictureOptions
+    """The job that the arguments of demo, compare, shade, bake or view describe. Raises Misuse."""
+    kind = {"bake": BakeOptions, "view": ViewOptions}.get(arguments.command, PictureOptions)
     command = "compare" if arguments.command == "demo" else arguments.command
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
@@ -255,7 +270,7 @@ def _relight(arguments, bar, open_file) -> int:
     return _printed(arguments, report, 0)
 
 
-RUN = "Do the jobs of a file, each a shade, compare or bake, one after another."
+RUN = "Do the jobs of a file, each a shade, compare, bake or view, one after another."
 RUN_EXAMPLES = """examples:
   %(prog)s night.toml
   %(prog)s night.toml --shard 1/4 --resume --log night.log
@@ -265,7 +280,7 @@ night.toml:
   techniques = ["ltc", "ltsh4"]
 
   [[job]]
-  command = "compare"              # or "bake" or "shade"
+  command = "compare"              # or "bake", "shade" or "view"
   scene = "room.blend"             # or scenes = [...]; paths are relative to the job file
   output = "out/room"              # a folder for each job
   frames = "1-240:10"              # options are named as on the command line, without the dashes
@@ -307,7 +322,7 @@ def _run_jobs(arguments, bar, open_file) -> int:
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
     found = {}
-    for name, add_arguments in (("shade", add_shade), ("compare", add_compare), ("bake", add_bake)):
+    for name, add_arguments in (("shade", add_shade), ("compare", add_compare), ("bake", add_bake), ("view", add_view)):
         found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         add_arguments(found[name])
         found[name].set_defaults(command=name)

@@ -54,6 +54,10 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         worse = baseline.worse(merged.report, arguments.tolerance)
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
+    if merged.command == "view":
+        from ..pipeline import view
+
+        document = view.with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 
@@ -85,9 +89,9 @@ def _warnings(merged) -> list[str]:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture
+    from ..pipeline import bake, picture, view
 
-    tables = bake if merged.command == "bake" else picture
+    tables = {"bake": bake, "view": view}.get(merged.command, picture)
     if merged.single and "reports" not in merged.report:
         lines = tables.summary(merged.report, merged.seconds)
     else:

@@ -23,6 +23,7 @@ MOST_FRAMES = 100_000
 MOST_CYCLES_SAMPLES = 2 << 24
 TEXTURE_SIDES = (64, 8192)
 SHADOW_RAYS = 8, 1024
+MOST_REFINEMENTS = 4096
 MOST_MARGIN = 512
 # Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
 MARGIN_TYPES = ("extend", "adjacent")
@@ -57,6 +58,11 @@ def table(text: str) -> str:
     raise ValueError(
         f"table {text!r} is unknown, expected some of {', '.join(SHIPPED_TABLES)} or the path of a table (.npz)"
     )
+
+
+def tables(text: str) -> tuple[str, ...]:
+    """Shipped tables or paths, separated by commas."""
+    return tuple(table(name) for name in _parts(text) or ("",))
 
 
 def passes(text: str) -> tuple[str, ...]:
@@ -131,6 +137,13 @@ def positive(text: str) -> int:
     if text.isdecimal() and int(text) > 0:
         return int(text)
     raise ValueError(f"{text!r} was given, expected a whole number above 0")
+
+
+def refinements(text: str) -> int:
+    """Pictures of which a view is the mean."""
+    if text.isdecimal() and 1 <= int(text) <= MOST_REFINEMENTS:
+        return int(text)
+    raise ValueError(f"refine is {text!r}, expected a whole number from 1 to {MOST_REFINEMENTS}")
 
 
 def shadow_rays(text: str) -> int:
@@ -266,6 +279,10 @@ def _passes_of(known: tuple[str, ...], parse: Callable, default: str) -> Any:
     return option("--passes", default=PASSES, type=parse, metavar="P", help=meaning)
 
 
+def _resolution() -> Any:
+    return option("--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file")
+
+
 def _frame() -> Any:
     meaning = "such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one"
     # The command line takes several: each is a task, of which this is the one.
@@ -326,9 +343,7 @@ class PictureOptions:
     # Names, paths of tables, or from Python a `shading.OwnTechnique`.
     techniques: tuple[Any, ...] = _techniques(tuple(TECHNIQUES))
     passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
-    resolution: tuple[int, int] | None = option(
-        "--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file"
-    )
+    resolution: tuple[int, int] | None = _resolution()
     sub_samples: int = _sub_samples("points per pixel, drawn from its filter; 1: pixel centers")
     reference_samples: int = option(
         "--reference-samples", default=150_000, type=positive, metavar="N",
@@ -386,6 +401,28 @@ class BakeOptions:
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """What to draw as the viewport does; None means as in the file."""
+
+    scene: Path = _scene("one or more; left out when Blender has a file open")
+    frame: int | None = _frame()
+    camera: str | None = _camera()
+    name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
+    output: Path = _output()
+    techniques: tuple[str, ...] = option(
+        "--techniques", default=("ltsh4",), type=tables, metavar="T",
+        help=f"{', '.join(SHIPPED_TABLES)} or paths of tables (.npz), separated by commas (default: ltsh4)",
+    )  # fmt: skip
+    resolution: tuple[int, int] | None = _resolution()
+    refine: int = option(
+        "--refine", default=16, type=refinements, metavar="N",
+        help="mean of N pictures, each of other points of the pixels; 1: pixel centers (default: %(default)s)",
+    )  # fmt: skip
+    shadows: str = _shadows()
+    scripts: bool = _scripts()
 
 
 # -- what follows from the declarations -----------------------------------------------------------------------------

@@ -55,6 +55,8 @@ class Frames:
         """Time of one frame, to the end of what the card does for it."""
         shown = ShownPicture(technique, passes, "single", technique, 0.5, 1.0, 1.0, False)
         self.moves += moving
+        # Lights that are new, if equal: what has not changed is not drawn again.
+        self.mirror.lights = tuple(list(self.mirror.lights))
         clock = time.process_time if is_software() else time.perf_counter
         start = clock()
         self.renderer.draw(self.mirror, self.views[self.moves % 2], self.size, shown, self.buffer)

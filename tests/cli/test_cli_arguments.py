@@ -53,7 +53,7 @@ def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint)
         (["tables"], "action"),
         (["tables", "burn"], "'burn'"),
         ("shad room.blend -o out".split(), "ltsh: command 'shad' is unknown (expected one of demo, compare, "
-         "shade, bake, relight, run, merge, tables); see ltsh --help"),
+         "shade, bake, view, relight, run, merge, tables); see ltsh --help"),
         ("shade room.blend -o out --techniqes ltc".split(), "ltsh shade: option --techniqes is unknown here; see ltsh "
          "shade --help"),
         ("shade room.blend -o out --techniqes=ltc".split(), "option --techniqes is unknown here"),

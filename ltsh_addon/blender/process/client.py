@@ -245,6 +245,52 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
     return run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
 
+# What a view is drawn as, the file of the first, and what the child says before it asks for a graphics card: a machine
+# without one may end it.
+VIEW_PASSES = ("combined", "specular", "diffuse")
+VIEW_PNG = "view.png"
+GRAPHICS = "graphics"
+NO_GRAPHICS = (
+    "Blender finds no graphics card here, nor a program in its place: install OpenGL (on Linux libegl1 and "
+    "libgl1-mesa-dri draw without a card), or use shade, which needs none"
+)
+
+
+@dataclass(frozen=True)
+class ViewJob:
+    """What to draw as the viewport does; None means as in the file."""
+
+    scene: Path
+    techniques: tuple[str, ...]  # names or absolute paths of tables
+    refine: int
+    width: int | None
+    height: int | None
+    frame: int | None
+    camera: str | None
+    scripts: bool = False  # run those of the file
+
+
+def draw_view(job: ViewJob, folder: Path, *, progress: Progress | None = None) -> dict:
+    """Pictures of a .blend as files in `folder`: "<number of the technique>_<pass>.npy", RGBA with row 0 on top, times
+    the exposure, and `VIEW_PNG`; the manifest.
+
+    Raises as `extract` does.
+    """
+    scene, stages = Path(job.scene).absolute(), [""]
+    check_readable(scene)
+
+    def watched(stage: str, fraction: float) -> bool | None:
+        stages.append(stage)
+        return None if progress is None else progress(stage, fraction)
+
+    try:
+        return run_child({"task": "view", **asdict(job), "scene": str(scene)}, folder, watched)
+    except SceneError as error:
+        if stages[-1] == GRAPHICS:
+            raise SceneError(NO_GRAPHICS) from error
+        raise
+
+
 def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
     """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
 

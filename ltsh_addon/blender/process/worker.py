@@ -68,6 +68,8 @@ def _perform(job: dict, folder: Path, progress) -> dict:
         return _module("blender.extract.bake").extract_bake(job, folder, progress)
     if job["task"] == "facts":
         return _module("blender.extract.bake").scene_facts(job, progress)
+    if job["task"] == "view":
+        return _module("blender.viewport.still").draw_view(job, folder, progress)
     if job["task"] == "apply":
         return _module("blender.extract.apply").apply_bake(job, progress)
     return _module("blender.extract.pixels").extract(job, folder, progress)

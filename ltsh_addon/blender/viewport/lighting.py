@@ -142,14 +142,14 @@ class LightingPass:
         view_position: Sequence[float] | None = None,
         view_direction: Sequence[float] | None = None,
         rect: tuple[int, int, int, int] | None = None,
-        add: bool = False,
+        blend: str = "NONE",
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
         `passes` is "specular", "diffuse" or "combined". Give the camera's place, or for orthographic cameras the unit
         direction toward it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in
-        `target` (None: what is bound), left out: (0, 0, its size). `add` adds to what is there: for a second lobe of
-        the same surfaces.
+        `target` (None: what is bound), left out: (0, 0, its size). `blend` is "NONE", or "ADDITIVE" to add the
+        radiance to what is there (a further lobe of the same surfaces), or "ADDITIVE_PREMULT" to add the alpha too.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
@@ -171,7 +171,7 @@ class LightingPass:
         with nullcontext() if target is None else target.bind():
             previous = gpu.state.viewport_get(), gpu.state.blend_get()
             gpu.state.viewport_set(x, y, width, height)
-            gpu.state.blend_set("ADDITIVE" if add else "NONE")
+            gpu.state.blend_set(blend)
             try:
                 shader.bind()
                 for name in features.samplers:

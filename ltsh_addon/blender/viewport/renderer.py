@@ -1,4 +1,5 @@
-"""One frame of a view: G-buffer, lighting, picture. What has not changed is not drawn again."""
+"""One frame of a view: G-buffer, lighting, picture. What has not changed is not drawn again, but may be refined: every
+further frame then adds other points of the pixels, and the picture is their mean."""
 
 from __future__ import annotations
 
@@ -19,6 +20,8 @@ from .textures import GBufferTextures, UploadedLights, upload_lights
 MODES = ("single", "split", "difference")
 # The lighting pass is fast for so many indices of refraction, and exact for all.
 MOST_IORS = 6
+# Of pixels: where they are seen, right and up of their centers.
+CENTERS = np.zeros((1, 2))
 
 
 @dataclass(frozen=True)
@@ -50,22 +53,23 @@ class PicturePass:
     """Draws one or two pictures into what is bound; needs an active GPU context."""
 
     def __init__(self):
-        constants = {"mode": "INT", "scales": "VEC4", "background": "VEC4", "white": "FLOAT"}
+        constants = {"mode": "INT", "scales": "VEC4", "background": "VEC4", "white": "FLOAT", "weights": "VEC2"}
         modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
         source = modes + glsl("picture")
         self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture"), constants)
 
-    def draw(self, first, second, size: tuple[int, int], shown: ShownPicture, background) -> None:
-        """Fill `size` pixels of what is bound, scene-linear, from textures RGBA with alpha 1 where they show a surface;
-        `second` may be None. `background` is a color (3,)."""
+    def draw(self, pictures, weights, size: tuple[int, int], shown: ShownPicture, background) -> None:
+        """Fill `size` pixels of what is bound, scene-linear, from one or two textures RGBA times their `weights`, whose
+        alpha then is the share of a pixel that shows a surface. `background` is a color (3,)."""
         gpu.state.viewport_set(0, 0, *size)
         gpu.state.blend_set("NONE")
         gpu.state.depth_test_set("NONE")
         gpu.state.depth_mask_set(False)
         shader = self._shader
         shader.bind()
-        shader.uniform_sampler("first_picture", first)
-        shader.uniform_sampler("second_picture", first if second is None else second)
+        shader.uniform_sampler("first_picture", pictures[0])
+        shader.uniform_sampler("second_picture", pictures[-1])
+        shader.uniform_float("weights", (weights[0], weights[-1]))
         shader.uniform_int("mode", MODES.index(shown.mode))
         scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
         shader.uniform_float("scales", scales)
@@ -89,28 +93,52 @@ class ViewRenderer:
         self._lit_gbuffer: GBufferTextures | None = None
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None)
+        self._still, self.samples = None, 0
 
-    def draw(self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer) -> None:
-        """Draw the scene into `frame_buffer`, which has `size` pixels."""
+    def draw(
+        self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer, points=CENTERS
+    ) -> None:
+        """Draw the scene into `frame_buffer`, which has `size` pixels.
+
+        Pixels are first seen at the first of `points` (N, 2), in pixels right and up of their centers, then, as long as
+        nothing changes, at one more with every call. The picture is their mean; `samples` is their number.
+        """
         view = view.around(_origin_of(mirror.lights, view))
+        techniques = [shown.technique]
+        if shown.mode != "single" and shown.second_picture is None:
+            techniques.append(shown.second_technique)
+        with_emission = shown.passes == "combined" and shown.second_picture is None
+        asked = techniques, shown.passes, with_emission
+        still = (mirror, mirror.lights), (mirror.surfaces_version, *_key(view, size), asked)
+        if not _same(still, self._still):
+            self.samples = 0
+        if self.samples < len(points):
+            self._still = None  # until all of the sample is there
+            self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
+            self._still, self.samples = still, self.samples + 1
+        pictures = [self._targets[number][0] for number in range(len(techniques))]
+        weights = [1.0 / self.samples] * len(pictures)
+        if shown.mode != "single" and shown.second_picture is not None:
+            pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
+        # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
+        with frame_buffer.bind():
+            background = mirror.background if shown.passes == "combined" else np.zeros(3)
+            self._picture.draw(pictures, weights, size, shown, background)
+
+    def _draw_sample(self, mirror, view: View, size, techniques: list[str], passes: str, with_emission: bool) -> None:
+        """Add one point of every pixel to the targets of `techniques`, or replace what is there by the first."""
         surfaces_changed = self._draw_surfaces(mirror, view, size)
         lights_changed = self._upload_lights(mirror, view)
         if surfaces_changed or lights_changed or self._lit_gbuffer is None:
             self._choose_horizons(mirror, view)
-        techniques = [shown.technique]
-        if shown.mode != "single" and shown.second_picture is None:
-            techniques.append(shown.second_technique)
-        first, *others = self._lit(techniques, mirror, view, size, shown)
-        second = others[0] if others else shown.second_picture
-        # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
-        with frame_buffer.bind():
-            background = mirror.background if shown.passes == "combined" else np.zeros(3)
-            self._picture.draw(first, second, size, shown, background)
+        buffers = self._light(techniques, mirror, view, size, passes)
+        for buffer in buffers if with_emission else ():
+            self._surfaces.add_emission(mirror.instances, view, size, buffer)
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
         """Draw the G-buffer if anything has changed, and tell that."""
-        drawn = (mirror.surfaces_version, view.projection.tobytes(), view.eye.tobytes(), view.origin.tobytes(), size)
-        if drawn == self._drawn:
+        drawn = (mirror,), (mirror.surfaces_version, *_key(view, size))
+        if _same(drawn, self._drawn):
             return False
         self._drawn = None
         self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
@@ -143,19 +171,17 @@ class ViewRenderer:
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
-    def _lit(self, techniques: list[str], mirror, view: View, size, shown: ShownPicture) -> list:
-        """The textures that `techniques` are drawn into; the surfaces of a further lobe are drawn once for all."""
+    def _light(self, techniques: list[str], mirror, view: View, size, passes: str) -> list:
+        """The buffers that `techniques` are drawn into; the surfaces of a further lobe are drawn once for all."""
         lightings = [self._lighting_of(technique, mirror) for technique in techniques]
-        targets = [self._target(number, size) for number in range(len(techniques))]
+        buffers = [self._target(number, size) for number in range(len(techniques))]
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
         for number in range(max(mirror.most_lobes, 1)):
             gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
-            for lighting, (_, buffer) in zip(lightings, targets, strict=True):
-                lighting.draw(gbuffer, buffer, shown.passes, **place, add=number > 0)
-        if shown.passes == "combined" and shown.second_picture is None:
-            for _, buffer in targets:
-                self._surfaces.add_emission(mirror.instances, view, size, buffer)
-        return [texture for texture, _ in targets]
+            first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
+            for lighting, buffer in zip(lightings, buffers, strict=True):
+                lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
+        return buffers
 
     def _lighting_of(self, technique: str, mirror) -> LightingPass:
         if technique not in self._lighting:
@@ -172,20 +198,17 @@ class ViewRenderer:
         return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
 
     def _target(self, number: int, size):
-        """Texture and frame buffer that the technique `number` is drawn into."""
+        """The frame buffer that the technique `number` is drawn into: the sum of its samples."""
         while len(self._targets) <= number:
             self._targets.append(None)
         if self._targets[number] is None or self._targets[number][2] != size:
             texture = gpu.types.GPUTexture(size, format="RGBA32F")
             self._targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
-        return self._targets[number][:2]
+        return self._targets[number][1]
 
     def read(self, number: int = 0) -> np.ndarray:
         """The last picture (H, W, 4) of the first technique or the second, row 0 at the bottom."""
-        texture = self._targets[number][0]
-        buffer = texture.read()
-        buffer.dimensions = texture.width * texture.height * 4
-        return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+        return read_texture(self._targets[number][0]) / np.float32(self.samples)
 
     def free(self) -> None:
         """Let go of everything."""
@@ -199,6 +222,23 @@ class ViewRenderer:
                 horizons.free()
         self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = self._lobe_horizons = None
         self._drawn, self._uploaded = None, (None, None)
+        self._still, self.samples = None, 0
+
+
+def _key(view: View, size) -> tuple:
+    return view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, view.origin.tobytes(), size
+
+
+def _same(new, old) -> bool:
+    """Do two states have the same things of the scene, their first part, and equal values, their second one?"""
+    return old is not None and new[1] == old[1] and all(a is b for a, b in zip(new[0], old[0], strict=True))
+
+
+def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
+    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
+    buffer = texture.read()
+    buffer.dimensions = texture.width * texture.height * 4
+    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

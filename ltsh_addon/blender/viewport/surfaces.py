@@ -61,6 +61,13 @@ class View:
         eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
         return View(self.projection @ to_world, eye, self.is_parallel, origin)
 
+    def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> View:
+        """The same view whose pixels, of `size` in all, show the points `offset` (2,) pixels right and up of their
+        centers."""
+        shift = np.eye(4)
+        shift[:2, 3] = -2.0 * np.asarray(offset) / size
+        return View(shift @ self.projection, self.eye, self.is_parallel, self.origin)
+
     @property
     def homogeneous_eye(self) -> tuple[float, ...]:
         """The eye's place and 1, or the way to it and 0."""

@@ -115,7 +115,7 @@ def test_a_pass_draws_where_it_is_told_and_adds_to_what_is_there():
         gbuffer = upload_samples(samples, WIDTH)
         rect = (5, 3, WIDTH, HEIGHT)
         lighting.draw(gbuffer, large.buffer, "specular", view_position=EYE, rect=rect)
-        lighting.draw(gbuffer, large.buffer, "diffuse", view_position=EYE, rect=rect, add=True)
+        lighting.draw(gbuffer, large.buffer, "diffuse", view_position=EYE, rect=rect, blend="ADDITIVE")
         return parts, large.read()
 
     parts, picture = with_graphics(draw)

@@ -181,3 +181,16 @@ def test_a_view_far_from_the_origin_is_that_at_the_origin():
         assert np.linalg.norm(far - near) < 1e-3 * np.linalg.norm(near)
 
     with_graphics(compare)
+
+
+@edits_with_graphics
+def test_a_flat_surface_that_shines_does_not_light_itself():
+    parts.empty_scene(*SIZE)
+    glow = {"Emission Color": (0.3, 0.2, 0.1, 1.0), "Emission Strength": 2.0}
+    # Turned, so that rounding puts its points before it and behind it.
+    parts.add_plane(parts.principled("Sign", **glow)[0], size=2.0, location=(0.7, 0.6, 0.6), rotation=(1.2, 0.3, -0.4))
+    camera = parts.add_camera((0.0, -4.0, 2.6), (1.02, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    for passes in shading.PASSES:
+        picture, _ = with_graphics(lambda passes=passes: viewport_picture(camera, passes, False))
+        assert not picture.any()

@@ -42,7 +42,10 @@ ltsh_light ltsh_seen_light(int header, vec3 position, float width)
 bool ltsh_receives(int header, ltsh_point point)
 {
     vec4 direction = ltsh_light_texel(header + 3);
-    bool facing = dot(ltsh_light_texel(header).xyz - point.position, direction.xyz) < 0.0;
+    vec3 center = ltsh_light_texel(header).xyz;
+    /* A flat surface that shines must not light itself where its points are rounded to behind it. */
+    float rounding = 4e-7 * dot(abs(center) + abs(point.position), vec3(1.0));
+    bool facing = dot(center - point.position, direction.xyz) < -rounding;
     int count = int(ltsh_light_texel(header + 4).w);
     bool received = count < 0;
     for (int i = 0; i < count; ++i) {

@@ -8,8 +8,8 @@ vec4 over_background(vec4 lit)
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
-  vec4 first = texelFetch(first_picture, texel, 0);
-  vec4 second = texelFetch(second_picture, texel, 0);
+  vec4 first = weights.x * texelFetch(first_picture, texel, 0);
+  vec4 second = weights.y * texelFetch(second_picture, texel, 0);
   second.a = min(first.a, second.a);
   color = over_background(first);
   if (mode == LTSH_SPLIT) {

@@ -1,0 +1,238 @@
+"""The viewport's picture without a window, through a camera of the scene (runs in the child): `ltsh view`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import bpy
+import gpu
+import numpy as np
+
+from ...files import save_array
+from ...scene import SceneError, error_line
+from .. import render_settings
+from ..extract.pixels import no_light, open_scene
+from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
+from ..render_settings import cycles_setting
+from .mirror import SceneMirror
+from .renderer import CENTERS, ShownPicture, ViewRenderer, read_texture
+from .surfaces import View
+
+# Redraws of which the median is told, at least.
+TIMED = 3
+# Where scripts may always use graphics, its compiled shaders serve the next picture.
+_renderer: list[ViewRenderer] = []
+
+
+def draw_view(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `client.ViewJob`), write arrays and a PNG into `folder`; the manifest as a dictionary."""
+    started, warnings = time.monotonic(), []
+    progress("open scene", 0.0)
+    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    scene = bpy.context.scene
+    render_settings.go_to_frame(scene, job["frame"])
+    camera = render_settings.choose_camera(scene, job["camera"])
+    size = render_settings.set_resolution(scene, job["width"], job["height"])
+    warnings += _not_shown(scene, camera)
+    progress(GRAPHICS, 0.0)
+    drawn = with_graphics(lambda: _draw(job, scene, camera, size, progress))
+    for number, pictures in enumerate(drawn["pictures"]):
+        for name, pixels in pictures.items():
+            save_array(folder / f"{number}_{name}.npy", pixels)
+    _save_png(scene, drawn["pictures"][0]["combined"], folder / VIEW_PNG)
+    seconds = drawn["seconds"]
+    return {
+        "blender_version": bpy.app.version_string,
+        "graphics": drawn["graphics"],
+        "frame": scene.frame_current,
+        "camera": camera.name,
+        "width": size[0],
+        "height": size[1],
+        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
+        "pixel_filter": render_settings.filter_name(scene),
+        "exposure": cycles_setting(scene, "film_exposure"),
+        "color_space": render_settings.working_space(),
+        "lights": drawn["lights"],
+        "warnings": [*warnings, *drawn["notes"]],
+        "redraws": seconds,
+        "start": time.monotonic() - started - sum(map(sum, seconds)),
+    }
+
+
+def with_graphics(function: Callable):
+    """What `function()` returns, called where the graphics card may be used. Raises SceneError where there is none.
+
+    Before Blender 5.2 scripts without a window may use it only inside a render of an engine that asks for it.
+    """
+    if not hasattr(gpu, "init"):
+        return _inside_render(function)
+    try:
+        gpu.init()
+    except (RuntimeError, SystemError) as error:
+        raise SceneError(error_line(error)) from None
+    return function()
+
+
+def _inside_render(function: Callable):
+    outcome: dict = {}
+
+    class Engine(bpy.types.RenderEngine):
+        bl_idname, bl_label, bl_use_gpu_context = "LTSH_GRAPHICS", "LTSH graphics", True
+
+        def render(self, depsgraph):
+            # What is raised in here would only be printed.
+            try:
+                outcome["value"] = function()
+            except Exception as error:
+                outcome["error"] = error
+
+    scene = bpy.data.scenes.new("LTSH graphics")
+    scene.camera = bpy.data.objects.new("LTSH graphics", bpy.data.cameras.new("LTSH graphics"))
+    scene.collection.objects.link(scene.camera)
+    scene.render.resolution_x = scene.render.resolution_y = 4
+    bpy.utils.register_class(Engine)
+    try:
+        scene.render.engine = Engine.bl_idname
+        bpy.ops.render.render(scene=scene.name)
+    finally:
+        # Blender 4.5 hangs at exit when an engine is still registered.
+        bpy.utils.unregister_class(Engine)
+        bpy.data.scenes.remove(scene)
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["value"]
+
+
+def _not_shown(scene, camera) -> list[str]:
+    """What the file asks of a picture and a view does not have."""
+    asked = {
+        "motion blur": scene.render.use_motion_blur,
+        "stereoscopy": scene.render.use_multiview,
+        f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
+        "the render region": scene.render.use_border,
+    }
+    found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
+    used = [layer.name for layer in scene.view_layers if layer.use]
+    if len(used) > 1:
+        found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
+    return found
+
+
+def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
+    """Pictures (H, W, 4), row 0 on top, by pass for every technique, seconds of redraws, lights and notes."""
+    progress("draw", 0.0)
+    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+    with bpy.context.temp_override(scene=scene, view_layer=layer):
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+    mirror = SceneMirror()
+    mirror.sync(depsgraph)
+    if not mirror.lights:
+        raise no_light(scene, mirror.notes)
+    canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
+    points = render_settings.sub_pixel_offsets(scene, job["refine"])
+    pictures, seconds = [], []
+    parts = len(job["techniques"]) * len(VIEW_PASSES)
+    try:
+        for technique in job["techniques"]:
+            pictures.append({})
+            for name in VIEW_PASSES:
+                done = sum(map(len, pictures)) / parts
+                shown = _shown(scene, technique, name)
+
+                def report(share, done=done):
+                    progress("draw", done + share / parts)
+
+                pictures[-1][name], times = canvas.draw(shown, points, report)
+                if name == "combined":
+                    seconds.append(times)
+    except ValueError as error:  # a table that the card does not take
+        raise SceneError(error_line(error)) from error
+    finally:
+        canvas.free()
+    lights = [light.record() for light in mirror.lights]
+    return {
+        "pictures": pictures,
+        "seconds": seconds,
+        "lights": sorted({light["name"] for light in lights}),
+        "notes": mirror.notes,
+        "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
+    }
+
+
+def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
+    """What the evaluated object `camera` renders in a picture of `size`."""
+    render = depsgraph.scene_eval.render
+    aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
+    window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **aspect)
+    return View.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
+
+
+def _shown(scene, technique: str, passes: str) -> ShownPicture:
+    return ShownPicture(
+        technique=technique,
+        passes=passes,
+        mode="single",
+        second_technique=technique,
+        split=0.5,
+        difference_scale=1.0,
+        exposure=cycles_setting(scene, "film_exposure"),
+        transparent=scene.render.film_transparent or passes != "combined",
+    )
+
+
+class _Canvas:
+    """A picture of floats that a view is drawn into; needs an active GPU context."""
+
+    def __init__(self, mirror: SceneMirror, view: View, size: tuple[int, int]):
+        self._mirror, self._view, self._size = mirror, view, size
+        self._renderer = _renderer[0] if _renderer else ViewRenderer()
+        self._texture = gpu.types.GPUTexture(size, format="RGBA32F")
+        self._buffer = gpu.types.GPUFrameBuffer(color_slots=[self._texture])
+
+    def draw(self, shown: ShownPicture, points: np.ndarray, progress: Callable) -> tuple[np.ndarray, list[float]]:
+        """The mean (H, W, 4) of `points` as of a view at rest, row 0 on top, and the seconds of redraws, those of
+        `points` first."""
+        # The first picture of all compiles shaders.
+        self._redraw(shown, self._view.shifted((1.0, 0.0), self._size), CENTERS)
+        seconds = []
+        for number in range(len(points)):
+            progress(number / len(points))
+            seconds.append(self._redraw(shown, self._view, points))
+        picture = read_texture(self._texture)[::-1]
+        for number in range(TIMED - len(points) if shown.passes == "combined" else 0):
+            seconds.append(self._redraw(shown, self._view.shifted((0.0, 1.0 + number), self._size), CENTERS))
+        return picture, seconds
+
+    def _redraw(self, shown, view, points) -> float:
+        """Draw once more; the seconds until the card has done it."""
+        start = time.perf_counter()
+        self._renderer.draw(self._mirror, view, self._size, shown, self._buffer, points)
+        self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+        return time.perf_counter() - start
+
+    def free(self) -> None:
+        """Let go of everything, but keep what the next canvas can use."""
+        if hasattr(gpu, "init"):
+            _renderer[:] = [self._renderer]
+        else:
+            self._renderer.free()
+
+
+def _save_png(scene, pixels: np.ndarray, path: Path) -> None:
+    """Save `pixels` (H, W, 4), row 0 on top, as Blender shows them: through the view transform of the scene."""
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new("LTSH view", width, height, alpha=True, float_buffer=True)
+    if bpy.app.version >= (5, 0, 0):
+        image.colorspace_settings.name = bpy.data.colorspace.working_space
+    # Blender takes color for multiplied by alpha, as it is.
+    image.alpha_mode = "PREMUL"
+    image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1], np.float32).ravel())
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth = "PNG", "8"
+    settings.color_mode = "RGBA" if scene.render.film_transparent else "RGB"
+    image.save_render(str(path), scene=scene)
+    bpy.data.images.remove(image)

@@ -1,0 +1,155 @@
+"""`ltsh view`: the viewport's picture without a window is that of `ltsh shade`, and refines as a view at rest does."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import bpy
+import numpy as np
+import programs
+import pytest
+import scene_parts as parts
+from fake_scene import run
+from graphics_card import Canvas, edits_with_graphics, with_graphics
+from view_pictures import textured
+
+from ltsh_addon import imaging
+from ltsh_addon.blender.render_settings import filter_points
+from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.still import view_of_camera
+
+ROOT = Path(__file__).resolve().parents[3]
+SIZE = (72, 48)
+
+
+def set_up_scene():
+    """A textured floor, a smooth metal sphere and a glowing sign, lit from two sides; through a shifted, turned camera
+    with pixels that are no squares. The camera."""
+    scene = parts.empty_scene(*SIZE)
+    floor = textured("floor", "Base Color")[0]
+    parts.add_plane(floor, size=6.0)
+    metal = parts.bsdf_material("ShaderNodeBsdfAnisotropic", "metal", Color=(0.9, 0.7, 0.4, 1.0), Roughness=0.3)[0]
+    parts.add_sphere(metal, radius=0.8, location=(-0.4, 0.2, 0.8))
+    black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0}
+    glow = {"Emission Color": (0.1, 0.2, 0.4, 1.0), "Emission Strength": 0.5}
+    glowing = parts.principled("glowing", **black, **glow)[0]
+    parts.add_plane(glowing, name="Sign", size=0.7, location=(1.2, 0.6, 0.6), rotation=(1.2, 0.0, -0.4))
+    parts.add_area_light(location=(1.5, -1.0, 2.5), rotation=(0.4, 0.5, 0.0), size=1.0, size_y=0.5)
+    parts.add_area_light("Left", location=(-3.0, 0.0, 1.0), rotation=(0.0, -1.3, 0.0), shape="DISK", size=1.5)
+    camera = parts.add_camera((0.3, -4.0, 2.6), (1.02, 0.1, 0.05))
+    camera.data.shift_x = 0.05
+    scene.render.pixel_aspect_y = 1.2
+    scene.view_settings.view_transform = "Standard"
+    scene.cycles.film_exposure = 1.5
+    bpy.context.view_layer.update()
+    return camera
+
+
+def relative(picture, expected):
+    return np.linalg.norm(picture - expected) / np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize(("count", "most"), [(1, 0.01), (16, 0.02)])
+def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
+    with_graphics(lambda: None)
+    set_up_scene()
+    path = parts.save(tmp_path / "room.blend")
+    view, shade = tmp_path / "view", tmp_path / "shade"
+    code, stdout, stderr = run(
+        capsys, "view", path, "-o", view, "--refine", count, "--shadows", "off", "--techniques", "ltsh4,ltc",
+        "--json", "--quiet",
+    )  # fmt: skip
+    report = json.loads(stdout)
+    assert (code, stderr) == (0, "") and report["draw_s"] > 0.0 and report["refined_s"] > 0.0
+    assert report["resolution"] == list(SIZE) and report["sub_samples"] == count
+    arguments = ("--aa", count, "--shadows", "off", "--techniques", "ltsh4,ltc", "--quiet")
+    assert run(capsys, "shade", path, "-o", shade, *arguments)[0] == 0
+    found, expected = imaging.read_layers(view / "view.exr"), imaging.read_layers(shade / "shade.exr")
+    for technique in ("ltsh4", "ltc"):
+        for name in ("specular", "diffuse"):
+            layer = f"{technique}.{name}"
+            assert relative(found[layer], expected[layer]) < most, layer
+    # All that shines by itself is in the combined picture alone.
+    emitted = found["ltsh4.combined"] - found["ltsh4.specular"] - found["ltsh4.diffuse"]
+    whole = np.abs(emitted - 1.5 * 0.5 * np.array([0.1, 0.2, 0.4])).max(axis=-1) < 1e-5
+    assert 40 < whole.sum() < 400 and (np.abs(emitted[~whole]).max(axis=-1) < 1e-5).mean() > 0.85
+    coverage = np.abs(found["coverage.hit"] - expected["coverage.hit"])
+    assert coverage.max() <= 2.0 / count and coverage.mean() < 0.01
+    # The PNG is the same picture as screens show it, within steps of 256 values.
+    shown = bpy.data.images.load(str(view / "view.png"))
+    pixels = np.array(shown.pixels[:]).reshape(SIZE[1], SIZE[0], 4)[::-1, :, :3]
+    linear = np.clip(found["ltsh4.combined"], 0.0, 1.0)
+    screen = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+    assert np.abs(pixels - screen).max() <= 1.01 / 255.0
+    bpy.data.images.remove(shown)
+
+
+def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
+    with_graphics(lambda: None)
+    camera = set_up_scene()
+    camera.data.dof.use_dof = True
+    path = parts.save(tmp_path / "room.blend")
+    code, stdout, _ = run(
+        capsys, "view", path, "-o", tmp_path / "out", "--refine", 1, "--frames", "3,5", "--resolution", "16x12",
+        "--json", "--quiet",
+    )  # fmt: skip
+    document = json.loads(stdout)
+    assert code == 0 and document["draw_s"] > 0.0
+    assert [(one["name"], one["frame"]) for one in document["reports"]] == [("view_0003", 3), ("view_0005", 5)]
+    warnings = "\n".join(document["reports"][0]["warnings"])
+    assert "depth of field" in warnings and "shadows are not drawn" in warnings
+    assert {path.name for path in (tmp_path / "out").glob("view_*")} == {
+        f"view_000{frame}.{suffix}" for frame in (3, 5) for suffix in ("exr", "png")
+    }
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere graphics cannot be taken away")
+def test_a_machine_without_graphics_is_told_in_one_line(tmp_path, own_blender):
+    path = parts.metal_room(tmp_path / "room.blend")
+    command = programs.command_line("view", path, "-o", tmp_path / "out", "--quiet")
+    without = {**os.environ, "__EGL_VENDOR_LIBRARY_DIRS": str(tmp_path), "DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    done = subprocess.run(command, cwd=ROOT, env=without, capture_output=True, text=True, timeout=120, check=False)
+    (line,) = done.stderr.splitlines()
+    assert done.returncode == 1 and "no graphics card" in line and "shade" in line
+    assert not (tmp_path / "out").exists()
+
+
+def drawn_by_samples():
+    """Means of 1, 2, ... points of a view at rest, the same points drawn alone, and what follows a change."""
+    camera = set_up_scene()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    mirror, canvas, points = SceneMirror(), Canvas(*SIZE), filter_points("BLACKMAN_HARRIS", 1.5, 3)
+    mirror.sync(depsgraph)
+    view = view_of_camera(camera, depsgraph, SIZE)
+    shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+    still, moved = ViewRenderer(), ViewRenderer()
+    try:
+        refined, alone, counts = [], [], []
+        for _ in range(len(points) + 1):
+            still.draw(mirror, view, SIZE, shown, canvas.buffer, points)
+            refined.append(canvas.read())
+            counts.append(still.samples)
+        for point in points:
+            moved.draw(mirror, view.shifted(point, SIZE), SIZE, shown, canvas.buffer)
+            alone.append(canvas.read())
+        mirror.lights = tuple(mirror.lights[:1])
+        still.draw(mirror, view, SIZE, shown, canvas.buffer, points)
+        changed = canvas.read(), still.samples
+        moved.draw(mirror, view, SIZE, shown, canvas.buffer, CENTERS)
+        return refined, counts, alone, changed, canvas.read()
+    finally:
+        still.free()
+        moved.free()
+
+
+@edits_with_graphics
+def test_a_view_at_rest_is_the_mean_of_its_points_and_starts_again_after_a_change():
+    refined, counts, alone, (changed, samples), expected = with_graphics(drawn_by_samples)
+    assert counts == [1, 2, 3, 3] and samples == 1
+    for number, picture in enumerate(refined):
+        np.testing.assert_allclose(picture, np.mean(alone[: number + 1], axis=0), rtol=1e-5, atol=1e-6)
+    assert not np.array_equal(alone[0], alone[1])
+    np.testing.assert_array_equal(changed, expected)

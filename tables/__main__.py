@@ -170,6 +170,7 @@ def _validate(options) -> int:
             **validate.validate_corners(table, max(options.count // 2, 4)).to_dict(),
         }
         basis = validate.fresnel_basis_error(table, max(options.count // 4, 2))
+        results[name]["layouts"] = validate.layout_errors(table, options.count)
         results[name]["fresnel_basis"] = {str(ior): error for ior, error in basis.items()}
     print(json.dumps(results, indent=2) if options.json else _as_text(results))
     return 0
@@ -191,6 +192,11 @@ def _as_text(results):
         cells = [f"{found[key]:.4f}" for key in ("smooth_mean", "smooth_maximum")]
         cells += [albedo, f"{found['largest_albedo_step']:.4f}", f"{found['largest_number']:.1f}"]
         lines.append(f"| `{name}` | {' | '.join(cells)} | {100.0 * worst:.2f} % |")
+    lines += ["", "| table | mean | half floats | loss | two textures |", "|---" * 5 + "|"]
+    for name, found in results.items():
+        mean, half, textures = found["mean"], found["layouts"]["half"], found["layouts"].get("two_textures")
+        last = "" if textures is None else f"{textures:.4f}"
+        lines.append(f"| `{name}` | {mean:.4f} | {half:.4f} | {100.0 * (half / mean - 1.0):.2f} % | {last} |")
     return "\n".join(lines)
 
 

@@ -8,11 +8,11 @@ needle at the horizon that samples of the BRDF alone never see.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ltsh_addon.shading import brdf, evaluate_lobe, spherical_harmonics
+from ltsh_addon.shading import brdf, evaluate_lobe, layouts, spherical_harmonics
 from ltsh_addon.shading.lookup_table import LookupTable
 
 from .brdfs import gauss_legendre
@@ -73,6 +73,40 @@ def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_the
     """Relative L2 errors (count, count) of the points of `validate`: rows roughness, columns theta_o."""
     points = grid(count, roughness, max_theta)
     return np.array([_measure(table, *point)[0] for point in points]).reshape(count, count)
+
+
+def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
+    """Mean errors of `validate` of the layouts for other engines, by their names."""
+    halves = layouts.half_layers(table)
+    rows, columns, parameters = table.warp.shape
+    channels = np.moveaxis(halves, 0, 2).reshape(rows, columns, -1).astype(np.float32)
+    coefficients = channels[..., parameters : parameters + table.coefficients[0, 0].size]
+    rounded = replace(
+        table, warp=channels[..., :parameters], coefficients=coefficients.reshape(table.coefficients.shape)
+    )
+    found = {"half": float(error_map(rounded, count).mean())}
+    if table.family == "ltc":
+        textures = layouts.two_textures(table)
+        found["two_textures"] = float(np.mean([_textures_error(textures, *point) for point in grid(count)]))
+    return found
+
+
+def _textures_error(textures, mu, roughness) -> float:
+    """L2 error of the two textures, looked up as in the shaders that they are made for."""
+    directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([roughness**2])))
+    lobe = brdf.ggx_brdf_cosine(mu, roughness**2, directions)
+    size = textures.shape[1]
+    row, column = np.sqrt(1.0 - mu) * (size - 1), roughness * (size - 1)
+    i, j = min(int(row), size - 2), min(int(column), size - 2)
+    (a, b), (c, d) = textures[:, i : i + 2, j : j + 2].swapaxes(0, 1).swapaxes(1, 2).astype(float)
+    row, column = row - i, column - j
+    first, second = (a * (1.0 - column) + b * column) * (1.0 - row) + (c * (1.0 - column) + d * column) * row
+    m00, m20, m02, m22 = first
+    x, y, z = directions.T
+    warped = np.stack([m00 * x + m02 * z, y, m20 * x + m22 * z])
+    length = np.linalg.norm(warped, axis=0)
+    fitted = second[0] * np.maximum(warped[2], 0.0) / np.pi * abs(m00 * m22 - m02 * m20) / length**4
+    return float(np.sqrt((weights * (fitted - lobe) ** 2).sum() / (weights * lobe**2).sum()))
 
 
 def _measure(table, mu, roughness):

@@ -354,7 +354,7 @@ TABLES_EXAMPLES = """examples:
   %(prog)s validate ltsh4 --json
   %(prog)s fit ltsh6 -o out/tables
 """
-EXPORT = "Write each table as an EXR and as a header for C, C++ and GLSL; see tables/EXPORT.md."
+EXPORT = "Write each table as images, as a header for C, C++, GLSL and HLSL, and as WGSL; see docs/engines.md."
 EXPORT_EXAMPLES = """examples:
   %(prog)s -o out/tables
   %(prog)s ltsh4 my_table.npz -o out/tables --json
@@ -376,7 +376,7 @@ def add_tables(parser) -> None:
         script = actions.add_parser(action, help=meaning, add_help=False, prefix_chars="\0")
         script.add_argument("arguments", nargs="*")
         script.set_defaults(run=_run_table_script, quiet=False, log=None)
-    export = actions.add_parser("export", help="for other engines: an EXR, a header for C, C++ and GLSL")
+    export = actions.add_parser("export", help="for other engines: images, a header for C, C++, GLSL and HLSL, WGSL")
     with_examples(export, EXPORT, EXPORT_EXAMPLES)
     export.add_argument("names", nargs="*", type=from_text(table), metavar="TABLE",
                         help="or a path (.npz); default: all shipped")  # fmt: skip

@@ -1,7 +1,7 @@
-"""Lookup tables for other engines: `ltsh tables export` writes one EXR and one header per table (tables/EXPORT.md).
+"""Lookup tables for other engines: what `ltsh tables export` writes (tables/EXPORT.md).
 
 The EXR holds every stored quantity as a channel over the grid of the table, the header all numbers and the functions
-that shade with them.
+that shade with them, the .wgsl these functions, the .dds the numbers as textures.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +18,12 @@ import numpy as np
 from ..files import replacing
 from ..imaging.exr import write_channels
 from ..scene import VERSION
-from ..shading import load_table
-from ..shading.header import header_text
+from ..shading import layouts, load_table
+from ..shading.header import header_text, wgsl_text
 from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
 from ..shading.spherical_harmonics import hemisphere_integrals
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
-
-
-class _ImageError(Exception):
-    """The EXR cannot be written; no OSError, so that its message passes through the file around it as it is."""
 
 
 def export_tables(
@@ -70,19 +67,23 @@ def identifier(name: str) -> str:
 
 
 def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> list[Path]:
-    """Write `folder`/`name`.exr and .h, both or none; returns them. Raises OSError."""
-    image, header = folder / f"{name}.exr", folder / f"{name}.h"
-    text = header_text(table, prefix, _about(table, name))
-    try:
-        with replacing(header) as temporary:
-            temporary.write_text(text, encoding="ascii", newline="\n")
-            try:
-                write_channels(image, table_channels(table), _attributes(table))
-            except OSError as error:
-                raise _ImageError(str(error)) from error
-    except _ImageError as error:
-        raise OSError(str(error)) from error
-    return [image, header]
+    """Write the files of a table to `folder`, all or none; returns them. Raises OSError, TableError."""
+    about = _about(table, name)
+    contents = {
+        f"{name}.h": header_text(table, prefix, about).encode("ascii"),
+        f"{name}.wgsl": wgsl_text(table, prefix, about).encode("ascii"),
+        f"{name}.dds": layouts.dds(layouts.half_layers(table)),
+    }
+    if table.family == "ltc":
+        for number, texture in enumerate(layouts.two_textures(table), start=1):
+            contents[f"{name}_{number}.dds"] = layouts.dds(texture[None])
+    image = folder / f"{name}.exr"
+    with ExitStack() as stack:
+        for own, data in contents.items():
+            stack.enter_context(replacing(folder / own)).write_bytes(data)
+        # The last to be written is the first to get its name.
+        write_channels(image, table_channels(table), _attributes(table))
+    return [image, *(folder / own for own in contents)]
 
 
 def table_channels(table: LookupTable) -> dict[str, np.ndarray]:
@@ -115,6 +116,7 @@ def _directional_albedo(table) -> np.ndarray:
 def _attributes(table) -> dict[str, str]:
     """EXR attributes; arrays as JSON, so that the image alone is enough to rebuild the table."""
     conventions = {
+        "license": "CC0-1.0",
         "table": table.name,
         "family": table.family,
         "degree": table.degree,
@@ -155,7 +157,7 @@ def _about(table, name) -> str:
     curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
     return f"""\
 {name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
-Made by `ltsh tables export` {VERSION} (SPDX-License-Identifier: GPL-3.0-or-later). C99, C++ and GLSL 3.30.
+Made by `ltsh tables export` {VERSION}. C99, C++, GLSL 3.30 and HLSL, or WGSL.
 Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
 Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
 {curves}

@@ -1,4 +1,4 @@
-"""The tables and the code that evaluates them, as a header for C, C++ and GLSL.
+"""The tables and the code that evaluates them, as a header for C, C++, GLSL and HLSL, and as WGSL.
 
 The text stands in `glsl/`: core.h is what no table changes, which the viewport's shaders contain too, and table.h what
 every table adds. This chapter reads such files, and writes the lines that follow from a table's numbers and degree.
@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from . import edge_integrals, lookup_table, tails
+from . import edge_integrals, lookup_table, tails, wgsl
 from .lobes import LEAST_SHARE
 from .lookup_table import LookupTable
 from .spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
 
 # Raise it when a function of core.h changes: headers of different versions refuse to be included together.
-CORE_VERSION = 5
+CORE_VERSION = 6
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
@@ -82,6 +82,20 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
             "LEAST_OF_COSINE": float_literal(0.5 * LEAST_SHARE / np.pi),
         }
     return filled(_of_family(_text("table.h"), table.family), values)
+
+
+# Here ends what is the same for all tables in WGSL, and in a header what shaders need.
+_OWN = "/* What stands above is the same for all tables: leave it out of a second one. */"
+_END_OF_SHADERS = "/* GLSL and HLSL may end here"
+
+
+def wgsl_text(table: LookupTable, prefix: str, about: str) -> str:
+    """The functions of the header in WGSL, without the data."""
+    text = header_text(table, prefix, about)
+    text = text[: text.index(_END_OF_SHADERS)]
+    core_end = text.index("#elif LTSH_SHARED")
+    text = text[:core_end] + f"{_OWN}\n" + text[core_end:]
+    return f"{wgsl.translated(text, prefix).strip()}\n"
 
 
 def _text(name) -> str:

@@ -23,6 +23,12 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"
 
 
+def files_of(name: str, family: str = "") -> list[str]:
+    """What is written of a table, in order."""
+    textures = [f"{name}_{number}.dds" for number in (1, 2)] if "ltc" in (name, family) else []
+    return [*(f"{name}.{ending}" for ending in ("exr", "h", "wgsl", "dds")), *textures]
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
@@ -106,7 +112,7 @@ def test_names_in_headers_are_identifiers(name, expected):
 
 def test_all_shipped_tables_are_the_default(capsys, out):
     code, stdout, stderr = run(capsys, "tables", "export", "-o", out, "--quiet")
-    names = [f"{name}.{ending}" for name in shading.SHIPPED_TABLES for ending in ("exr", "h")]
+    names = [file for name in shading.SHIPPED_TABLES for file in files_of(name)]
     assert (code, stderr) == (0, "") and stdout.splitlines() == [str(out / name) for name in names]
     assert sorted(path.name for path in out.iterdir()) == sorted(names)
 
@@ -117,9 +123,9 @@ def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
     code, stdout, stderr = run(capsys, "tables", "export", "ltc", path, "ltc", "-o", out / "deep", "--json", "--quiet")
     files = json.loads(stdout)["tables"]
     assert (code, stderr) == (0, "") and list(files) == ["ltc", str(path)]
-    assert {Path(file).name for written in files.values() for file in written} == {
-        "ltc.exr", "ltc.h", "My table.exr", "My table.h"
-    } == {file.name for file in (out / "deep").iterdir()}  # fmt: skip
+    expected = {*files_of("ltc"), *files_of("My table", "ltc")}
+    assert {Path(file).name for written in files.values() for file in written} == expected
+    assert {file.name for file in (out / "deep").iterdir()} == expected
     assert "my_table_integrate_polygon" in (out / "deep" / "My table.h").read_text(encoding="ascii")
 
 
@@ -154,7 +160,7 @@ def test_a_broken_table_fails_before_anything_is_written(capsys, out, tmp_path):
 @pytest.mark.parametrize(
     ("owner", "attribute", "failure", "named"),
     [
-        (Path, "write_text", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "ltc.h"),
+        (Path, "write_bytes", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "ltc.h"),
         (OpenEXR, "OutputFile", OSError("Cannot write image file"), "ltc.exr"),
     ],
 )
@@ -168,14 +174,26 @@ def test_nothing_is_left_behind_when_writing_fails(capsys, out, monkeypatch, own
     assert result[2].count("cannot be written") == 1 and list(out.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["ltc.exr", "ltc.h"])
+@pytest.mark.parametrize("name", ["ltc.exr", "ltc.h", "ltc_2.dds"])
 def test_a_failure_keeps_what_was_there(capsys, out, name):
-    """A folder in the place of one file: neither is replaced."""
-    other = {"ltc.exr": "ltc.h", "ltc.h": "ltc.exr"}[name]
+    """A folder in the place of one file: none is replaced."""
+    other = "ltc.wgsl"
     (out / name).mkdir(parents=True)
     (out / other).write_bytes(b"old")
     _assert_failure(run(capsys, "tables", "export", "ltc", "-o", out, "--quiet"), "a folder has that name")
     assert (out / other).read_bytes() == b"old" and len(list(out.iterdir())) == 2
+
+
+def test_every_file_says_its_license(exported):
+    for name in shading.SHIPPED_TABLES:
+        for ending in ("h", "wgsl"):
+            text = (exported / f"{name}.{ending}").read_text(encoding="ascii")
+            start = text[:3000]
+            assert "SPDX-License-Identifier: CC0-1.0" in start and "SPDX-License-Identifier: MIT" in start
+            assert "Permission is hereby granted, free of charge" in start and "GPL" not in text
+        with OpenEXR.File(str(exported / f"{name}.exr"), header_only=True) as file:
+            assert json.loads(file.header()["ltsh:conventions"])["license"] == "CC0-1.0"
+    assert "CC0 1.0 Universal" in (ROOT / "tables" / "LICENSE").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +218,7 @@ def test_the_installed_add_on_exports_without_scipy(installed, exported, out):
     package = "bl_ext.user_default.ltsh.ltsh_addon"
     done = _run_without_scipy(installed, package, "tables", "export", "ltsh2", "-o", out, "--quiet")
     assert (done.returncode, done.stderr) == (0, "")
-    for name in ("ltsh2.exr", "ltsh2.h"):
+    for name in files_of("ltsh2"):
         assert (out / name).read_bytes() == (exported / name).read_bytes()
 
 

@@ -1,14 +1,10 @@
 """Exported headers as texts: what C, C++ and GLSL take, and what tables/EXPORT.md says of them."""
 
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import header_harness
 import pytest
-
-from ltsh_addon import shading
 
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
 
@@ -92,21 +88,3 @@ def test_every_offset_is_documented(folder, tables):
 def test_the_documented_c_example_compiles(folder, tables):
     (example,) = re.findall(r"```c\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), flags=re.DOTALL)
     assert header_harness.accepts(header_harness.C_COMPILER, example, folder / "example.c", "-std=c99") == ""
-
-
-@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
-@pytest.mark.parametrize("whole", [True, False])
-def test_a_glsl_compiler_takes_the_header(folder, tables, name, whole):
-    compiler = shutil.which("glslangValidator")
-    if compiler is None:
-        pytest.skip("needs glslangValidator; the other tests look at the GLSL branch without it")
-    (example,) = re.findall(r"```glsl\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), flags=re.DOTALL)
-    header = (folder / f"{name}.h").read_text(encoding="ascii")
-    if not whole:
-        header = header[: header.index("/* A GLSL source may end here")] + "#endif\n"
-    main = "out vec4 color; void main() { color = vec4(NAME_integrate_polygon(0.5, 0.5, ltsh_empty_polygon())); }"
-    source = example.replace("ltsh4", name).replace("LTSH4", name.upper()) + header + main.replace("NAME", name)
-    path = folder / f"{name}.frag"
-    path.write_text(source, encoding="ascii")
-    done = subprocess.run([compiler, str(path)], capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stdout

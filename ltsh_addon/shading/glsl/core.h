@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: MIT, with the notice of table.h. Copyright 2026 LTSH contributors. */
 #ifndef LTSH_SHARED
 #define LTSH_SHARED @VERSION@
 
@@ -6,15 +7,21 @@
 #define LTSH_MAX_CORNERS 8
 #endif
 
-#ifdef LTSH_GLSL
+#if defined(LTSH_GLSL) || defined(LTSH_HLSL)
+#define LTSH_SHADER 1
 #define LTSH_FUNCTION
 #define LTSH_SQRT(x) sqrt(x)
 #define LTSH_SIN(x) sin(x)
 #define LTSH_COS(x) cos(x)
-#define LTSH_ATAN2(y, x) atan(y, x)
 #define LTSH_INT(x) int(x)
 #define LTSH_FLOAT(x) float(x)
+#ifdef LTSH_HLSL
+#define LTSH_ATAN2(y, x) atan2(y, x)
+#define ltsh_vec3 float3
+#else
+#define LTSH_ATAN2(y, x) atan(y, x)
 #define ltsh_vec3 vec3
+#endif
 #else
 #include <math.h>
 #define LTSH_FUNCTION static inline
@@ -48,7 +55,7 @@ struct ltsh_extent { ltsh_vec3 center; ltsh_vec3 half_u; ltsh_vec3 half_v; ltsh_
    and 0. */
 struct ltsh_limits { float least; float most; float cosine; };
 
-#ifndef LTSH_GLSL
+#ifndef LTSH_SHADER
 typedef struct ltsh_frame ltsh_frame;
 typedef struct ltsh_polygon ltsh_polygon;
 typedef struct ltsh_cell ltsh_cell;

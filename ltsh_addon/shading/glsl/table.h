@@ -1,11 +1,30 @@
 /* @ABOUT@ */
+/* The numbers are in the public domain (SPDX-License-Identifier: CC0-1.0). The code (SPDX-License-Identifier: MIT):
+
+   Copyright 2026 LTSH contributors
+
+   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
+   documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
+   rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
+   persons to whom the Software is furnished to do so, subject to the following conditions:
+
+   The above copyright notice and this permission notice shall be included in all copies or substantial portions of the
+   Software.
+
+   THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
+   WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR
+   COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR
+   OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE. */
 #ifndef @PREFIX@_TABLE
 #define @PREFIX@_TABLE 1
 
 #if !defined(LTSH_GLSL) && (defined(GL_core_profile) || defined(GL_compatibility_profile) || defined(GL_ES))
 #define LTSH_GLSL 1
 #endif
-#if defined(LTSH_GLSL) && !defined(@PREFIX@_DATA)
+#if !defined(LTSH_HLSL) && defined(__HLSL_VERSION)
+#define LTSH_HLSL 1
+#endif
+#if (defined(LTSH_GLSL) || defined(LTSH_HLSL)) && !defined(@PREFIX@_DATA)
 #error define @PREFIX@_DATA(index), which fetches one float of the data, before this header is included
 #endif
 
@@ -14,7 +33,7 @@
 struct @prefix@_coefficients { float values[@PREFIX@_COEFFICIENTS]; };
 struct @prefix@_weights { float values[@PREFIX@_COEFFICIENTS]; };
 struct @prefix@_moments { float values[@PREFIX@_COEFFICIENTS]; };
-#ifndef LTSH_GLSL
+#ifndef LTSH_SHADER
 typedef struct @prefix@_coefficients @prefix@_coefficients;
 typedef struct @prefix@_weights @prefix@_weights;
 typedef struct @prefix@_moments @prefix@_moments;
@@ -242,7 +261,7 @@ LTSH_FUNCTION float @prefix@_dielectric_integral(
     return ltsh_larger(orientation * @prefix@_integral(dielectric, moments), root * root * plain_integral);
 }
 
-/* A GLSL source may end here, with the #endif of the last line: what follows is for C and C++ only. */
+/* GLSL and HLSL may end here, with the #endif of the last line: what follows is for C and C++ only. */
 #ifdef @PREFIX@_DATA_FOLLOWS
 static const float @prefix@_data[@PREFIX@_DATA_COUNT] = {
 @VALUES@

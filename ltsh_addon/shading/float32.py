@@ -9,13 +9,13 @@ handed back, for `shade_pairs` takes those of many blocks together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import numpy as np
 
-from . import float64, light_cone, moments32
-from .light_polygons import integrate_visible, light_levels, local_corners
+from . import float64, light_cone, moments32, small_lights
+from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .polygon import convex_pieces, dot
 from .tails import SeenLight, TailLimits
@@ -26,6 +26,8 @@ SEPARATE_IORS = 8
 # multiple of a page long, where the cache would hold few of them.
 CHUNK = 24592
 CORNERS = 4 * CHUNK
+# Samples per chunk for small lights.
+SMALL_CHUNK = 6144
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -45,13 +47,14 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
             rows = _normal_frame(_columns(samples.diffuse_normal, index))
-            clip_rows, integrate = (2,), FormFactor(scratch)
+            clip_rows, integrate, at_point = (2,), FormFactor(scratch), small_lights.CosineAtPoint(rows)
             if is_bumped:
-                smooth = _columns(samples.smooth_normal, index)
+                smooth, bump_alpha2 = _columns(samples.smooth_normal, index), samples.bump_alpha2[index]
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
-                integrate = ShadowedFormFactor(rows, samples.bump_alpha2[index].astype(np.float32), scratch)
+                integrate = ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
+                at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
             colors = _columns(samples.diffuse_albedo, index)[None]
-            lighting.add(Lobes(index, rows, clip_rows, integrate, colors, 1.0))
+            lighting.add(Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0))
     lighting.finish(leftovers)
 
 
@@ -75,7 +78,10 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
                 ior = None if isinstance(vectors[-1], int) else samples.ior[index]
                 second = rows[clip_rows[0]] if len(clip_rows) > 1 else None
                 limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
-            lighting.add(Lobes(index, rows, clip_rows, integrate, colors_of(index), width, limits))
+            at_point = small_lights.LobeAtPoint(rows, weights, table.family == "ltc", limits)
+            sharpest = small_lights.SharpestLobes(*axes, width)
+            lobes = Lobes(index, rows, clip_rows, integrate, at_point, colors_of(index), width, limits, sharpest)
+            lighting.add(lobes)
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
 
@@ -101,9 +107,16 @@ class Lobes:
     rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` wants
     clip_rows: tuple[int, ...]  # the coordinates that are positive above the horizons
     integrate: Callable
+    at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.Rays`
     colors: np.ndarray  # (F, 3, Q) reflectances of the integrals
     width: np.ndarray | float  # as for `light_levels`
     limits: TailLimits | None = None
+    sharpest: small_lights.SharpestLobes | None = None  # of specular lobes
+
+    @cached_property
+    def clip_lengths(self) -> list[np.ndarray]:
+        """Lengths (Q,) of the rows that are clipped."""
+        return [np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows]
 
 
 class _Lighting:
@@ -125,10 +138,17 @@ class _Lighting:
             if light.is_focused:
                 near = light_cone.may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
+            if light.is_profiled:
+                rest = None
+            else:
+                rest = self._add_small(lobes, light, position, allowed, sums[group])
+                if rest is not None and len(rest) == 0:
+                    continue
             if light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners):
-                needs_float64.append(index if allowed is None else index[allowed])
+                chosen = _both(allowed, rest)
+                needs_float64.append(index if chosen is None else index[chosen])
                 continue
-            for part, outline, effort in _batches(light, corners, position, lobes.width):
+            for part, outline, effort in _batches(light, corners, position, lobes.width, rest):
                 offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
                 toward = dot(offset, light.direction.astype(np.float32))
                 facing = toward < 0.0
@@ -155,6 +175,37 @@ class _Lighting:
                 # Terms that cancel in the Fresnel factor may leave a rest below zero.
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[group, index] += reflected.T
+
+    def _add_small(self, lobes, light, position, allowed, total) -> np.ndarray | None:
+        """Add the light to total (F, 3, Q) where it is small; the columns (Q',) that are left, None for all."""
+        seen, left, count = small_lights.SmallLight.of(light), [], position.shape[1]
+        direction = seen.area_vector.astype(np.float32)
+        origins = light.origins(position)
+        for part in moments32.pieces(count, SMALL_CHUNK):
+            offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
+            rays = small_lights.Rays.along(offset, direction, np.float32(seen.diagonal))
+            size = small_lights.seen_sizes(lobes, part, rays, seen.radius)
+            rays = replace(rays, slack=small_lights.VARIATION * size)
+            small, lit = small_lights.small_and_lit(lobes, part, rays, seen.radius, size)
+            if not small.all():
+                left.append(part.start + np.nonzero(~small)[0])
+            if allowed is not None:
+                lit &= allowed[part]
+            share = np.count_nonzero(lit)
+            if share == 0:
+                continue
+            if share == len(lit):
+                found, columns = lobes.at_point(part, rays), part
+            elif share > MOSTLY_WHOLE * len(lit):
+                found, columns = np.where(lit, lobes.at_point(part, rays), np.float32(0.0)), part
+            else:
+                chosen = np.nonzero(lit)[0]
+                columns = part.start + chosen
+                found = lobes.at_point(columns, rays.take(chosen))
+            for channel in range(3):
+                total[:, channel, columns] += found * np.float32(light.radiance[channel])
+        left = np.concatenate(left) if left else np.empty(0, np.intp)
+        return None if len(left) == count else left
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""
@@ -192,7 +243,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.is_profiled or light.is_round else (0, len(corners) + 1j * light.is_distant)
+        own = (1, position) if light.is_profiled or light.is_round else (0, (len(corners), light.is_distant))
         batches.setdefault(own, []).append(position)
     for (alone, _), chosen in sorted(batches.items()):
         among = np.full(len(lights), -1)
@@ -229,9 +280,21 @@ def _is_in_pieces(light, corners) -> bool:
     return light.is_profiled and light.shape == "POLYGON" and len(convex_pieces(corners)) > 1
 
 
-def _batches(light, corners, position, width):
-    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of all points, in batches."""
+def _both(allowed, rest):
+    """The columns `rest` of which the mask `allowed` is true; either may be None, for all."""
+    if allowed is None or rest is None:
+        return allowed if rest is None else rest
+    return rest[allowed[rest]]
+
+
+def _batches(light, corners, position, width, rest=None):
+    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of the columns `rest` (Q',), None
+    for all, in batches."""
+    if rest is not None:
+        position, width = position[:, rest], width if np.ndim(width) == 0 else width[rest]
     for outline, effort, chosen in light_levels(light, corners, position, width):
+        if rest is not None:
+            chosen = rest if chosen is None else rest[chosen]
         count = position.shape[1] if chosen is None else len(chosen)
         step = max(CORNERS // len(outline), 512)
         for start in range(0, count, step):

@@ -95,6 +95,42 @@ class TailLimits:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             _LightPoints(self.take(part), light, scratch).limit(integrals)
 
+    def apply_at_centers(self, integrals, part, rays) -> None:
+        """As `apply` for integrals (F, ...) over lights so small that their centers stand for all of them, at the ends
+        of `small_lights.Rays`."""
+        lobes = self.take(part)
+        heights, views = dot(lobes.normal, rays.offset), dot(lobes.view, rays.offset)
+        beyond = rays.squares - np.float32(NEAR_RADII**2) * rays.diagonal
+        mirrored = np.float32(2.0) * lobes.cosine * heights - views
+        tail = (mirrored * np.abs(mirrored) < beyond) & (beyond > 0.0)
+        halves = views * rays.distance
+        halves += rays.squares
+        cosine = halves / rays.squares
+        cosine *= np.float32(0.5)
+        cosine = np.sqrt(np.minimum(np.maximum(cosine, np.float32(0.0)), np.float32(1.0)))
+        cosine *= tail
+        squares, distances = rays.squares.copy(), rays.distance.copy()
+        value = _integrands(lobes.cosine, lobes.alpha_squared, (heights, halves, squares, distances))
+        value *= lobes.alpha_squared * rays.flux
+        value *= np.float32(0.5 / np.pi)
+        tail &= integrals[0] > 0.0
+        if rays.slack is not None:
+            margin = rays.slack * value
+            value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
+        np.copyto(integrals[0], value, where=tail)
+        lobes.limit_others(integrals, cosine)
+
+    def limit_others(self, integrals, cosine) -> None:
+        """Limit all but the first of integrals (F, ...) by that, where `cosine` (...) of the half angle is the least
+        over the light; 0 where that is not in the tail."""
+        plain = integrals[0]
+        if self.schlick:
+            np.minimum(integrals[1], schlick_curve(cosine) * plain, out=integrals[1])
+        if self.ior is not None:
+            np.minimum(integrals[-1], dielectric_reflectance(cosine, self.ior) * plain, out=integrals[-1])
+            head_on = (self.ior - 1.0) / (self.ior + 1.0)
+            np.maximum(integrals[-1], head_on * head_on * plain, out=integrals[-1])
+
 
 class _LightPoints:
     """The centers of lights as seen from samples, then also their corners: (5, Q) heights over the horizons, products
@@ -124,15 +160,7 @@ class _LightPoints:
             np.copyto(least, 0.0, where=others)
             np.copyto(most, np.inf, where=others)
             np.minimum(np.maximum(plain, least, out=plain), most, out=plain)
-        if self.lobes.schlick:
-            np.minimum(integrals[1], schlick_curve(cosine) * plain, out=integrals[1])
-        ior = self.lobes.ior
-        if ior is not None:
-            np.minimum(integrals[-1], dielectric_reflectance(cosine, ior) * plain, out=integrals[-1])
-            head_on = (ior - 1.0) / (ior + 1.0)
-            head_on *= head_on
-            head_on *= plain
-            np.maximum(integrals[-1], head_on, out=integrals[-1])
+        self.lobes.limit_others(integrals, cosine)
 
     def are_in_tail(self) -> np.ndarray:
         """Mask (Q,) of the lights that the mirrored view ray misses far enough."""
@@ -172,7 +200,9 @@ class _LightPoints:
         """The least and the greatest integrand over the area (Q,), times the area and a profile. Changes all arrays."""
         cosine, alpha_squared = self.lobes.cosine, self.lobes.alpha_squared
         profile = None if self.light.profile is None else self.light.range_of_profile(self.squares[0])
-        values = self._integrands(cosine, alpha_squared)
+        values = _integrands(
+            cosine, alpha_squared, (self.heights, self.halves, self.squares, self.distances), self.work
+        )
         least = np.minimum.reduce(values, axis=0, out=self.squares[0])
         most = np.maximum.reduce(values, axis=0, out=self.squares[1])
         factor = np.multiply(alpha_squared, self.light.toward, out=self.one)
@@ -191,32 +221,6 @@ class _LightPoints:
             least *= np.minimum.reduce(self.heights, axis=0) > 0.0
         return least, most
 
-    def _integrands(self, cosine, alpha_squared):
-        """GGX's BRDF times both cosines by the squared distance (5, Q), but for constants; negative below horizons."""
-        rest = 1.0 - alpha_squared
-        heights, distances, squares = self.heights, self.distances, self.squares
-        ratio = np.multiply(cosine, distances, out=self.work)
-        ratio += heights
-        ratio *= ratio
-        ratio *= -0.5 * rest
-        ratio += self.halves
-        np.divide(self.halves, ratio, out=ratio)
-        ratio *= ratio
-        ratio *= heights
-        masking = np.multiply(heights, heights, out=self.halves)
-        masking *= rest
-        distances *= squares
-        squares *= alpha_squared
-        masking += squares
-        np.sqrt(masking, out=masking)
-        masking *= cosine
-        np.abs(heights, out=heights)
-        heights *= np.sqrt(alpha_squared + rest * cosine * cosine)
-        masking += heights
-        masking *= distances
-        ratio /= masking
-        return ratio
-
     def _add_center(self, values, vectors):
         """Products of vectors (3, Q) with the offset of the center."""
         offset = self.light.offset
@@ -229,3 +233,33 @@ class _LightPoints:
         along = self.light.along_diagonals(vectors, *self.work[:4].reshape(2, 2, -1))
         np.add(values[0], along, out=values[1:3])
         np.subtract(values[0], along, out=values[3:])
+
+
+def _integrands(cosine, alpha_squared, at_points, work=None):
+    """GGX's BRDF times both cosines by the squared distance (...), but for constants; negative below horizons.
+
+    At points with given heights over the horizon, halves, squared distances and distances, all (...); all change.
+    """
+    heights, halves, squares, distances = at_points
+    rest = 1.0 - alpha_squared
+    ratio = np.multiply(cosine, distances, out=work)
+    ratio += heights
+    ratio *= ratio
+    ratio *= -0.5 * rest
+    ratio += halves
+    np.divide(halves, ratio, out=ratio)
+    ratio *= ratio
+    ratio *= heights
+    masking = np.multiply(heights, heights, out=halves)
+    masking *= rest
+    distances *= squares
+    squares *= alpha_squared
+    masking += squares
+    np.sqrt(masking, out=masking)
+    masking *= cosine
+    np.abs(heights, out=heights)
+    heights *= np.sqrt(alpha_squared + rest * cosine * cosine)
+    masking += heights
+    masking *= distances
+    ratio /= masking
+    return ratio

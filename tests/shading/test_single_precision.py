@@ -8,7 +8,8 @@ from surface_scenes import area_light, four_lights, random_samples, unit
 from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
-from ltsh_addon.shading import edge_integrals, float32, moments32
+from ltsh_addon.shading import edge_integrals, float32, integrator, moments32
+from ltsh_addon.shading import small_lights as points
 from ltsh_addon.shading.polygon import project_to_sphere
 
 # What `shade` promises for radiance 1.
@@ -96,6 +97,61 @@ def test_narrow_lights_are_exact_to_rounding(name):
         for part in shading.PASSES:
             found, expected = getattr(single, part), getattr(double, part)
             assert np.abs(found - expected).max() < 2e-7 * expected.max() and expected.max() > 0.0
+
+
+def small_lights(size, seed):
+    """One of each shape, of about `size` m, 1 to 6 m from the samples and facing them."""
+    generator = np.random.default_rng(seed)
+    for shape in ("RECTANGLE", "DISK", "ELLIPSE", "POLYGON"):
+        center = np.array([*generator.uniform(-4.0, 4.0, 2), generator.uniform(1.5, 4.0)])
+        direction = -unit(center)
+        u = size * unit(np.cross(direction, [0.3, 1.0, 0.0]))
+        v = np.cross(direction, u) * (1.0 if shape == "DISK" else 0.6)
+        # A boomerang, whose center of gravity is not in the middle
+        corners = center + np.array([-u, 0.3 * u, u + v, 0.2 * u - v]) if shape == "POLYGON" else None
+        yield area_light("Small", shape, center, u, v, direction=direction, corners=corners, radiance=np.ones(3))
+
+
+@pytest.mark.parametrize("size", [0.2, 0.05, 0.01, 1e-3])
+@table_names
+def test_small_lights_keep_the_promise_and_their_share(name, size, monkeypatch):
+    """They are their center: that neglects at most 0.2 % of a light, and more only of the tails that are confined by
+    a light's corners. Bent horizons among them. Few pairs are left to double precision."""
+    samples = all_kinds_of_samples(1000, seed=11)
+    samples = replace(samples, roughness=np.maximum(samples.roughness, moments32.SHARP_ROUGHNESS))
+    asked, original = [], integrator.Task.shade_pairs
+
+    def counted(self, samples, part, number):
+        asked.append(len(number))
+        return original(self, samples, part, number)
+
+    monkeypatch.setattr(integrator.Task, "shade_pairs", counted)
+    squares = {part: np.zeros(2) for part in shading.PASSES}
+    for light in small_lights(size, seed=5):
+        double = assert_close(samples, [light], name)
+        single = shading.shade(samples, [light], name, workers=1)
+        for part, both in squares.items():
+            expected = getattr(double, part)
+            both += ((getattr(single, part) - expected) ** 2).sum(), (expected**2).sum()
+    assert all(0.0 < error < (5e-3) ** 2 * energy for error, energy in squares.values()), squares
+    # Of the pairs of four lights, two passes and two calls
+    assert sum(asked) < 0.02 * 4 * 2 * 2 * len(samples)
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_terms_of_weights_give_the_moments_of_a_tiny_patch(degree):
+    """Against the moments of regular polygons of 1 mrad in double precision by their area: second order in that."""
+    generator = np.random.default_rng(degree)
+    polygons = regular_polygons(5, 50, seed=degree).astype(np.float64)
+    center = polygons.mean(axis=1, keepdims=True)
+    patch = project_to_sphere(center + 1e-3 * (polygons - center))
+    moments = np.linalg.solve(moments32.form_matrix(degree), edge_integrals.moments(patch, degree))
+    weights = generator.normal(size=(2, len(moments), 50))
+    x, _, z = project_to_sphere(center)[:, 0]
+    terms = points.polynomial_terms(weights)
+    for vector, own in zip(weights, terms, strict=True):
+        expected = (vector * moments).sum(axis=0) / moments[0]
+        assert np.abs(points.polynomial(own, x, z) - expected).max() < 1e-5 * np.abs(weights).sum(axis=1).max()
 
 
 @table_names

@@ -86,14 +86,14 @@ def test_workers_use_the_matrix_of_this_process(dtype, started, children_only):
 
 
 def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started, children_only, monkeypatch):
-    """Lights of 2 mm, of two groups, several kinds, and one not for all; some lobes are sharp. Against double precision
-    for all, against children, and against blocks that leave little."""
+    """Lights of 1 m by 10 um, of two groups, several kinds, and one not for all; some lobes are sharp. Against double
+    precision for all, against children, and against blocks that leave little."""
     generator = np.random.default_rng(5)
     samples = random_samples(300, seed=11, lowest_roughness=0.02)
     samples = replace(samples, receiver=np.arange(300) % 2, bump_alpha2=np.full(300, 0.1))
-    tiny = {"half_u": (0.001, 0, 0), "half_v": (0, -0.001, 0), "group": "Tiny"}
+    narrow = {"half_u": (0.5, 0, 0), "half_v": (0, -5e-6, 0), "group": "Narrow"}
     centers = np.append(generator.uniform(-0.5, 0.5, (4, 2)), np.full((4, 1), 1.5), axis=1)
-    lights = [area_light(center=center, **tiny) for center in centers]
+    lights = [area_light(center=center, **narrow) for center in centers]
     lights[1] = replace(lights[1], receivers=(1,), group="Key")
     lights[2] = replace(lights[2], shape="DISK")
     lights[3] = replace(lights[3], spread=1.0)

@@ -1,0 +1,208 @@
+"""Lights so small, as a sample sees them, that their center stands for all of them: no integral over a polygon.
+
+The integral is the lobe at the center times the solid angle. What that neglects is second order in the light's radius
+by the length over which the integrand changes: the distance, and for specular lobes their width, or the angle from
+their peak where that is larger. For a cosine or the peak of GGX it is 2/3 LARGEST^2 = 0.2 % of the light, which has
+then 2 LARGEST^2 sr at most: 3e-6 per unit of radiance.
+Arrays broadcast over what stands for "...": lights, samples or both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .light_polygons import LEAST_COSINE, LOBE_WIDTH
+from .lobes import LEAST_SHARE
+from .polygon import dot
+
+# Radius of a light by the length over which the integrand changes, at most.
+LARGEST = 0.05
+# By which share of itself GGX changes toward the rim of such a light, by that quotient.
+VARIATION = 4.0
+
+
+@dataclass(frozen=True)
+class SmallLight:
+    """What is to be known of a light that is small."""
+
+    center: np.ndarray  # (3,) m: the centroid
+    radius: float  # m, from there
+    area_vector: np.ndarray  # (3,) m^2, toward where it shines
+    diagonal: float  # m^2: the longer half diagonal of the parallelogram around it, squared
+
+    @classmethod
+    def of(cls, light) -> SmallLight:
+        """That of an AreaLight."""
+        area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
+        u, v = light.half_u, light.half_v
+        diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())
+        if light.is_round:
+            return cls(light.center, float(np.sqrt(max(u @ u, v @ v))), area, diagonal)
+        if light.corners is None:
+            return cls(light.center, float(np.sqrt(diagonal)), area, diagonal)
+        offset = light.corners - light.corners[0]
+        weights = np.cross(offset, np.roll(offset, -1, axis=0)) @ (0.5 * light.area_vector)
+        thirds = (offset + np.roll(offset, -1, axis=0)) / 3.0
+        center = light.corners[0] + weights @ thirds / (light.area_vector @ light.area_vector)
+        return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays (...) from samples to the centers of small lights."""
+
+    offset: np.ndarray  # (3, ...) m
+    squares: np.ndarray  # (...) m^2, of their lengths
+    distance: np.ndarray  # (...) m
+    flux: np.ndarray  # (...) m^3: the distance times the area that the sample sees; its cube makes that a solid angle
+    diagonal: np.ndarray | float  # (...) m^2, see `SmallLight`
+    slack: np.ndarray | None = None  # (...): by which share of itself a specular lobe varies over the light
+
+    @classmethod
+    def along(cls, offset, area_vector, diagonal) -> Rays:
+        """Those of lights with `area_vector` (3, ...) whose centers are at `offset` from the samples."""
+        squares = dot(offset, offset)
+        flux = np.maximum(-dot(area_vector, offset), np.float32(0.0))
+        return cls(offset, squares, np.sqrt(squares), flux, diagonal)
+
+    def take(self, index) -> Rays:
+        """The rays `index` (Q,) of the last axis."""
+        chosen = (values[..., index] for values in (self.offset, self.squares, self.distance, self.flux))
+        return Rays(*chosen, self.diagonal, None if self.slack is None else self.slack[index])
+
+
+class SharpestLobes:
+    """The narrowest parts of the specular lobes of samples (...)."""
+
+    def __init__(self, normal, view, width):
+        cosine = dot(normal, view)
+        self.mirrored = np.float32(2.0) * cosine * normal - view
+        self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
+
+    def lengths(self, part, rays: Rays, size) -> np.ndarray:
+        """The least angle in rad (...), at most 1, over which the lobes `part` change where they meet lights of a
+        radius of `size` rad."""
+        toward = dot(self.mirrored[:, part], rays.offset)
+        toward /= rays.distance
+        chord = np.sqrt(np.maximum(np.float32(2.0) - np.float32(2.0) * toward, np.float32(0.0)))
+        chord -= size
+        return np.minimum(np.maximum(chord, np.float32(0.0)) + self.width[part], np.float32(1.0))
+
+
+def seen_sizes(lobes, part, rays: Rays, radius) -> np.ndarray:
+    """Radii (...) of lights, `radius` m, by the length over which the lobes `part` change."""
+    size = np.float32(radius) / rays.distance
+    return size if lobes.sharpest is None else size / lobes.sharpest.lengths(part, rays, size)
+
+
+def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (...) of the lights of `seen_sizes` that are small, and of those among them that shine at the samples.
+
+    Lights that cross a horizon are not small.
+    """
+    small = size < np.float32(LARGEST)
+    lit = rays.flux > 0.0
+    for row, length in zip(lobes.clip_rows, lobes.clip_lengths, strict=True):
+        height = dot(lobes.rows[row, :, part], rays.offset)
+        small &= np.abs(height) > np.float32(radius) * length[part]
+        lit &= height > 0.0
+    return small, lit & small
+
+
+class CosineAtPoint:
+    """Form factors (1, ...) of small lights under lobes with the axes `rows` (C, 3, ...)."""
+
+    def __init__(self, rows):
+        self.normal = rows[2]
+
+    def __call__(self, part, rays: Rays):
+        values = np.maximum(dot(self.normal[:, part], rays.offset), np.float32(0.0))
+        values *= rays.flux
+        values *= np.float32(1.0 / np.pi)
+        values /= rays.squares * rays.squares
+        return values[None]
+
+
+class ShadowedCosineAtPoint:
+    """As `CosineAtPoint` times the bump shadowing of `SurfaceSamples`."""
+
+    def __init__(self, rows, bump_alpha2):
+        self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
+
+    def __call__(self, part, rays: Rays):
+        along = np.maximum(dot(self.smooth[:, part], rays.offset), np.float32(1e-15) * rays.distance)
+        tangent2 = np.maximum(rays.squares / (along * along) - np.float32(1.0), np.float32(0.0))
+        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
+        return self.plain(part, rays) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
+
+
+class LobeAtPoint:
+    """Integrals (F, ...) of lobes over small lights, with the weights (F, K, ...) of a `moments32.RidgeTable`."""
+
+    def __init__(self, rows, weights, is_cosine, limits):
+        self.rows, self.is_cosine, self.limits = rows, is_cosine, limits
+        x, y, z = rows[:3]
+        self.determinant = dot(x, np.stack([
+            y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0]
+        ]))  # fmt: skip
+        self.terms = weights if is_cosine else polynomial_terms(weights)
+
+    def __call__(self, part, rays: Rays):
+        x, y, z = (dot(row[:, part], rays.offset) for row in self.rows[:3])
+        inverse = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
+        angle = self.determinant[part] * rays.flux
+        angle *= inverse * inverse * inverse
+        z *= inverse
+        cosine = np.maximum(z, np.float32(0.0)) * angle
+        cosine *= np.float32(1.0 / np.pi)
+        if self.is_cosine:
+            return self.terms[:, 0, part] * cosine
+        x *= inverse
+        values = np.stack([polynomial(terms[..., part], x, z) for terms in self.terms])
+        values *= angle
+        np.maximum(values, np.float32(0.0), out=values)
+        np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
+        self.limits.apply_at_centers(values, part, rays)
+        return values
+
+
+def polynomial_terms(weights: np.ndarray) -> np.ndarray:
+    """Coefficients (..., K, P) of 1; x, z; x^2, xz, z^2; x^3, ... of a lobe with weights (..., K, P) of `moments`.
+
+    The moments of a patch around the direction (x, y, z) are its solid angle times 1; 2 x, 2 z; and for k > 1 the
+    coefficients of the form (k + 1) (u.w)^k - (k - 1) |u|^2 (u.w)^(k - 2) in u, w = (x, z).
+    """
+    w = np.moveaxis(weights, -2, 0)
+    terms = np.empty_like(w)
+    terms[0] = w[0]
+    terms[1:3] = 2.0 * w[1:3]
+    if len(w) > 3:
+        terms[0] -= w[3] + w[5]
+        terms[3:6] = 3.0 * w[3], 6.0 * w[4], 3.0 * w[5]
+    if len(w) > 6:
+        terms[1] -= 2.0 * (w[6] + w[8])
+        terms[2] -= 2.0 * (w[7] + w[9])
+        terms[6:10] = 4.0 * w[6], 12.0 * w[7], 12.0 * w[8], 4.0 * w[9]
+    if len(w) > 10:
+        terms[3] -= 3.0 * (w[10] + w[12])
+        terms[4] -= 6.0 * (w[11] + w[13])
+        terms[5] -= 3.0 * (w[12] + w[14])
+        terms[10:15] = 5.0 * w[10], 20.0 * w[11], 30.0 * w[12], 20.0 * w[13], 5.0 * w[14]
+    return np.ascontiguousarray(np.moveaxis(terms, 0, -2))
+
+
+def polynomial(terms: np.ndarray, x, z) -> np.ndarray:
+    """Values (...) of the polynomials with coefficients (K, ...), in the order of `polynomial_terms`."""
+    degree = int(np.sqrt(2 * len(terms))) - 1
+    result = None
+    for power in range(degree, -1, -1):
+        # The factor of z^power: those of x^k z^power are the last but `degree - power - k` of the degree k + power.
+        rows = [(k + power) * (k + power + 1) // 2 + power for k in range(degree - power, -1, -1)]
+        factor = terms[rows[0]]
+        for row in rows[1:]:
+            factor = factor * x
+            factor += terms[row]
+        result = factor if result is None else result * z + factor
+    return result

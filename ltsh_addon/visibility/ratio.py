@@ -11,6 +11,7 @@ Nothing hangs on where a sample stands in a picture or a block but which samples
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -28,10 +29,10 @@ PROBES = 8
 MOST_RAYS = 1024
 # Rays of a block: its arrays stay in the cache.
 BLOCK_RAYS = 1 << 15
-# Samples of a block that one process takes at a time. Fewer pairs of samples and lights than that take no longer than a
-# process takes to start.
+# Samples of a block that one process takes at a time.
 BLOCK_SAMPLES = 1 << 14
-PAIRS_WORTH_A_CHILD = 300_000
+# What probes for all pairs take, in processor seconds, where a process that helps is worth its start.
+SECONDS_WORTH_A_CHILD = 1.0
 # How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both count
 # alike, as at first, when the specular one counts more, and when the diffuse one does.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
@@ -102,14 +103,17 @@ def visible_shares(
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
     emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), is_baked)
-    task = replace(task, typical=typical_radiance(samples, task, tracer))
+    start = time.thread_time()
+    typical, looked_at = typical_radiance(samples, task, tracer)
+    seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
+    task = replace(task, typical=typical)
     shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
     blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
     parts = ((samples.take(block), None if film is None else film.take(block)) for block in blocks)
-    wanted = 1 if shape[0] * shape[1] < PAIRS_WORTH_A_CHILD else workers
+    wanted = workers if seconds > SECONDS_WORTH_A_CHILD else 1
     for number, found in crew.run(task, tracer, list(parts), wanted, progress):
         block = blocks[number]
         for name in passes:
@@ -154,12 +158,13 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> dict[str, float]:
-    """By pass, the root mean square of what samples reflect, from some of them and the first rays alone."""
+def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple[dict[str, float], int]:
+    """By pass, the root mean square of what samples reflect, from some of them and the first rays alone; how many."""
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
     some = samples.take(slice(None, None, -(-len(samples) // most) or 1))
     found = replace(task, rays=PROBES).shares(some, None, tracer)
-    return {name: float(np.sqrt(np.square(found.radiance[name]).mean())) if len(some) else 0.0 for name in task.passes}
+    squares = {name: np.square(found.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
+    return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 
 
 @dataclass(frozen=True)

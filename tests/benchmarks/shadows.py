@@ -255,15 +255,15 @@ def errors(scene: Measured):
     """Print the errors by pass; the pictures with most rays, the mean of both."""
     most, few, default = scene.settings.most_rays, FEW, scene.settings.rays
     runs = {rays: scene.pictures(rays) for rays in sorted({few, default, most})}
-    counts = [f"bias at {most} rays (limit)", *(f"{rays}: bias, own noise (told)" for rays in (default, few))]
+    counts = [f"bias at {most} rays (limit)", *(f"{rays}: bias (limit), noise, told" for rays in (default, few))]
     print(f"    {'':<9} {'unshadowed':>11}{counts[0]:>26}{counts[1]:>34}{counts[2]:>34}")
     for name in PASSES:
         cells = []
         for rays in (default, few):
             (first, second), shadows = runs[rays]
-            bias = scene.error(first[name], second[name], name).estimate
+            bias = scene.error(first[name], second[name], name)
             noise = own_noise(first[name], second[name], scene.mask)
-            cells.append(f"{bias:>16.2%} {noise:>8.2%} {shadows[0].noise[name]:>8.2%}")
+            cells.append(f"{bias!s:>18} {noise:>6.2%} {shadows[0].noise[name]:>6.2%}")
         first, second = (images[name] for images in runs[most][0])
         bias = scene.error(first, second, name)
         plain = scene.error(scene.unshadowed[name], name=name).estimate

@@ -17,7 +17,7 @@ from ltsh_addon.visibility import OccluderMesh, Occluders, crew, open_tracer, ra
 def scene(monkeypatch):
     """A ball above the floor in blocks of 200 samples, and the processes that were started."""
     monkeypatch.setattr(ratio, "BLOCK_SAMPLES", 200)
-    monkeypatch.setattr(ratio, "PAIRS_WORTH_A_CHILD", 0)
+    monkeypatch.setattr(ratio, "SECONDS_WORTH_A_CHILD", -1.0)
     started, popen = [], parallel.subprocess.Popen
 
     def counted(arguments, **options):

@@ -47,19 +47,19 @@ class StartFinder:
         for start in range(0, count, chunk):
             part = slice(start, start + chunk)
             found = self._triangles_at(position[part], normal[part], (NEARBY * (1.0 + reach[part])).astype(np.float32))
-            for number in np.unique(found.instance):
+            index, shape = start + found.ray, _Shape.of(self._occluders, found, self._is_applied)
+            clearance[index] = CLEARANCE * (reach[index] + shape.size)
+            is_thick = self._thickness[found.instance] > 0.0
+            for number in np.unique(found.instance[is_thick]):
                 here = found.instance == number
-                shape = _Shape.of(self._occluders, found, here, self._is_applied[number])
-                index = start + found.ray[here]
-                clearance[index] = CLEARANCE * (reach[index] + shape.size)
-                if self._thickness[number] > 0.0:
-                    clearance[index] += self._thickness_of(number, found.triangle[here])
-                else:
-                    normal[index] = shape.face_normals(normal[index], smooth_normal[index])
-                if shape.normals is not None:
-                    lifts = shape.lifts(normal[index])
-                    lift[:, index] = lifts
-                    terminator[index] = self._occluders.terminators[number] * np.any(lifts, axis=(0, 2))
+                clearance[index[here]] += self._thickness_of(number, found.triangle[here])
+            normal[index] = np.where(
+                is_thick[:, None], normal[index], shape.face_normals(normal[index], smooth_normal[index])
+            )
+            smooth = np.flatnonzero(shape.is_smooth)
+            index = index[smooth]
+            lift[:, index] = shape.take(smooth).lifts(normal[index])
+            terminator[index] = self._occluders.terminators[found.instance[smooth]] * lift[:, index].any(axis=(0, 2))
         return Starts(position, normal, smooth_normal, clearance, lift, terminator)
 
     def _thickness_of(self, instance, triangle) -> np.ndarray:
@@ -195,33 +195,48 @@ def _dot(first, second):
 
 @dataclass(frozen=True)
 class _Shape:
-    """Q points on triangles of one instance: corners (Q, 3, 3) and normals there, all in the space in which Cycles has
-    them, or no normals where they are flat; shares (Q, 3) of the corners; and what takes directions to world space."""
+    """Q points on triangles: corners (Q, 3, 3), and where `is_smooth` (Q,) normals there, all in the space in which
+    Cycles has them; shares (Q, 3) of the corners; and what takes directions to world space."""
 
     corners: np.ndarray
-    normals: np.ndarray | None
+    normals: np.ndarray
+    is_smooth: np.ndarray
     shares: np.ndarray
-    to_world: np.ndarray | None
+    to_world: np.ndarray  # (Q, 3, 3)
     size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
 
     @classmethod
-    def of(cls, occluders: Occluders, hits: Hits, here, is_applied: bool) -> _Shape:
-        """Those of the `hits` that are `here`, all on one instance."""
-        instance, triangle, u, v = hits.instance[here][0], hits.triangle[here], hits.u[here], hits.v[here]
-        mesh, matrix = occluders.meshes[occluders.mesh[instance]], occluders.matrices[instance]
-        named = mesh.triangles[triangle]
-        corners, normals = mesh.vertices[named].astype(np.float64), mesh.normals
-        if normals is not None:
-            normals = (normals[named] if normals.ndim == 2 else normals[triangle]).astype(np.float64)
-        shares = np.stack([1.0 - u - v, u, v], axis=-1)
-        in_world = corners @ matrix[:, :3].T
+    def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> _Shape:
+        """Those of `hits`. Where `is_applied` (I,) instances are in world space."""
+        corners, normals = np.zeros((2, len(hits.ray), 3, 3))
+        is_smooth, mesh = np.zeros(len(hits.ray), bool), occluders.mesh[hits.instance]
+        order = np.argsort(mesh, kind="stable")
+        for here in np.split(order, np.flatnonzero(np.diff(mesh[order])) + 1) if len(order) else ():
+            own, triangle = occluders.meshes[mesh[here[0]]], hits.triangle[here]
+            named = own.triangles[triangle]
+            corners[here] = own.vertices[named]
+            if own.normals is not None:
+                normals[here] = own.normals[named] if own.normals.ndim == 2 else own.normals[triangle]
+                is_smooth[here] = True
+        matrix, applied = occluders.matrices[hits.instance], is_applied[hits.instance][:, None, None]
+        in_world = _turned(corners, matrix)
         size = np.abs(in_world - in_world[:, :1]).max(axis=(1, 2))
-        if not is_applied:
-            return cls(corners, normals, shares, matrix[:, :3], size + np.abs(in_world).max(axis=(1, 2)))
-        if normals is not None:
-            normals = normals @ _cofactors(matrix[:, :3]).T
-            normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
-        return cls(in_world + matrix[:, 3], normals, shares, None, size)
+        size += np.where(applied[:, 0, 0], 0.0, np.abs(in_world).max(axis=(1, 2)))
+        shares = np.stack([1.0 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+        turned = _turned(normals, _cofactors(matrix))
+        turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
+        return cls(
+            np.where(applied, in_world + matrix[:, None, :, 3], corners),
+            np.where(applied, turned, normals),
+            is_smooth,
+            shares,
+            np.where(applied, np.eye(3), matrix[:, :, :3]),
+            size,
+        )
+
+    def take(self, index: np.ndarray) -> _Shape:
+        """Those at `index`."""
+        return _Shape(*(getattr(self, each.name)[index] for each in fields(self)))
 
     def face_normals(self, geometric_normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
         """Unit normals (Q, 3) of the triangles in world space: on the side of `geometric_normal` (Q, 3) where they are
@@ -229,16 +244,12 @@ class _Shape:
 
         Where a triangle has no area it is the former.
         """
-        edges = self.corners[:, 1:] - self.corners[:, :1]
-        if self.to_world is not None:
-            edges = edges @ self.to_world.T
-        normal = np.cross(edges[:, 0], edges[:, 1])
+        first, second = np.moveaxis(_turned(self.corners[:, 1:] - self.corners[:, :1], self.to_world), 1, 0)
+        normal = _crossed(first, second)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        if self.normals is None:
-            facing = _dot(normal, geometric_normal)
-        else:
-            own = np.einsum("qc,qck->qk", self.shares, self.normals)
-            facing = _dot(own if self.to_world is None else own @ _cofactors(self.to_world).T, smooth_normal)
+        own = np.einsum("qc,qck->qk", self.shares, self.normals)
+        own = _turned(own[:, None], _cofactors(self.to_world))[:, 0]
+        facing = np.where(self.is_smooth, _dot(own, smooth_normal), _dot(normal, geometric_normal))
         normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
         return np.divide(normal, length, out=geometric_normal.astype(np.float64), where=length > 0.0)
 
@@ -262,12 +273,24 @@ class _Shape:
                 for own, one, other, n in corners
             ]
             heights.append(side * np.maximum(np.minimum.reduce(envelope), side * parabola))
-        normal = normal if self.to_world is None else normal @ self.to_world.T
+        normal = _turned(normal[:, None], self.to_world)[:, 0]
         above = _dot(normal, geometric_normal) > 0.0
         heights = np.where(above, heights, heights[::-1])
         return heights[:, :, None] * normal
 
 
-def _cofactors(matrix):
-    """What takes normals (3,) along with points: the inverse transposed times the determinant."""
-    return np.array([np.cross(matrix[1], matrix[2]), np.cross(matrix[2], matrix[0]), np.cross(matrix[0], matrix[1])])
+def _turned(vectors, matrices):
+    """Vectors (Q, N, 3) by the first three columns of matrices (Q, 3, ...)."""
+    return sum(vectors[:, :, k, None] * matrices[:, None, :, k] for k in range(3))
+
+
+def _cofactors(matrices):
+    """What takes normals along with points (Q, 3, 3): the inverse transposed times the determinant."""
+    a, b, c = np.moveaxis(matrices[:, :, :3], 1, 0)
+    return np.stack([_crossed(b, c), _crossed(c, a), _crossed(a, b)], axis=1)
+
+
+def _crossed(first, second):
+    """Cross products (Q, 3)."""
+    (a, b, c), (x, y, z) = first.T, second.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=-1)

@@ -393,16 +393,19 @@ def ray_counts(scene: Measured):
         tracer, samples = scene.tracer(0)
         start = time.process_time()
         with tracer:
+            grown = time.process_time()
             timed = TimedTracer(tracer._tracer)
             samples = replace(samples, position=samples.position - scene.extraction.origin)
             found = visibility.visible_shares(
                 samples, tracer._lights, timed, rays=rays, film=scene.extraction.film, workers=1
             )
-        rows[rays] = time.process_time() - start, found.rays
-        numpy_share = rows[rays][0] / timed.seconds - 1.0 if timed.seconds else math.nan
+            end = time.process_time()
+        rows[rays] = end - start, found.rays
+        numpy_share = (end - grown) / timed.seconds - 1.0 if timed.seconds else math.nan
         verdict = "" if numpy_share <= MOST_NUMPY else "  MISSED"
         print(f"  {rays:>4} rays: {rows[rays][0]:.2f} s, {rows[rays][1]:>9} traced, "
-              f"{rows[rays][0] / max(1, rows[rays][1]) * 1e9:.0f} ns each; rays {timed.seconds:.2f} s, "
+              f"{rows[rays][0] / max(1, rows[rays][1]) * 1e9:.0f} ns each; tree {grown - start:.2f} s, "
+              f"rays {timed.seconds:.2f} s, "
               f"numpy {numpy_share:.2f} times that (target {MOST_NUMPY:.0f}){verdict}")  # fmt: skip
     (t0, n0), (t1, n1), (t2, n2) = rows.values()
     print(f"  seconds per million rays more: {(t1 - t0) / (n1 - n0) * 1e6:.3f} from {FEW} to {DEFAULT}, "

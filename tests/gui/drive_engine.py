@@ -19,6 +19,7 @@ def main(rig):
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     rig.camera_view()
+    eyes.pixel_centers()
     yield 1
     yield from previewed(rig)
     yield from with_panel(rig)

@@ -5,7 +5,7 @@ import time
 
 import bpy
 import numpy as np
-from hands import ADDON, over, until
+from hands import ADDON, module, over, until
 
 # Pixels at the edge of a region, over which Blender draws the rounded corners of its areas.
 EDGE = 12
@@ -26,10 +26,16 @@ def view():
 
 def engine_started(rig):
     """See the scene through its camera as the engine LTSH draws it."""
+    pixel_centers()
     bpy.context.scene.render.engine = "LTSH"
     rig.camera_view()
     yield 1
     rig.space.shading.type = "RENDERED"
+
+
+def pixel_centers():
+    """Views come to rest with their first picture, which sees pixels at their centers."""
+    module("engine.view").REFINEMENTS = 1
 
 
 def bare_view(rig):

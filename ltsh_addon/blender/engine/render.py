@@ -42,6 +42,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     bl_use_preview = False
     bl_use_shading_nodes_custom = False
     bl_use_spherical_stereo = False
+    # Material Preview stays EEVEE's.
+    bl_use_eevee_viewport = True
     # With the GPU's context Blender's window would stand still during a final render.
     bl_use_gpu_context = False
 

@@ -6,6 +6,7 @@ import functools
 import hashlib
 import logging
 import textwrap
+import time
 from dataclasses import dataclass
 
 import blf
@@ -16,7 +17,7 @@ import numpy as np
 from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
 from ...scene import CYCLES, TECHNIQUES, error_line
-from ..render_settings import cycles_setting
+from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
 from ..ui.job import output_folder
@@ -26,6 +27,11 @@ from ..viewport.renderer import ShownPicture, ViewRenderer
 from ..viewport.surfaces import View
 from ..viewport.textures import float_texture, look_values
 
+# Points of a pixel of which a view at rest is the mean.
+REFINEMENTS = 64
+# For so long nothing may change before a view is refined; and drawing that takes longer makes pauses.
+REST_SECONDS, LONGEST_REST = 0.25, 1.0
+QUICK_SECONDS = 0.03
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
 NO_LIGHTS = "No area light and no glowing mesh shines here: add an area light"
@@ -64,7 +70,8 @@ class EngineView:
             self.mirror = SceneMirror()
 
     def draw(self, context, depsgraph) -> None:
-        """Draw into the region of `context`."""
+        """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
+        start = time.monotonic()
         frame_buffer = gpu.state.active_framebuffer_get()
         region = context.region
         error, notes, captions = self._error, [], Captions()
@@ -78,7 +85,8 @@ class EngineView:
             if mode != "single" and settings.second_technique == CYCLES:
                 mode, reference, notes = self._beside_cycles(context, depsgraph, view, mode)
             shown = _shown(depsgraph.scene, mode, reference, context.preferences.system.ui_scale)
-            self._renderer.draw(self.mirror, view, size, shown, frame_buffer)
+            points = sub_pixel_offsets(depsgraph.scene, REFINEMENTS)
+            self._renderer.draw(self.mirror, view, size, shown, frame_buffer, points)
             captions = _captions(settings, mode)
         except Exception as problem:
             error = self._note(problem)
@@ -87,6 +95,8 @@ class EngineView:
         if not error and not self.mirror.lights:
             notes = [NO_LIGHTS, *notes]
         show(region, error, [*notes, *self.mirror.notes], captions)
+        if not error and self._renderer.samples < REFINEMENTS:
+            _redraw_later(start, self._renderer.samples)
 
     def _beside_cycles(self, context, depsgraph, view: View, mode: str):
         """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""
@@ -288,6 +298,38 @@ class Captions:
     scale: float = 0.0  # difference of radiance that has the full color
 
 
+# When views at rest are drawn again, and when the last of them had been drawn.
+_next = {"at": 0.0, "drawn": 0.0}
+
+
+def _redraw_later(start: float, samples: int) -> None:
+    """Let all views be drawn again that can be refined. The drawing began at `start`; where it took long, the window
+    answers as long before the next one, and a view must have come to rest first."""
+    now = time.monotonic()
+    took = now - start
+    if samples > 1:
+        # What the card did after the call is in the time by which this one came late.
+        took = max(took, start - max(_next["at"], _next["drawn"]))
+        wait = took if took > QUICK_SECONDS else 0.0
+    else:
+        # The first one of all compiles shaders.
+        wait = min(max(REST_SECONDS, 2.0 * took), LONGEST_REST)
+    _next["at"], _next["drawn"] = now + wait, now
+    if not bpy.app.timers.is_registered(_redraw):
+        bpy.app.timers.register(_redraw, first_interval=wait)
+
+
+def _redraw() -> float | None:
+    left = _next["at"] - time.monotonic()
+    if left > 0.0:
+        return left
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
+                area.tag_redraw()
+    return None
+
+
 # Region -> (error, notes, captions).
 _texts: dict[int, tuple[str, list[str], Captions]] = {}
 _handle = []
@@ -385,6 +427,8 @@ def register() -> None:
 
 def unregister() -> None:
     """Remove it."""
+    if bpy.app.timers.is_registered(_redraw):
+        bpy.app.timers.unregister(_redraw)
     while _handle:
         bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
     _texts.clear()

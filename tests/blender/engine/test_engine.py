@@ -300,3 +300,28 @@ def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(tmp_path):
     finally:
         ltsh_addon.unregister()
         bpy.ops.preferences.addon_enable(module="cycles")
+
+
+def test_views_at_rest_are_drawn_again_and_what_moves_is_left_alone():
+    def left(took, samples):
+        """Seconds until views are drawn again, after one that `took` as long."""
+        view._redraw_later(time.monotonic() - took, samples)
+        return view._redraw()
+
+    try:
+        # A quick picture is refined once nothing has changed for a while; every change begins that anew.
+        assert view.REST_SECONDS - 0.1 < left(0.01, 1) <= view.REST_SECONDS
+        assert bpy.app.timers.is_registered(view._redraw)
+        assert 0.5 < left(0.4, 1) <= 0.8 and left(30.0, 1) <= view.LONGEST_REST
+        view._next.update(at=0.0, drawn=time.monotonic() - 10.0)
+        # Then slow ones leave the window as much time as they take, and quick ones follow each other.
+        assert 0.2 < left(0.4, 2)
+        view._next.update(at=time.monotonic() + 10.0, drawn=0.0)
+        assert left(0.001, 2) is None
+    finally:
+        view.unregister()
+    assert not bpy.app.timers.is_registered(view._redraw)
+
+
+def test_material_preview_stays_that_of_eevee():
+    assert render_module.LTSH_RenderEngine.bl_use_eevee_viewport

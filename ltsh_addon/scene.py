@@ -77,12 +77,29 @@ BAKE_PASSES = (*PASSES, "diffuse_light", "combined")
 # In m. Squares of what is much farther away, or larger, do not fit into single precision.
 FARTHEST = 1e15
 AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # of Blender's area lights
-LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, "POLYGON")
+FACING_SHAPES = ("BALL", "FACING_DISK")  # of Blender's points and spots
+LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, *FACING_SHAPES, "POLYGON")
+
+
+@dataclass(frozen=True)
+class SpotCone:
+    """Where a light shines that sees a point in the direction w: with v = axes w and c = v_z / |v| its radiance is
+    multiplied by x^2 (3 - 2 x), x = (c - cosine) sharpness, from 0 to 1."""
+
+    axes: np.ndarray  # (3, 3), of any length
+    cosine: float
+    sharpness: float
+
+    def __post_init__(self):
+        axes = np.asarray(self.axes, dtype=np.float64)
+        if axes.shape != (3, 3) or not np.isfinite([*axes.ravel(), self.cosine, self.sharpness]).all():
+            raise ValueError(f"spot cone: {self!r}, expected 3 x 3 and two finite numbers")
+        object.__setattr__(self, "axes", axes)
 
 
 @dataclass(frozen=True)
 class AreaLight:
-    """A one-sided, uniformly emitting, flat area light.
+    """A one-sided, uniformly emitting, flat area light, or one that looks flat from every point.
 
     The surface is ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE and
     s^2 + t^2 <= 1 for DISK and ELLIPSE. That of a POLYGON is inside `corners`, in the plane of center, half_u and
@@ -90,6 +107,8 @@ class AreaLight:
     by max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
     At the distance t from its points it is also multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
     Falloff node: 0 is quadratic, 1 linear, 2 constant.
+    A BALL has |half_u| = |half_v| for its radius. Of a FACING_DISK with that radius every point sees the front.
+    Of both the half axes and the direction say no more; they may have a `cone`, and no spread.
     A light that `is_distant` is infinitely far away: center, half_u, half_v and corners are directions to it, of any
     length, and every point is where it is seen from.
     """
@@ -111,6 +130,7 @@ class AreaLight:
     falloff: int = 0  # power of the distance in m
     smooth: float = 0.0  # m^2
     is_distant: bool = False
+    cone: SpotCone | None = None
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -133,8 +153,14 @@ class AreaLight:
             object.__setattr__(self, "corners", corners)
         if not 0.0 < self.spread <= np.pi + 1e-6:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
-        if self.shape == "POLYGON" and self.is_focused:
-            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape POLYGON")
+        if self.shape in ("POLYGON", *FACING_SHAPES) and self.is_focused:
+            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape {self.shape}")
+        if isinstance(self.cone, dict):
+            object.__setattr__(self, "cone", SpotCone(**self.cone))
+        if not self.is_facing and self.cone is not None:
+            raise ValueError(f"light {self.name!r}: shape {self.shape} has a cone, expected one of {FACING_SHAPES}")
+        if self.is_facing and (self.is_distant or self.detail):
+            raise ValueError(f"light {self.name!r}: shape {self.shape} is expected nearby, and without detail")
         if self.falloff not in (0, 1, 2) or not 0.0 <= self.smooth < np.inf:
             raise ValueError(
                 f"light {self.name!r}: falloff is {self.falloff!r} and smooth is {self.smooth!r}, expected 0, 1 or 2 "
@@ -168,19 +194,28 @@ class AreaLight:
         """This light as JSON has it; AreaLight(**record) reads it back."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+        if self.cone is not None:
+            record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
         return {**record, "detail": [part.record() for part in self.detail]}
 
     @property
     def radius(self) -> float:
         """A distance from the center in m that no point of the light exceeds."""
+        if self.is_facing:
+            return float(np.linalg.norm(self.half_u))
         if self.is_round:
             return float(np.hypot(np.linalg.norm(self.half_u), np.linalg.norm(self.half_v)))
         return float(np.linalg.norm(self.polygon() - self.center, axis=1).max())
 
     @property
     def is_round(self) -> bool:
-        """True for DISK and ELLIPSE."""
-        return self.shape in ("DISK", "ELLIPSE")
+        """True for what looks like an ellipse."""
+        return self.shape in ("DISK", "ELLIPSE", *FACING_SHAPES)
+
+    @property
+    def is_facing(self) -> bool:
+        """True for lights that face every point, see `shading.facing`."""
+        return self.shape in FACING_SHAPES
 
     @property
     def is_focused(self) -> bool:
@@ -194,8 +229,8 @@ class AreaLight:
 
     @property
     def is_profiled(self) -> bool:
-        """True where it depends on the place on the light how bright a point sees it: by its spread or falloff."""
-        return self.is_focused or self.has_falloff
+        """True where it depends on the place on a flat light how bright a point sees it: by its spread or falloff."""
+        return (self.is_focused or self.has_falloff) and not self.is_facing
 
     def receives(self, receiver: np.ndarray, index=slice(None)) -> np.ndarray | None:
         """Mask (Q,) of the samples `index` whose `receiver` (P,) the light lights; None: it lights all."""
@@ -221,13 +256,18 @@ class AreaLight:
         return corners[::-1] if np.dot(self.area_vector, self.direction) < 0.0 else corners
 
     def _outline(self, round_vertices):
-        """Corners s, t (V,) in units of half_u and half_v."""
-        if not self.is_round:
-            return np.array([-1.0, 1.0, 1.0, -1.0]), np.array([-1.0, -1.0, 1.0, 1.0])
-        angle = 2.0 * np.pi * np.arange(round_vertices) / round_vertices
-        step = 2.0 * np.pi / round_vertices
-        radius = np.sqrt(step / np.sin(step))
-        return radius * np.cos(angle), radius * np.sin(angle)
+        """Corners s, t (2, V) in units of half_u and half_v."""
+        if self.is_round:
+            return round_outline(round_vertices)
+        return np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
+
+
+def round_outline(count: int) -> np.ndarray:
+    """Corners (2, V) of a regular polygon with the area of the unit disk, counterclockwise."""
+    angle = 2.0 * np.pi * np.arange(count) / count
+    step = 2.0 * np.pi / count
+    radius = np.sqrt(step / np.sin(step))
+    return radius * np.stack([np.cos(angle), np.sin(angle)])
 
 
 # Fields of SurfaceSamples with one number per sample; all others are vectors or colors.

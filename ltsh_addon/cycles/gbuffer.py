@@ -140,7 +140,7 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
     nearest = np.full(len(some), np.inf)
     for light in lights:
         distance = np.linalg.norm(some - light.center, axis=1) - light.radius
-        height = np.abs((some - light.center) @ light.direction)
+        height = distance if light.is_facing else np.abs((some - light.center) @ light.direction)
         nearest = np.minimum(nearest, np.maximum(distance, height))
     share = apart / np.maximum(nearest, 1e-30)
     if np.mean(share > ROUNDED) <= ROUNDED_SHARE:

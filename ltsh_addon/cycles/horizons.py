@@ -169,10 +169,22 @@ def horizon_excess(
 
 def _solid_angle(position, light) -> np.ndarray:
     """Solid angle (P,) of the light in sr, 0 from behind it."""
+    if light.is_facing:
+        cosine = _facing_cone(light, position)[1]
+        return 2.0 * np.pi * (1.0 - cosine)
     axes = np.concatenate([_plane_axes(light), -light.direction[None]])
     corners = np.einsum("ak,pvk->avp", axes, light.polygon() - light.origins(position)[:, None])
     whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
     return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
+
+
+def _facing_cone(light, position):
+    """Unit vectors (P, 3) to the center of a light that faces every point, and the cosine (P,) of half its width."""
+    offset = light.center - position
+    distance = np.linalg.norm(offset, axis=1)
+    ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
+    cosine = np.sqrt(1.0 - ratio**2) if light.shape == "BALL" else 1.0 / np.sqrt(1.0 + ratio**2)
+    return offset / np.maximum(distance, 1e-30)[:, None], cosine
 
 
 def _plane_axes(light) -> np.ndarray:
@@ -187,8 +199,16 @@ def _crosses(samples, light) -> np.ndarray:
     corners, above, position = light.polygon(), [], light.origins(samples.position)
     for normal in (samples.smooth_normal, samples.geometric_normal):
         above.append(normal @ corners.T > (normal * position).sum(axis=1, keepdims=True))
+    if light.is_facing:
+        offset = light.center - position
+        heights = [(normal * offset).sum(axis=1) for normal in (samples.smooth_normal, samples.geometric_normal)]
+        above = [np.stack([height > -light.radius, height > light.radius], axis=1) for height in heights]
     above = np.concatenate(above, axis=1)
-    return above.any(axis=1) & ~above.all(axis=1) & ((light.center - position) @ light.direction < 0.0)
+    return (
+        above.any(axis=1) & ~above.all(axis=1)
+        if light.is_facing
+        else above.any(axis=1) & ~above.all(axis=1) & ((light.center - position) @ light.direction < 0.0)
+    )
 
 
 def _lobe_density(samples, towards) -> np.ndarray:
@@ -235,6 +255,9 @@ def _directions(samples):
 
 def _hits(light, position, towards) -> np.ndarray:
     """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
+    if light.is_facing:
+        axis, cosine = _facing_cone(light, position)
+        return np.einsum("phni,pi->phn", towards, axis) > cosine[:, None, None]
     axes, position = _plane_axes(light), light.origins(position)
     outline = (light.polygon() - light.center) @ axes.T
     steepness = towards @ light.direction

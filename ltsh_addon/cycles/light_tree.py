@@ -143,6 +143,10 @@ def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> 
     offset = light.center - light.origins(position)
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
+    if light.is_facing:
+        ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
+        near = np.maximum(distance, light.radius)
+        return _bounds(_cluster_of(np.array(_row(light)), 0), offset, normal, np.sqrt(1.0 - ratio**2), near, near)
     corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
     reach = np.array([np.linalg.norm(corner, axis=1) for corner in corners])
     along = np.array([(corner * axis).sum(axis=1) for corner in corners])
@@ -160,13 +164,14 @@ def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> 
 
 def _row(light) -> list[float]:
     power = np.abs(light.radiance).mean() * np.linalg.norm(light.area_vector)
-    return [*light.center, *light.half_u, *light.half_v, *light.direction, 0.5 * light.spread, power]
+    return [*light.center, *light.half_u, *light.half_v, *light.direction, 0.5 * light.spread, power, light.is_facing]
 
 
 def _cluster_of(row, number: int) -> Cluster:
     center, half_u, half_v, direction = row[:12].reshape(4, 3)
     reach = np.abs(half_u) + np.abs(half_v)
-    return Cluster((number,), center - reach, center + reach, direction, 0.0, row[12], row[13])
+    spread = np.pi if row[14] else 0.0
+    return Cluster((number,), center - reach, center + reach, direction, spread, row[12], row[13])
 
 
 @lru_cache(maxsize=4)

@@ -21,8 +21,12 @@ def ggx_brdf_cosine(cos_theta_o, alpha, directions):
     half_z = z + mu_o
     distribution = ggx_distribution(half_x * half_x + y * y, half_z * half_z, alpha_squared)
     mu_i = np.maximum(z, 0.0)
-    masking = mu_o * _slope_length(mu_i, alpha_squared) + mu_i * _slope_length(mu_o, alpha_squared)
-    return distribution * mu_i / (2.0 * np.maximum(masking, 1e-300))
+    return distribution * mu_i / (2.0 * np.maximum(masking(mu_o, mu_i, alpha_squared), 1e-300))
+
+
+def masking(mu_o, mu_i, alpha_squared):
+    """mu_o S(mu_i) + mu_i S(mu_o), see `ggx_brdf_cosine`; broadcasts."""
+    return mu_o * _slope_length(mu_i, alpha_squared) + mu_i * _slope_length(mu_o, alpha_squared)
 
 
 def ggx_distribution(horizontal, vertical, alpha_squared):
@@ -30,7 +34,7 @@ def ggx_distribution(horizontal, vertical, alpha_squared):
 
     horizontal = h_x^2 + h_y^2 and vertical = h_z^2: D = alpha^2 |h|^4 / (pi (horizontal + alpha^2 vertical)^2).
     """
-    ratio = (horizontal + vertical) / np.maximum(horizontal + alpha_squared * vertical, 1e-300)
+    ratio = (horizontal + vertical) / np.maximum(horizontal + alpha_squared * vertical, 1e-30)
     return alpha_squared / np.pi * ratio * ratio
 
 

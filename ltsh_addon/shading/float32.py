@@ -15,8 +15,10 @@ from functools import cached_property, partial
 import numpy as np
 
 from . import float64, light_cone, moments32, small_lights
-from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners
+from .facing import FacingDisk, Lobe, mean_emission
+from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
+from .lookup_table import MIN_ALPHA
 from .polygon import convex_pieces, dot
 from .tails import SeenLight, TailLimits
 
@@ -135,8 +137,8 @@ class _Lighting:
         sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
         for (light, group, corners), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
             allowed = light.receives(samples.receiver, index)
-            if light.is_focused:
-                near = light_cone.may_reach(light, position)
+            if light.is_focused or light.cone is not None:
+                near = may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
             if light.is_profiled:
                 rest = None
@@ -150,18 +152,26 @@ class _Lighting:
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width, rest):
                 offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
-                toward = dot(offset, light.direction.astype(np.float32))
-                facing = toward < 0.0
+                seen, factor = light, 1.0
+                if light.is_facing:
+                    seen, factor = self._seen(light, index[part], position[:, part])
+                    offset, facing = seen.offset, np.ones(offset.shape[1], bool)
+                else:
+                    toward = dot(offset, light.direction.astype(np.float32))
+                    facing = toward < 0.0
                 if allowed is not None:
                     facing &= allowed[part]
                 axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
                 if light.is_profiled:
                     integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(colors))
                     axes = integrate.rows
-                polygons = local_corners(light, outline, offset, axes, self.scratch)
+                polygons = local_corners(seen, outline, offset, axes, self.scratch)
                 found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
                 if lobes.limits is not None:
-                    lobes.limits.apply(found, part, SeenLight.of(light, offset, toward), self.scratch)
+                    own = SeenLight.of_disk(seen) if light.is_facing else SeenLight.of(light, offset, toward)
+                    lobes.limits.apply(found, part, own, self.scratch)
+                if light.is_facing:
+                    found *= factor
                 if redo.any():
                     found[:, redo] = 0.0
                     needs_float64.append(index[part][redo])
@@ -184,6 +194,8 @@ class _Lighting:
         for part in moments32.pieces(count, SMALL_CHUNK):
             offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
             rays = small_lights.Rays.along(offset, direction, np.float32(seen.diagonal))
+            if light.is_facing:
+                rays = replace(rays, flux=np.float32(np.linalg.norm(light.area_vector)) * rays.distance)
             size = small_lights.seen_sizes(lobes, part, rays, seen.radius)
             rays = replace(rays, slack=small_lights.VARIATION * size)
             small, lit = small_lights.small_and_lit(lobes, part, rays, seen.radius, size)
@@ -202,10 +214,26 @@ class _Lighting:
                 chosen = np.nonzero(lit)[0]
                 columns = part.start + chosen
                 found = lobes.at_point(columns, rays.take(chosen))
+            if light.is_facing:
+                found = found * self._seen(light, lobes.index[columns], position[:, columns])[1]
             for channel in range(3):
                 total[:, channel, columns] += found * np.float32(light.radiance[channel])
         left = np.concatenate(left) if left else np.empty(0, np.intp)
         return None if len(left) == count else left
+
+    def _seen(self, light, index, position) -> tuple[FacingDisk, np.ndarray | float]:
+        """A light that faces the samples `index` as they see it from position (3, Q), and its `mean_emission`."""
+        offset, lobe = (light.center[:, None] - position).astype(np.float32), self._lobe(index)
+        disk = FacingDisk.of(light, offset, lobe.normal)
+        return disk, mean_emission(light, offset, disk, lobe)
+
+    def _lobe(self, index) -> Lobe:
+        """The lobes of the samples `index`, as they are but for their colors."""
+        samples = self.samples
+        if self.shade_in_float64 is float64.shade_diffuse:
+            return Lobe(_columns(samples.diffuse_normal, index))
+        alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
+        return Lobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""

@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..scene import REFERENCE
-from . import light_cone
+from . import facing, light_cone
 from .edge_integrals import vector_irradiance
+from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
 from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
-from .lookup_table import Lobe, LookupTable
+from .lookup_table import MIN_ALPHA, Lobe, LookupTable
 from .polygon import dot
 from .reference import reference_integrals
 from .spherical_harmonics import coefficient_index
@@ -42,6 +43,7 @@ class LightOfEachSample:
     is_profiled: bool = False
     is_round: bool = False
     is_distant: bool = False
+    is_facing: bool = False
 
     def take(self, index) -> LightOfEachSample:
         """The lights of the samples `index`."""
@@ -85,8 +87,16 @@ def shade_diffuse(samples, lights, radiance):
                     irradiance = _profiled(light, view, effort, index, polygon, integral, 1)[0]
                 else:
                     irradiance = integral(polygon, index)
+                if light.is_facing:
+                    irradiance = irradiance * _mean_emission(light, samples, index, facing.Lobe(frame[2][:, index]))
                 reflected = irradiance[:, None] * samples.diffuse_albedo[index]
                 radiance[group, index] += reflected * _of(light.radiance, index)
+
+
+def _mean_emission(light, samples, index, lobe):
+    """As `facing.mean_emission`, of a light as the samples `index` see it."""
+    offset = (light.center - samples.position[index]).T
+    return facing.mean_emission(light, offset, FacingDisk.of(light, offset, lobe.normal), lobe)
 
 
 def lobe_width(samples, index) -> np.ndarray:
@@ -139,6 +149,10 @@ def shade_specular(samples, lights, table, radiance, error=None):
         for index, integrals in parts:
             if table != REFERENCE and table.family == "ltsh":
                 _limit(integrals, samples, index, light)
+            if table != REFERENCE and light.is_facing:
+                alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
+                own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
+                integrals *= _mean_emission(light, samples, index, own)
             plain, schlick, dip, dielectric = integrals[..., None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
@@ -160,9 +174,12 @@ def _limit(integrals, samples, index, light):
     own = light if light.center.ndim == 1 else light.take(index)
     axes = samples.normal[index].T, samples.view[index].T
     offset = (own.center - own.origins(samples.position[index])).T
-    toward = dot(offset, own.direction.T)
+    if light.is_facing:
+        seen = SeenLight.of_disk(FacingDisk.of(light, offset, axes[0]))
+    else:
+        seen = SeenLight.of(own, offset, dot(offset, own.direction.T))
     limits = TailLimits.of(axes, samples.roughness[index], samples.geometric_normal[index].T, True, samples.ior[index])
-    limits.apply(integrals, slice(None), SeenLight.of(own, offset, toward), lambda name, shape: np.empty(shape))
+    limits.apply(integrals, slice(None), seen, lambda name, shape: np.empty(shape))
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:

@@ -11,8 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..scene import AreaLight, SurfaceSamples
-from . import light_cone
+from ..scene import AreaLight, SurfaceSamples, round_outline
+from . import facing, light_cone
+from .facing import FacingDisk
 from .polygon import convex_pieces, split_at_horizon
 
 # Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
@@ -59,9 +60,11 @@ def round_levels(light, position, width):
     (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
     position = light.origins(position)
     offset = [position[axis] - light.center[axis] for axis in range(3)]
-    height = np.abs(sum(offset[axis] * light.direction[axis] for axis in range(3)))
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     beyond = np.sqrt(sum(component * component for component in offset)) - reach
+    height = beyond
+    if not light.is_facing:
+        height = np.abs(sum(offset[axis] * light.direction[axis] for axis in range(3)))
     distance = np.maximum(np.maximum(height, beyond), 1e-12 * reach)
     level = np.searchsorted(ROUND_LIMITS, reach / (distance * width))
     for number in np.unique(level):
@@ -74,11 +77,19 @@ def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarr
     """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
 
     corners (V, 3) in the world; offset (3, P) from the points to the light's center, which for "POLYGON" may lie
-    anywhere near.
+    anywhere near. Of a FacingDisk the corners are their own number, the offset its own.
     """
     coordinates, _, points = rows.shape
     center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
     result = scratch("corners", (coordinates, len(corners), points))
+    if isinstance(light, FacingDisk):
+        out, product = (scratch(name, (coordinates, points)) for name in ("axis", "product"))
+        u, v = (_along(rows, half, np.empty_like(out), scratch) for half in (light.half_u, light.half_v))
+        for number, (s, t) in enumerate(round_outline(len(corners)).T.astype(np.float32)):
+            np.multiply(u, s, out=out)
+            out += np.multiply(v, t, out=product)
+            np.add(center, out, out=result[:, number])
+        return result
     if light.is_round or light.shape == "POLYGON":
         for number, corner in enumerate((corners - light.center).astype(np.float32)):
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
@@ -164,11 +175,21 @@ def in_front(samples, light, candidates):
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )
-    facing = ((light.origins(samples.position[candidates]) - center) * direction).sum(axis=1) > 0.0
-    if light.is_focused:
-        facing &= light_cone.may_reach(light, samples.position[candidates].T)
+    position = samples.position[candidates]
+    ahead = np.ones(len(candidates), bool)
+    if not light.is_facing:
+        ahead = ((light.origins(position) - center) * direction).sum(axis=1) > 0.0
+    if light.is_facing or light.is_focused:
+        ahead &= may_reach(light, position.T)
     allowed = light.receives(samples.receiver, candidates)
-    return candidates[facing if allowed is None else facing & allowed]
+    return candidates[ahead if allowed is None else ahead & allowed]
+
+
+def may_reach(light, position) -> np.ndarray:
+    """Mask (Q,): False for points (3, Q) that no part of a light with a spread or a cone shines on."""
+    if light.is_facing:
+        return facing.may_reach(light, light.center[:, None] - position)
+    return light_cone.may_reach(light, position)
 
 
 # Samples at which lights are tried first, and pairs of samples and lights that are tried at all.
@@ -194,7 +215,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
         for light in lights:
             # How far the box around the samples reaches in front of the light.
             ahead = ((light.origins(ends) - light.center) * light.direction).max(axis=0).sum()
-            if light.name not in reached and ahead > 0.0:
+            if light.name not in reached and (light.is_facing or ahead > 0.0):
                 pairs += len(part)
                 if pairs > MOST_PAIRS or _reaches(light, part, lobes):
                     reached.add(light.name)
@@ -212,6 +233,9 @@ def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bo
             index = in_front(samples, light, candidates[start : start + CHUNK])
             offset = corners - light.origins(samples.position[index])
             heights = [(offset * normal[index]).sum(axis=-1).max(axis=0) for normal in horizons]
+            if light.is_facing:
+                offset = light.center - samples.position[index]
+                heights = [(offset * normal[index]).sum(axis=-1) + light.radius for normal in horizons]
             if (np.minimum(*heights) > 0.0).any():
                 return True
     return False
@@ -231,8 +255,12 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
     index = in_front(samples, light, candidates)
     if len(index) == 0:
         return
-    corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
-    offset = (corners - light.origins(samples.position[index])).transpose(2, 0, 1)
+    if light.is_facing:
+        disk = FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index])
+        offset = disk.corners(round_outline(len(corners)))
+    else:
+        corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
+        offset = (corners - light.origins(samples.position[index])).transpose(2, 0, 1)
     local = to_local(frame[:, :, index], offset)
     if light.is_profiled:
         local = np.concatenate([local, to_local(light_cone.plane_axes(light), offset)])

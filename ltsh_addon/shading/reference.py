@@ -17,8 +17,10 @@ from functools import partial
 
 import numpy as np
 
+from ..scene import AreaLight
 from . import brdf, light_cone
 from .edge_integrals import arc_factors
+from .facing import FacingDisk, emission
 from .light_polygons import in_front, light_view, to_local, visible_parts
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
 from .polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
@@ -133,6 +135,35 @@ class EllipseBoundary:
 
 
 @dataclass(frozen=True)
+class FacingEmission:
+    """As `Cone`, of lights that face every point: seen in local frames, from points with their centers at `offset`."""
+
+    light: AreaLight
+    frame: np.ndarray  # (3, 3, P)
+    offset: np.ndarray  # (3, P) in the world
+
+    @property
+    def axis(self) -> np.ndarray:
+        """Of no meaning."""
+        return np.zeros_like(self.offset)
+
+    @property
+    def at_foot(self) -> np.ndarray:
+        """Nowhere is there a tip."""
+        return np.zeros(self.offset.shape[1], bool)
+
+    def take(self, index) -> FacingEmission:
+        """Those of the points `index` (Q,)."""
+        return FacingEmission(self.light, self.frame[:, :, index], self.offset[:, index])
+
+    def factor(self, direction: np.ndarray) -> np.ndarray:
+        """Factors (..., P) for unit directions (3, ..., P) in local frames."""
+        world = np.stack([sum(self.frame[row, axis] * direction[row] for row in range(3)) for axis in range(3)])
+        offset = self.offset.reshape(3, *[1] * (direction.ndim - 2), -1)
+        return emission(self.light, np.broadcast_to(offset, world.shape), world)
+
+
+@dataclass(frozen=True)
 class Cone:
     """The profiles of lights, by the angle theta from `axis`."""
 
@@ -156,7 +187,9 @@ class Cone:
         return self.axis.reshape(3, *[1] * (direction.ndim - 2), -1)
 
 
-def lobe_integrals(make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4, cone: Cone | None = None):
+def lobe_integrals(
+    make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4, cone: Cone | FacingEmission | None = None
+):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
     `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
@@ -266,7 +299,9 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
         batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
     profile = light_cone.Profile.of(light)
     for index, make_boundary, cone in batches:
-        if cone is None and light.has_falloff:
+        if light.is_facing and (light.has_falloff or light.cone is not None):
+            cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
+        elif cone is None and light.has_falloff:
             cone = _whole_cone(samples, frame, light, index, profile)
         alpha = samples.roughness[index] ** 2
         setting = (cosine[index], alpha, samples.ior[index])
@@ -301,18 +336,25 @@ def _uncut_ellipses(samples, frame, light, candidates):
     center and half axes in local frames)."""
     index = in_front(samples, light, candidates)
     offset = (light.center - light.origins(samples.position[index])).T
-    height, swing = _ellipse_extent(samples.geometric_normal[index].T, offset, light)
+    half_u, half_v = light.half_u[:, None], light.half_v[:, None]
+    if light.is_facing:
+        disk = FacingDisk.of(light, offset, frame[2][:, index])
+        offset, half_u, half_v = disk.offset, disk.half_u, disk.half_v
+    ellipse = np.stack(np.broadcast_arrays(offset, half_u, half_v))
+    height, swing = _ellipse_extent(samples.geometric_normal[index].T, ellipse)
     cut = index[(height < swing) & (height > -swing)]
-    index, offset = index[height >= swing], offset[:, height >= swing]
-    height, swing = _ellipse_extent(samples.normal[index].T, offset, light)
-    index, offset = index[height > -swing], offset[:, height > -swing]
+    index, ellipse = index[height >= swing], ellipse[:, :, height >= swing]
+    height, swing = _ellipse_extent(samples.normal[index].T, ellipse)
+    index, ellipse = index[height > -swing], ellipse[:, :, height > -swing]
     axes = frame[:, :, index]
-    return cut, index, [to_local(axes, vector) for vector in (offset, light.half_u[:, None], light.half_v[:, None])]
+    return cut, index, [to_local(axes, vector) for vector in ellipse]
 
 
-def _ellipse_extent(normal, offset, light):
-    """Heights (P,) of the light's center over the planes with `normal` (3, P), and how far it reaches up and down."""
-    return dot(normal, offset), np.hypot(dot(normal, light.half_u), dot(normal, light.half_v))
+def _ellipse_extent(normal, ellipse):
+    """Heights (P,) of centers over the planes with `normal` (3, P), and how far ellipses, centers and half axes
+    (3, 3, P), reach up and down."""
+    offset, half_u, half_v = ellipse
+    return dot(normal, offset), np.hypot(dot(normal, half_u), dot(normal, half_v))
 
 
 def _cone_parts(samples, cosine, frame, light, corners, candidates):

@@ -40,6 +40,14 @@ class SeenLight:
         profile = Profile.of(light) if light.is_profiled else None
         return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
+    @classmethod
+    def of_disk(cls, disk) -> SeenLight:
+        """That of a FacingDisk."""
+        u, v = disk.half_u, disk.half_v
+        square = disk.radius * disk.radius
+        diagonals, squares = np.stack([u + v, u - v]), np.stack([2.0 * square] * 2)
+        return cls(disk.offset, -disk.length, diagonals, squares, np.pi * square, None)
+
     def along_diagonals(self, vectors, out, product):
         """Products (2, Q) of vectors (3, Q) with the half diagonals."""
         np.multiply(self.diagonals[:, 0], vectors[0], out=out)

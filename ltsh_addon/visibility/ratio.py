@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples
-from ..shading import light_cone
+from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
 from ..shading.brdf import dielectric_reflectance, schlick_curve
-from ..shading.light_polygons import has_lobe
+from ..shading.facing import FacingDisk, emission, ray_length
+from ..shading.light_polygons import has_lobe, may_reach
 from . import crew
 from .directions import Choices, Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
 
@@ -50,6 +50,9 @@ ROUNDS = 4
 END = np.float32(1.0 - 1e-4)
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 _MIN_ALPHA = np.float32(1e-5)
+# Corners of lights that face the points, to aim at, and around them.
+OUTLINE = 0.99 * round_outline(16)
+SQUARE = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
 _FARTHEST = np.float32(FARTHEST)
 # Of unit vectors after a warp.
 _LENGTHS = np.float32(1e-11), np.float32(4.0)
@@ -258,9 +261,11 @@ class Pairs:
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
         offset = (light.center[:, None] - light.origins(surface.position)).astype(np.float32)
-        ahead = dot(light.direction.astype(np.float32), offset) < 0.0
-        if light.is_focused:
-            ahead &= light_cone.may_reach(light, surface.position)
+        ahead = np.ones(offset.shape[1], bool)
+        if not light.is_facing:
+            ahead = dot(light.direction.astype(np.float32), offset) < 0.0
+        if light.is_focused or light.is_facing:
+            ahead &= may_reach(light, surface.position)
         if light.receivers is not None:
             ahead &= light.receives(surface.receiver)
         radius, self.wanted, above = np.float32(1.001 * light.radius), {}, {}
@@ -320,7 +325,11 @@ class Pairs:
         """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
         surface, index = self.surface, self.index[members]
         center = self.light.center[:, None] - self.light.origins(surface.position[:, index])
-        offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
+        if self.light.is_facing:
+            normal = surface.horizons(name)[0][:, index]
+            offset = FacingDisk.of(self.light, center.astype(np.float32), normal).corners(OUTLINE)
+        else:
+            offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
         heights = [dot(offset, normal[:, None, index]) for normal in surface.horizons(name)]
         return np.minimum.reduce(heights), offset
 
@@ -500,7 +509,13 @@ class View:
         offset = light.center[:, None] - light.origins(np.take(surface.position, index, axis=1))
         self.height = (-dot(light.direction, offset)).astype(np.float32)
         self.offset = offset.astype(np.float32)
-        corners = emitter.corners_from(self.offset, self.height)
+        self.disk = None
+        if light.is_facing:
+            normal = surface.normal if "specular" in lobes else surface.diffuse_normal
+            self.disk = FacingDisk.of(light, self.offset, np.take(normal, index, axis=1))
+            corners = self.disk.corners(SQUARE)
+        else:
+            corners = emitter.corners_from(self.offset, self.height)
         self.quads = SphericalQuads(corners)
         self.is_seen = self.quads.is_seen
         self.seeds = surface.seeds[index]
@@ -540,12 +555,16 @@ class View:
             np.clip(length, *_LENGTHS, out=length)
             density = density + scale / (length * length * length)
         light = self.emitter.light
-        falling = dot(directions, -light.direction.astype(np.float32))
-        distance = np.minimum(self.height / np.maximum(falling, _TINY), _FARTHEST)
+        falling = dot(directions, -light.direction.astype(np.float32) if self.disk is None else self._axis())
+        height = self.height if self.disk is None else self.disk.length
+        distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
         falls = falling > 0.0
         falls &= self.is_seen
         factor = falls / density
-        brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
+        if self.disk is None:
+            brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
+        else:
+            brightness, distance = self._of_disk(directions, distance)
         if brightness is not None:
             factor *= brightness
         if light.is_distant:
@@ -558,6 +577,20 @@ class View:
             weights["diffuse"] = self._diffuse(directions)
             weights["diffuse"] *= factor
         return directions, distance, weights
+
+    def _axis(self):
+        """Unit vectors (3, 1, Q) to the light."""
+        return (self.disk.offset / self.disk.length)[:, None]
+
+    def _of_disk(self, directions, distance):
+        """How bright (S, Q) a light that faces the points is along directions (3, S, Q) which meet its plane at
+        `distance`, and where they meet the light itself."""
+        disk, offset = self.disk, np.broadcast_to(self.offset[:, None], directions.shape)
+        place = directions * distance - disk.offset[:, None]
+        inside = dot(place, place) <= disk.radius * disk.radius
+        own = ray_length(self.emitter.light, offset, directions)
+        factor = inside * np.asarray(emission(self.emitter.light, offset, directions), np.float32)
+        return factor, np.where(inside, own, distance).astype(np.float32)
 
     def _diffuse(self, directions):
         """The cosine (S, Q), shadowed where a bump map has another horizon."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import AreaLight, SpotCone, SurfaceSamples
 
 EYE = np.array([0.25, -4.0, 2.0])
 SURFACES = ("plain", "sharp", "grazing", "head-on", "tilted")
 LIGHTS = ("plain", "near", "horizon", "tiny", "tiny disk", "huge", "disk", "polygon", "linked")
 PROFILED_LIGHTS = ("spread", "narrow", "spread disk", "linear", "constant disk", "smooth")
+FACING_LIGHTS = ("ball", "facing disk", "spot", "spot disk")
 GROUPS = 4
 
 
@@ -85,6 +86,8 @@ def _fresnel(random, count):
 
 def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
     """A light within a few meters of the origin that shines towards it, with about the power of any other."""
+    if kind in FACING_LIGHTS:
+        return _facing(kind, number, random)
     center = np.array([*random.uniform(-2.0, 2.0, 2), random.uniform(0.4, 2.5)])
     direction = unit(random.normal(size=3) * [1.0, 1.0, 0.5])
     spread = np.pi
@@ -120,6 +123,30 @@ def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
         receivers=tuple(random.choice(GROUPS, 2, replace=False)) if kind == "linked" else None,
         falloff={"linear": 1, "constant disk": 2}.get(kind, 0),
         smooth=0.5 if kind == "smooth" else 0.0,
+    )
+
+
+def _facing(kind, number, random):
+    """A ball or disk that faces every point, half of them a spot aimed at the origin."""
+    center, radius = (
+        np.array([*random.uniform(-2.0, 2.0, 2), random.uniform(0.8, 2.5)]),
+        10.0 ** random.uniform(-2.0, -0.2),
+    )
+    toward, cone = unit(center), None
+    if "spot" in kind:
+        u = unit(np.cross(toward, random.normal(size=3)))
+        axes = np.stack([u, random.uniform(0.6, 1.6) * np.cross(toward, u), toward])
+        cosine = np.cos(random.uniform(0.3, 1.2))
+        cone = SpotCone(axes, cosine, 1.0 / (random.uniform(0.05, 1.0) * (1.0 - cosine)))
+    return AreaLight(
+        name=f"{kind} {number}",
+        shape="FACING_DISK" if "disk" in kind else "BALL",
+        center=rounded(center),
+        half_u=rounded([radius, 0.0, 0.0]),
+        half_v=rounded([0.0, radius, 0.0]),
+        direction=-toward,
+        radiance=rounded(random.uniform(0.5, 1.0, 3) / radius**2),
+        cone=cone,
     )
 
 

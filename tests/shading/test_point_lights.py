@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scenes import area_light, random_samples
+import quadrature
+from surface_scenes import area_light, random_samples, unit
 
 from ltsh_addon import shading
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import AreaLight, SpotCone
 
 CORNERS = np.array([(-1.0, -0.4, 0.0), (0.8, -0.6, 0.0), (1.0, 0.7, 0.0), (-0.6, 0.5, 0.0)])
 
@@ -47,3 +48,128 @@ def test_distant_lights_stay_where_they_are():
 def test_distant_lights_have_no_profile(options):
     with pytest.raises(ValueError, match="distant"):
         area_light("D", "RECTANGLE", (0.0, 0.0, 3.0), is_distant=True, **options)
+
+
+def facing_light(shape="BALL", radius=0.4, center=(0.3, 0.2, 2.5), **options):
+    light = area_light("B", shape, center, (radius, 0.0, 0.0), (0.0, radius, 0.0), **options)
+    return replace(light, radiance=light.radiance / radius**2)
+
+
+def spot(**options):
+    """A light whose cone points about to the origin, wider along one axis."""
+    turn = rotation_to((0.0, 0.0, 1.0), (0.3, 0.2, 2.5))
+    axes = np.diag([1.0, 1.4, 1.0]) @ turn.T
+    cosine = np.cos(0.35)
+    return facing_light(cone=SpotCone(axes, cosine, 1.0 / (0.4 * (1.0 - cosine))), **options)
+
+
+def rotation_to(start, end):
+    """A rotation that turns one vector into the direction of another."""
+    start, end = unit(np.asarray(start)), unit(np.asarray(end))
+    half = unit(start + end)
+    return (2.0 * np.outer(half, half) - np.eye(3)) @ (2.0 * np.outer(start, start) - np.eye(3))
+
+
+def oracle(samples, light, brdf, count=160):
+    """Radiance (P, 3) by midpoints of equal solid angles of the cone in which a light is seen, written out."""
+    offset = light.center - samples.position
+    distance = np.linalg.norm(offset, axis=1, keepdims=True)
+    radius = np.linalg.norm(light.half_u)
+    sine = radius / (distance if light.shape == "BALL" else np.hypot(distance, radius))
+    inside = light.shape == "BALL" and (distance < radius).all()
+    least = -1.0 if inside else np.sqrt(1.0 - sine**2)
+    steps = (np.arange(count) + 0.5) / count
+    cosine, angle = (grid.ravel() for grid in np.meshgrid(steps, 2.0 * np.pi * steps))
+    cosine = 1.0 - (1.0 - least) * cosine
+    axis = unit(offset)
+    u = unit(np.cross(axis, [0.3, -0.5, 0.8]))
+    v = np.cross(axis, u)
+    across = np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None]
+    directions = cosine[..., None] * axis[:, None] + np.sqrt(1.0 - cosine**2)[..., None] * across
+    factor = np.broadcast_to(1.0, directions.shape[:2])
+    if light.cone is not None:
+        x, y, z = np.moveaxis(directions @ light.cone.axes.T, -1, 0)
+        share = np.clip((z / np.sqrt(x * x + y * y + z * z) - light.cone.cosine) * light.cone.sharpness, 0.0, 1.0)
+        factor = factor * (3.0 * share**2 - 2.0 * share**3)
+    if light.falloff or light.smooth:
+        length = distance * cosine - np.sqrt(radius**2 - distance**2 * (1.0 - cosine**2))
+        factor = factor * length**light.falloff * length**2 / (length**2 + light.smooth)
+    whole = 2.0 * np.pi * (1.0 - least) / count**2
+    values = brdf(directions, samples) * (factor * whole)[..., None]
+    above = np.einsum("psk,pk->ps", directions, samples.geometric_normal) > 0.0
+    return (values * above[..., None]).sum(axis=1) * light.radiance
+
+
+def lit_samples(count, light, seed=0):
+    """Samples that face the light, all of which is above their horizons."""
+    samples = random_samples(6 * count, seed=seed, lowest_roughness=0.3)
+    samples = replace(samples, diffuse_normal=samples.normal, smooth_normal=samples.normal)
+    toward = unit(light.center - samples.position)
+    chosen = ((samples.normal * toward).sum(axis=1) > 0.5) & ((samples.normal * samples.view).sum(axis=1) > 0.2)
+    return samples.take(np.flatnonzero(chosen)[:count])
+
+
+KINDS = {
+    "ball": facing_light(),
+    "disk": facing_light("FACING_DISK"),
+    "spot": spot(),
+    "spot disk": spot(shape="FACING_DISK"),
+    "small": facing_light(radius=1e-3),
+    "smooth": facing_light(falloff=1, smooth=0.5),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_reference_integrates_lights_that_face_every_point(kind):
+    light = KINDS[kind]
+    samples = lit_samples(24, light)
+    found = shading.shade(samples, [light], "reference", workers=1)
+    assert np.allclose(found.specular[0], oracle(samples, light, quadrature.ggx), rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("kind", KINDS)
+def test_form_factors_of_lights_that_face_every_point(kind, dtype):
+    light = KINDS[kind]
+    samples = lit_samples(200, light)
+    found = shading.shade(samples, [light], "ltsh4", passes=["diffuse"], workers=1, dtype=dtype).diffuse[0]
+    expected = oracle(samples, light, quadrature.lambert)
+    error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+    assert expected.any() and error < 2e-3
+
+
+def test_a_ball_shines_like_a_point_in_its_middle():
+    """On what faces it: the flux through a surface is that of all of its power."""
+    light = facing_light()
+    samples = lit_samples(50, light)
+    offset = light.center - samples.position
+    squared = (offset**2).sum(axis=1)
+    cosine = (samples.normal * offset).sum(axis=1) / np.sqrt(squared)
+    expected = (cosine / squared * np.pi * 0.4**2 / np.pi)[:, None] * samples.diffuse_albedo * light.radiance
+    found = shading.shade(samples, [light], "ltsh4", passes=["diffuse"], workers=1).diffuse[0]
+    assert np.allclose(found, expected, rtol=1e-4, atol=1e-5 * expected.max())
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_within_a_ball_light_comes_from_everywhere(dtype):
+    light = facing_light(radius=20.0)
+    samples = random_samples(60, lowest_roughness=0.3)
+    samples = replace(samples, diffuse_normal=samples.normal, smooth_normal=samples.normal)
+    found = shading.shade(samples, [light], "ltsh4", workers=1, dtype=dtype)
+    assert np.allclose(found.diffuse[0], samples.diffuse_albedo * light.radiance, rtol=1e-4, atol=1e-6)
+    expected = oracle(samples, light, quadrature.ggx, 250)
+    assert np.linalg.norm(found.specular[0] - expected) < 0.01 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_both_precisions_agree_about_lights_that_face_every_point(kind):
+    """And both with the reference as far as the table goes."""
+    light = KINDS[kind]
+    samples = lit_samples(200, light, seed=1)
+    single, double = (
+        shading.shade(samples, [light], "ltsh4", workers=1, dtype=dtype).specular[0]
+        for dtype in (np.float32, np.float64)
+    )
+    assert np.abs(single - double).max() < 2e-4 * double.max()
+    expected = shading.shade(samples, [light], "reference", passes=["specular"], workers=1).specular[0]
+    assert np.linalg.norm(double - expected) < 0.015 * np.linalg.norm(expected)

@@ -13,7 +13,8 @@ from ltsh_addon.visibility.directions import Emitter
 from ltsh_addon.visibility.occluders import ChosenBy
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
-    ("plain", light) for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS)
+    ("plain", light)
+    for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS, *random_surfaces.FACING_LIGHTS)
 ]
 
 

@@ -1,0 +1,243 @@
+"""Lights that face every point: balls and disks, of point and spot lights, and what a spot's cone leaves of them.
+
+A ball is seen as the disk in its outline. From within it light comes from everywhere: a disk that all but fills the
+half space over the lobe's normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .brdf import ggx_distribution, masking
+from .polygon import dot
+
+# Of a ball's radius: how far the disk is that stands for the half space, seen from within.
+NEAR_DISK = 1e-3
+# Of the squared distance: what a point on a ball is at least outside of it.
+LEAST_SHRINKING = 1e-6
+# The emission is that of the middle where it changes over the disk by no more than this share.
+CHANGING = 0.01
+# A rule of Chebyshev (second kind) along the first axis of a disk, of Legendre across: its order.
+ALONG, ACROSS = 16, 4
+# Points around a disk.
+_RIM = np.array([[0.0, 1.0, -1.0, 0.0, 0.0, 0.7, -0.7, 0.7, -0.7], [0.0, 0.0, 0.0, 1.0, -1.0, 0.7, 0.7, -0.7, -0.7]])
+NODES_CHUNK = 2048
+# The point nearest to the peak counts little for wide lobes, of which others meet the peak.
+PEAK_WEIGHT = 1.0 / 400.0
+
+
+def _disk_rule(along: int, across: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places (2, N) and weights (N,), 1 together, of integrals over the unit disk."""
+    angle = np.pi * np.arange(1, along + 1) / (along + 1)
+    nodes, weights = np.polynomial.legendre.leggauss(across)
+    places = np.stack(np.broadcast_arrays(np.cos(angle)[:, None], np.sin(angle)[:, None] * nodes))
+    whole = np.sin(angle)[:, None] ** 2 * weights / (along + 1)
+    return places.reshape(2, -1), whole.ravel()
+
+
+_NODES, _WEIGHTS = _disk_rule(ALONG, ACROSS)
+
+
+@dataclass(frozen=True)
+class FacingDisk:
+    """The disks that Q points see; corners and half axes in the order of `AreaLight.polygon`."""
+
+    offset: np.ndarray  # (3, Q) from the points to the centers
+    half_u: np.ndarray  # (3, Q)
+    half_v: np.ndarray  # (3, Q)
+    length: np.ndarray  # (Q,) of the offset
+    radius: np.ndarray  # (Q,)
+    is_inside: np.ndarray  # (Q,) bool, points in a ball
+
+    @classmethod
+    def of(cls, light, offset: np.ndarray, normal: np.ndarray) -> FacingDisk:
+        """Of `light` for points with its center at offset (3, Q), whose lobes have a normal (3, Q)."""
+        radius = offset.dtype.type(np.sqrt((light.half_u**2).sum()))
+        squared = dot(offset, offset)
+        if light.shape == "BALL":
+            inside = squared <= radius * radius
+            shrinking = 1.0 - radius * radius / np.where(inside, radius * radius + 1.0, squared)
+            shrinking = np.maximum(shrinking, offset.dtype.type(LEAST_SHRINKING))
+            offset = offset * shrinking
+            own = np.where(inside, radius, radius * np.sqrt(shrinking))
+            distance = NEAR_DISK
+        else:
+            inside = squared <= 0.0
+            own, distance = np.broadcast_to(radius, squared.shape), 1e-6
+        if inside.any():
+            offset = np.where(inside, offset.dtype.type(distance) * radius * normal, offset)
+        length = np.sqrt(dot(offset, offset))
+        x, y, z = -offset / length
+        # A frame around the direction of the light (Duff et al. 2017).
+        sign = np.copysign(offset.dtype.type(1.0), z)
+        a = -1.0 / (sign + z)
+        b = x * y * a
+        half_u = own * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+        half_v = own * np.stack([b, sign + y * y * a, -y])
+        return cls(offset, half_u, half_v, length, own, inside)
+
+    def _sizes(self):
+        return self.length, self.radius, self.is_inside
+
+    def take(self, part) -> FacingDisk:
+        """Those of the points `part`."""
+        vectors = (self.offset[:, part], self.half_u[:, part], self.half_v[:, part])
+        return FacingDisk(*vectors, *(values[part] for values in self._sizes()))
+
+    def along(self, cone) -> FacingDisk:
+        """The same disks with the half axis u where the factor of a cone changes most; of no cone as they are."""
+        if cone is None:
+            return self
+        axes = cone.axes.astype(self.offset.dtype)
+        local = np.einsum("ij,jq->iq", axes, self.offset / self.length)
+        rise = axes[2][:, None] * dot(local, local) - local[2] * np.einsum("ij,iq->jq", axes, local)
+        s, t = dot(rise, self.half_u), dot(rise, self.half_v)
+        size = np.sqrt(s * s + t * t)
+        s, t = (np.where(size > 0.0, value / np.where(size > 0.0, size, 1.0), 1.0) for value in (s, t))
+        half_u = s * self.half_u + t * self.half_v
+        return FacingDisk(self.offset, half_u, s * self.half_v - t * self.half_u, *self._sizes())
+
+    def corners(self, outline: np.ndarray) -> np.ndarray:
+        """Offsets (3, V, Q) to places (2, V) in units of the half axes."""
+        s, t = outline.astype(self.offset.dtype)[:, :, None]
+        return self.offset[:, None] + s * self.half_u[:, None] + t * self.half_v[:, None]
+
+    @property
+    def direction(self) -> np.ndarray:
+        """Unit vectors (3, Q) to the side that shines."""
+        return -self.offset / self.length
+
+
+def cone_factor(light, directions: np.ndarray) -> np.ndarray:
+    """What the cone of a spot leaves (...) of light that arrives from `directions` (3, ...), of any length."""
+    axes = light.cone.axes.astype(directions.dtype)
+    x, y, z = (dot(row, directions) for row in axes)
+    cosine = z / np.sqrt(np.maximum(x * x + y * y + z * z, np.finfo(directions.dtype).tiny))
+    share = np.clip((cosine - light.cone.cosine) * light.cone.sharpness, 0.0, 1.0)
+    return share * share * (3.0 - 2.0 * share)
+
+
+def may_reach(light, offset: np.ndarray) -> np.ndarray:
+    """Mask (Q,): False for points with the center of the light at offset (3, Q) that its cone is far from."""
+    if light.cone is None:
+        return np.ones(offset.shape[1], bool)
+    distance = np.sqrt(np.maximum(dot(offset, offset), np.finfo(offset.dtype).tiny))
+    axis = np.linalg.solve(light.cone.axes, [0.0, 0.0, 1.0])
+    axis /= np.sqrt((axis**2).sum())
+    between = np.arccos(np.clip(dot(axis, offset) / distance, -1.0, 1.0))
+    widest = np.arccos(np.clip(light.cone.cosine, -1.0, 1.0))
+    sizes = np.sqrt((light.cone.axes**2).sum(axis=1))
+    widest = np.arctan2(np.sin(widest) * sizes[2], np.cos(widest) * min(sizes[:2]))
+    seen = np.arcsin(np.minimum(light.radius / distance, 1.0))
+    return (between < widest + 1.001 * seen + 1e-4) | (distance <= light.radius)
+
+
+def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """How far (...) the light is along unit `directions` (3, ...) that meet it, its center at offset (3, ...)."""
+    along = dot(offset, directions)
+    squared = dot(offset, offset)
+    if light.shape != "BALL":
+        return squared / np.maximum(along, np.finfo(offset.dtype).tiny)
+    rest = light.radius**2 - squared
+    root = np.sqrt(np.maximum(rest + along * along, 0.0))
+    # The near side, or from within the far one, without a difference of nearly equal numbers.
+    return np.where(rest < 0.0, -rest / np.maximum(along + root, np.finfo(offset.dtype).tiny), along + root)
+
+
+def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | float:
+    """By what the radiance (...) is multiplied along unit `directions` (3, ...) that meet the light; 1.0: nothing."""
+    factor = 1.0
+    if light.cone is not None:
+        factor = cone_factor(light, directions)
+        if light.shape == "BALL":
+            factor = np.where(dot(offset, offset) <= light.radius**2, 1.0, factor)
+    if light.has_falloff:
+        squared = np.square(ray_length(light, offset, directions))
+        factor = factor * (squared / (squared + light.smooth)) * squared ** (0.5 * light.falloff)
+    return factor
+
+
+def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np.ndarray | float:
+    """By what the radiance of the light, its center at offset (3, Q), is multiplied for the lobes; 1.0: nothing.
+
+    Where it changes over the disk it is the mean over points of the disk, weighted by what the lobes make of them.
+    """
+    if light.cone is None and not light.has_falloff:
+        return 1.0
+
+    def factors(places, part):
+        directions = disk.take(part).along(light.cone).corners(places)
+        lengths = np.sqrt(dot(directions, directions))
+        directions /= lengths
+        own = np.broadcast_to(offset[:, None, part], directions.shape)
+        return emission(light, own, directions), directions, lengths
+
+    few = factors(_RIM, slice(None))[0]
+    # Half of it is farther out than half of the rim's: right for what bends evenly.
+    result, most = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0), few.max(axis=0)
+    changing = np.nonzero(most - few.min(axis=0) > CHANGING * most)[0]
+    for start in range(0, len(changing), NODES_CHUNK):
+        part = changing[start : start + NODES_CHUNK]
+        values, directions, lengths = factors(_NODES, part)
+        own = lobe.take(part)
+        weights = own.values(directions) / lengths**3 * _WEIGHTS.astype(lengths.dtype)[:, None]
+        peak = own.peak(disk.take(part))
+        at_peak, toward_peak, length = factors_at(light, offset[:, part], peak)
+        weight = PEAK_WEIGHT * own.values(toward_peak[:, None])[0] / length**3
+        weight *= own.view is not None
+        whole = weights.sum(axis=0) + weight
+        lit = whole > 0.0
+        mean = ((weights * values).sum(axis=0) + weight * at_peak) / np.where(lit, whole, 1.0)
+        result[part] = np.where(lit, mean, values.mean(axis=0))
+    return result
+
+
+def factors_at(light, offset, places):
+    """Emission (Q,), unit directions (3, Q) and distances (Q,) of points of the light at `places` (3, Q)."""
+    length = np.sqrt(dot(places, places))
+    directions = places / length
+    return emission(light, offset, directions), directions, length
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """Diffuse lobes, or GGX with a view and alpha, of Q samples."""
+
+    normal: np.ndarray  # (3, Q)
+    view: np.ndarray | None = None  # (3, Q)
+    alpha: np.ndarray | None = None  # (Q,)
+
+    def take(self, part) -> Lobe:
+        """Those of the samples `part`."""
+        if self.view is None:
+            return Lobe(self.normal[:, part])
+        return Lobe(self.normal[:, part], self.view[:, part], self.alpha[part])
+
+    def values(self, directions: np.ndarray) -> np.ndarray:
+        """BRDF times cosine (S, Q) for unit directions (3, S, Q), of white lobes."""
+        normal = self.normal[:, None]
+        cosine = np.maximum(dot(normal, directions), 0.0)
+        if self.view is None:
+            return cosine * (1.0 / np.pi)
+        half = directions + self.view[:, None]
+        # Not as a difference, which has no digits of what a sharp lobe sees.
+        across = [normal[a] * half[b] - normal[b] * half[a] for a, b in ((0, 1), (1, 2), (2, 0))]
+        vertical, squared = np.square(dot(normal, half)), self.alpha * self.alpha
+        distribution = ggx_distribution(dot(across, across), vertical, squared)
+        facing = np.maximum(dot(self.normal, self.view), 0.0)
+        return distribution * cosine / np.maximum(2.0 * masking(facing, cosine, squared), 1e-30)
+
+    def peak(self, disk: FacingDisk) -> np.ndarray:
+        """The points (3, Q) of disks that are nearest to the lobe's peak."""
+        if self.view is None:
+            return disk.offset
+        mirrored = 2.0 * dot(self.normal, self.view) * self.normal - self.view
+        along = dot(mirrored, disk.offset)
+        ahead = along > 1e-3 * disk.length
+        place = mirrored * (disk.length * disk.length / np.where(ahead, along, 1.0)) - disk.offset
+        squared = disk.radius * disk.radius
+        s, t = (np.where(ahead, dot(place, half) / squared, 0.0) for half in (disk.half_u, disk.half_v))
+        beyond = np.maximum(np.sqrt(s * s + t * t), 1.0)
+        return disk.offset + s / beyond * disk.half_u + t / beyond * disk.half_v

@@ -17,13 +17,14 @@ from .polygon import dot
 NEAR_DISK = 1e-3
 # Of the squared distance: what a point on a ball is at least outside of it.
 LEAST_SHRINKING = 1e-6
-# The emission is that of the middle where it changes over the disk by no more than this share.
-CHANGING = 0.01
-# A rule of Chebyshev (second kind) along the first axis of a disk, of Legendre across: its order.
-ALONG, ACROSS = 16, 4
+# Shares of the brightest place of a disk: what changes by less has a mean, what falls below has a step.
+CHANGING, STEP = 0.01, 0.1
+# Rules of Chebyshev (second kind) along the first axis of a disk, of Legendre across: their orders. The second is for
+# what goes all the way from bright to dark on the disk, perhaps in a step.
+ORDERS = ((16, 4), (64, 5))
 # Points around a disk.
 _RIM = np.array([[0.0, 1.0, -1.0, 0.0, 0.0, 0.7, -0.7, 0.7, -0.7], [0.0, 0.0, 0.0, 1.0, -1.0, 0.7, 0.7, -0.7, -0.7]])
-NODES_CHUNK = 2048
+NODES_CHUNK = 1 << 17
 # The point nearest to the peak counts little for wide lobes, of which others meet the peak.
 PEAK_WEIGHT = 1.0 / 400.0
 
@@ -37,7 +38,7 @@ def _disk_rule(along: int, across: int) -> tuple[np.ndarray, np.ndarray]:
     return places.reshape(2, -1), whole.ravel()
 
 
-_NODES, _WEIGHTS = _disk_rule(ALONG, ACROSS)
+_RULES = [_disk_rule(*orders) for orders in ORDERS]
 
 
 @dataclass(frozen=True)
@@ -175,14 +176,14 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
         return emission(light, own, directions), directions, lengths
 
     few = factors(_RIM, slice(None))[0]
-    # Half of it is farther out than half of the rim's: right for what bends evenly.
-    result, most = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0), few.max(axis=0)
-    changing = np.nonzero(most - few.min(axis=0) > CHANGING * most)[0]
-    for start in range(0, len(changing), NODES_CHUNK):
-        part = changing[start : start + NODES_CHUNK]
-        values, directions, lengths = factors(_NODES, part)
+    least, most = few.min(axis=0), few.max(axis=0)
+    # Half of the disk is farther out than the other half: right for what bends evenly.
+    result = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0)
+    rule = np.where(most - least > CHANGING * most, np.where(least < STEP * most, 1, 0), -1)
+    for part, (places, shares) in _parts(rule):
+        values, directions, lengths = factors(places, part)
         own = lobe.take(part)
-        weights = own.values(directions) / lengths**3 * _WEIGHTS.astype(lengths.dtype)[:, None]
+        weights = own.values(directions) / lengths**3 * shares.astype(lengths.dtype)[:, None]
         peak = own.peak(disk.take(part))
         at_peak, toward_peak, length = factors_at(light, offset[:, part], peak)
         weight = PEAK_WEIGHT * own.values(toward_peak[:, None])[0] / length**3
@@ -192,6 +193,15 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
         mean = ((weights * values).sum(axis=0) + weight * at_peak) / np.where(lit, whole, 1.0)
         result[part] = np.where(lit, mean, values.mean(axis=0))
     return result
+
+
+def _parts(rule):
+    """Yield (index, rule): the points for which each of the rules is chosen, not too many at a time."""
+    for number, (places, shares) in enumerate(_RULES):
+        chosen = np.nonzero(rule == number)[0]
+        step = NODES_CHUNK // len(shares)
+        for start in range(0, len(chosen), step):
+            yield chosen[start : start + step], (places, shares)
 
 
 def factors_at(light, offset, places):

@@ -76,7 +76,7 @@ def _places(depsgraph) -> list[tuple]:
     found = []
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type in ("LIGHT", *SURFACE_TYPES) and (ob.type != "LIGHT" or ob.data.type == "AREA"):
+        if ob.type in ("LIGHT", *SURFACE_TYPES) and (ob.type != "LIGHT" or ob.data.type != "SUN"):
             found.append(((ob.original.name, ob.type), np.array(instance.matrix_world, dtype=np.float64)))
     camera = depsgraph.scene_eval.camera
     if camera is not None:

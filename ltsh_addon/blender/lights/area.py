@@ -1,4 +1,4 @@
-"""Area lights of an evaluated scene as `AreaLight` (runs in the child).
+"""Lights of an evaluated scene as `AreaLight` (runs in the child); see `points` for those that are no area lights.
 
 Radiance as Cycles has it: L = color * temperature color * energy * 2^exposure / pi [/ area if normalize], one-sided
 along the local -Z axis. Size and shape follow the first two columns of the world matrix. Measured against
@@ -21,6 +21,7 @@ from ..render_settings import cycles_setting
 from .emission import NO_FACTOR, Falloff, emission_of, open_studio
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
+from .points import point_light, strength
 from .textures import UnseenLight, look_at_area_lights
 
 # Two axes further from a right angle than this (cosine) are called sheared.
@@ -83,7 +84,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
             placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
-            if cycles_setting(ob.data, "use_multiple_importance_sampling"):
+            if cycles_setting(ob.data, "use_multiple_importance_sampling") and ob.data.type == "AREA":
                 hit.append(light)
             note_unsupported(ob, matrix, inventory)
             if light.affects_diffuse != light.affects_specular:
@@ -216,23 +217,34 @@ def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
 def reason_to_leave_out(ob, matrix: np.ndarray) -> str:
     """Why the evaluated light `ob` at `matrix` (4, 4) is not shaded; "" where it is."""
     light = ob.data
-    if light.type != "AREA":
-        return f"{light.type} lights are not shaded, only area lights are"
-    if light.shape not in AREA_LIGHT_SHAPES:
-        return f"shape {light.shape} is not supported"
-    if cycles_setting(light, "is_portal"):
-        return "it is a light portal, which only guides the sampling of the world"
     if not np.isfinite(matrix).all():
         return "its transform is not finite"
     if not np.isfinite([light.energy, *light.color]).all():
         return "its power or color is not finite"
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if light.type != "AREA":
+        return _reason_to_leave_out_point(light, matrix, lengths)
+    if light.shape not in AREA_LIGHT_SHAPES:
+        return f"shape {light.shape} is not supported"
+    if cycles_setting(light, "is_portal"):
+        return "it is a light portal, which only guides the sampling of the world"
     if max(np.abs(matrix[:3, 3]).max(), max(_sizes(light)) * lengths.max()) > FARTHEST:
         return f"it is farther away, or larger, than {FARTHEST:g} m"
     if min(_sizes(light)) * lengths[:2].min() <= 0.0 or lengths[2] <= 0.0:
         return "its size or scale is zero"
     if math.degrees(light.spread) < LEAST_SPREAD:
         return f"its spread is {math.degrees(light.spread):g} degrees, expected at least {LEAST_SPREAD:g}"
+    return ""
+
+
+def _reason_to_leave_out_point(light, matrix, lengths) -> str:
+    """As `reason_to_leave_out` of a point, spot or sun light."""
+    if light.type not in ("POINT", "SPOT", "SUN"):
+        return f"{light.type} lights are not shaded"
+    if light.type != "SUN" and max(np.abs(matrix[:3, 3]).max(), light.shadow_soft_size) > FARTHEST:
+        return f"it is farther away, or larger, than {FARTHEST:g} m"
+    if light.type == "SPOT" and lengths.min() <= 1e-6 * lengths.max() or light.type == "SUN" and lengths[2] <= 0.0:
+        return "its scale is zero"
     return ""
 
 
@@ -244,6 +256,14 @@ def _sizes(light) -> tuple[float, float]:
 def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
     """The evaluated light `ob` at `matrix` (4, 4), without what its node tree makes of it."""
     light = ob.data
+    shared = {
+        "group": traits.group,
+        "affects_diffuse": traits.diffuse,
+        "affects_specular": traits.glossy,
+        "receivers": receivers.of(ob.original),
+    }
+    if light.type != "AREA":
+        return point_light(ob, matrix, **shared)
     size_u, size_v = _sizes(light)
     half_u, half_v = 0.5 * size_u * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
     return AreaLight(
@@ -254,19 +274,14 @@ def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receive
         half_v=half_v,
         direction=-matrix[:3, 2] / np.linalg.norm(matrix[:3, 2]),
         radiance=_radiance(light, half_u, half_v),
-        group=traits.group,
-        affects_diffuse=traits.diffuse,
-        affects_specular=traits.glossy,
         spread=min(light.spread, math.pi),
-        receivers=receivers.of(ob.original),
+        **shared,
     )
 
 
 def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     """Emitted radiance (3,) in W m^-2 sr^-1."""
-    value = np.array(light.color, dtype=np.float64) * light.energy * 2.0**light.exposure / math.pi
-    if light.use_temperature:
-        value *= np.array(light.temperature_color, dtype=np.float64)[:3]
+    value = strength(light) / math.pi
     if light.normalize:
         area = 4.0 * np.linalg.norm(half_u) * np.linalg.norm(half_v)
         value /= area * (math.pi / 4.0 if light.shape in ("DISK", "ELLIPSE") else 1.0)
@@ -294,8 +309,10 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLig
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     """Warn of what Cycles renders for this light and the techniques do not."""
     light, name = ob.data, ob.original.name
+    if light.energy < 0.0:
+        inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")
+    if light.type != "AREA":
+        return
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
     if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE:
         inventory.warn(f"light {name!r}: its transform is sheared, which Cycles itself does not sample correctly")
-    if light.energy < 0.0:
-        inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")

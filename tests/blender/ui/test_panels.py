@@ -158,8 +158,7 @@ def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
 
 
 def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
-    parts.add_area_light("Torn")
-    bpy.data.objects["Torn"].data.type = "POINT"
+    parts.add_area_light("Torn", scale=(1.0, 0.0, 1.0))
     glass, _ = parts.bsdf_material("ShaderNodeBsdfHairPrincipled", "Fur")
     parts.add_plane(glass, name="Fur")
     bpy.context.view_layer.update()

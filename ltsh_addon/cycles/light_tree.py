@@ -12,6 +12,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from ..scene import AreaLight
+from ..shading.facing import cone_angle
 
 # Of these Cycles makes a leaf at most, and tries so many places along each axis where clusters may be cut.
 LIGHTS_OF_LEAF = 8
@@ -144,9 +145,7 @@ def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> 
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
     if light.is_facing:
-        ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
-        near = np.maximum(distance, light.radius)
-        return _bounds(_cluster_of(np.array(_row(light)), 0), offset, normal, np.sqrt(1.0 - ratio**2), near, near)
+        return _facing_bounds(light, axis, distance, normal)
     corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
     reach = np.array([np.linalg.norm(corner, axis=1) for corner in corners])
     along = np.array([(corner * axis).sum(axis=1) for corner in corners])
@@ -162,16 +161,40 @@ def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> 
     return bounds * (offset @ light.direction < 0.0)
 
 
+def _facing_bounds(light, axis, distance, normal):
+    """As `light_bounds` of a point or spot light along unit vectors (P, 3) at a distance (P,)."""
+    if light.shape == "BALL":
+        ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
+        width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
+    else:
+        width = distance / np.maximum(np.hypot(distance, light.radius), 1e-30)
+    inside = width < 0.0
+    near = np.where(inside, light.radius / np.sqrt(2.0), distance)
+    far = np.where(inside, near, distance / np.maximum(width, 1e-30))
+    cluster = _cluster_of(np.array(_row(light)), 0)
+    if light.cone is None:
+        here = (axis * normal).sum(axis=1)
+        most = np.where(here >= width, 1.0, np.maximum(_cosine_of_sum(here, width, -1.0), 0.0))
+        least = np.maximum(_cosine_of_sum(here, width, 1.0), 0.0) * np.maximum(width, 0.0)
+        return cluster.power * np.stack([most / np.maximum(near, 1e-30) ** 2, least / np.maximum(far, 1e-30) ** 2])
+    between = np.arccos(np.clip(-(axis @ cluster.axis), -1.0, 1.0)) - np.arccos(np.clip(width, -1.0, 1.0))
+    share = np.clip((np.cos(np.maximum(between, 0.0)) - np.cos(cluster.reach)) * light.cone.sharpness, 0.0, 1.0)
+    return _bounds(cluster, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
+
+
 def _row(light) -> list[float]:
     power = np.abs(light.radiance).mean() * np.linalg.norm(light.area_vector)
-    return [*light.center, *light.half_u, *light.half_v, *light.direction, 0.5 * light.spread, power, light.is_facing]
+    reach = 0.5 * light.spread if light.cone is None else min(cone_angle(light.cone), 0.5 * np.pi)
+    spread = np.pi if light.is_facing and light.cone is None else 0.0
+    size = light.radius if light.is_facing else 0.0
+    return [*light.center, *light.half_u, *light.half_v, *light.direction, reach, power, spread, size]
 
 
 def _cluster_of(row, number: int) -> Cluster:
     center, half_u, half_v, direction = row[:12].reshape(4, 3)
     reach = np.abs(half_u) + np.abs(half_v)
-    spread = np.pi if row[14] else 0.0
-    return Cluster((number,), center - reach, center + reach, direction, spread, row[12], row[13])
+    reach = np.maximum(reach, row[15])
+    return Cluster((number,), center - reach, center + reach, direction, row[14], row[12], row[13])
 
 
 @lru_cache(maxsize=4)

@@ -120,6 +120,13 @@ def cone_factor(light, directions: np.ndarray) -> np.ndarray:
     return share * share * (3.0 - 2.0 * share)
 
 
+def cone_angle(cone) -> float:
+    """Half the angle in rad of a cone, along its wider axis."""
+    angle = np.arccos(np.clip(cone.cosine, -1.0, 1.0))
+    sizes = np.sqrt((cone.axes**2).sum(axis=1))
+    return float(np.arctan2(np.sin(angle) * sizes[2], np.cos(angle) * min(sizes[:2])))
+
+
 def may_reach(light, offset: np.ndarray) -> np.ndarray:
     """Mask (Q,): False for points with the center of the light at offset (3, Q) that its cone is far from."""
     if light.cone is None:
@@ -128,23 +135,22 @@ def may_reach(light, offset: np.ndarray) -> np.ndarray:
     axis = np.linalg.solve(light.cone.axes, [0.0, 0.0, 1.0])
     axis /= np.sqrt((axis**2).sum())
     between = np.arccos(np.clip(dot(axis, offset) / distance, -1.0, 1.0))
-    widest = np.arccos(np.clip(light.cone.cosine, -1.0, 1.0))
-    sizes = np.sqrt((light.cone.axes**2).sum(axis=1))
-    widest = np.arctan2(np.sin(widest) * sizes[2], np.cos(widest) * min(sizes[:2]))
     seen = np.arcsin(np.minimum(light.radius / distance, 1.0))
-    return (between < widest + 1.001 * seen + 1e-4) | (distance <= light.radius)
+    return (between < cone_angle(light.cone) + 1.001 * seen + 1e-4) | (distance <= light.radius)
 
 
 def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """How far (...) the light is along unit `directions` (3, ...) that meet it, its center at offset (3, ...)."""
     along = dot(offset, directions)
     squared = dot(offset, offset)
+    # Directions that pass by have no length: one that can be squared.
+    least = 1e-9 * np.sqrt(squared) + np.finfo(offset.dtype).tiny
     if light.shape != "BALL":
-        return squared / np.maximum(along, np.finfo(offset.dtype).tiny)
+        return squared / np.maximum(along, least)
     rest = light.radius**2 - squared
     root = np.sqrt(np.maximum(rest + along * along, 0.0))
     # The near side, or from within the far one, without a difference of nearly equal numbers.
-    return np.where(rest < 0.0, -rest / np.maximum(along + root, np.finfo(offset.dtype).tiny), along + root)
+    return np.where(rest < 0.0, -rest / np.maximum(along + root, least), along + root)
 
 
 def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | float:

@@ -76,6 +76,13 @@ def choices(x, light, shadow, met):
     light.data.use_shadow, light.data.cycles.use_multiple_importance_sampling = shadow, met
 
 
+def other_kind(light, **settings):
+    """A point, spot or sun light in the place of an area light."""
+    light.data.type = settings.pop("kind")
+    for name, value in settings.items():
+        setattr(light.data, name, value)
+
+
 BAYS = {
     "holdout": lambda x, light: cube(x, is_holdout=True),
     "seen, without a shadow": lambda x, light: cube(x, visible_shadow=False),
@@ -87,6 +94,9 @@ BAYS = {
     "mesh that emits": lambda x, light: lamp(x),
     "light without a shadow": lambda x, light: choices(x, light, shadow=False, met=True),
     "light that no surface chooses": lambda x, light: choices(x, light, shadow=True, met=False),
+    "point": lambda x, light: (other_kind(light, kind="POINT", shadow_soft_size=0.15), cube(x)),
+    "point without a radius": lambda x, light: (other_kind(light, kind="POINT", shadow_soft_size=0.0), cube(x)),
+    "spot": lambda x, light: (other_kind(light, kind="SPOT", spot_size=1.3, shadow_soft_size=0.1), cube(x, size=0.3)),
     "light that is never blocked": lambda x, light: choices(x, light, shadow=False, met=False),
 }
 UNBLOCKED = "seen, without a shadow", "light that is never blocked"

@@ -170,6 +170,7 @@ def test_both_precisions_agree_about_lights_that_face_every_point(kind):
         shading.shade(samples, [light], "ltsh4", workers=1, dtype=dtype).specular[0]
         for dtype in (np.float32, np.float64)
     )
-    assert np.abs(single - double).max() < 2e-4 * double.max()
+    # Small lights are shaded by their centers in single precision, see `small_lights`.
+    assert np.abs(single - double).max() < (3e-3 if kind == "small" else 2e-4) * double.max()
     expected = shading.shade(samples, [light], "reference", passes=["specular"], workers=1).specular[0]
     assert np.linalg.norm(double - expected) < 0.015 * np.linalg.norm(expected)

@@ -54,6 +54,8 @@ class _Collector:
         # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
         self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
         self._instances: list[tuple] = []  # (mesh, matrices (N, 3, 4), mask, terminator)
+        # By size and place of meshes the first of them, and the name of its object.
+        self._there: dict[tuple, tuple[int, str]] = {}
         self._materials: dict[str, _Clear | None] = {}
         self._images: dict[tuple, np.ndarray] = {}
         # Kinds of what is not as in Cycles, with names.
@@ -64,7 +66,7 @@ class _Collector:
             ob = instance.object
             if ob.type not in SURFACE_TYPES or ob.original.name_full in self._left_out:
                 continue
-            if not (ob.visible_shadow and owner_of(instance).visible_shadow):
+            if not self._casts_shadow(instance):
                 continue
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
@@ -81,6 +83,18 @@ class _Collector:
                 f"{MOST_BLOCKER_SETS} blocker collections are not told apart"
             )
         return self._joined()
+
+    def _casts_shadow(self, instance) -> bool:
+        ob, owner = instance.object, owner_of(instance)
+        shadow, diffuse, glossy = (
+            getattr(ob, name) and getattr(owner, name)
+            for name in ("visible_shadow", "visible_diffuse", "visible_glossy")
+        )
+        if not shadow and (diffuse or glossy):
+            self._note("hidden from shadow rays alone: in Cycles it still blocks light that surfaces choose", ob)
+        elif shadow and not (diffuse and glossy):
+            self._note("hidden from diffuse or glossy rays: in Cycles light that surfaces choose passes it", ob)
+        return shadow
 
     def _joined(self) -> Occluders:
         counts = [len(matrices) for _, matrices, _, _ in self._instances]
@@ -106,6 +120,17 @@ class _Collector:
         mask = self._blockers.mask_of(instance)
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
         self._instances += [(number, (matrix @ places)[:, :3], mask, terminator) for number in numbers]
+        # Metaballs are told twice.
+        if places is AS_IT_IS and instance.object.type != "META":
+            for number in numbers:
+                self._look_for_twins(number, matrix, instance.object)
+
+    def _look_for_twins(self, number, matrix, ob):
+        """Note a mesh of an object that is where another one is."""
+        mesh, own = self._meshes[number], (number, ob.original.name)
+        first = self._there.setdefault((len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), own)
+        if first is not own and _is_same(mesh, self._meshes[first[0]]):
+            self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
 
     # -- surfaces --
 
@@ -207,6 +232,12 @@ class _Collector:
             meshes = [_tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
             # Particles are in world space.
             self._place(instance, np.eye(4), self._number(meshes))
+
+
+def _is_same(mesh, other):
+    return mesh is other or all(
+        np.array_equal(getattr(mesh, name), getattr(other, name)) for name in ("vertices", "triangles")
+    )
 
 
 # -- what materials let through ------------------------------------------------------------------------------------

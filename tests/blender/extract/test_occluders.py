@@ -42,6 +42,12 @@ def hidden(ob):
     return ob
 
 
+def invisible(ob):
+    """`ob`, which no ray meets that looks for light."""
+    ob.visible_shadow = ob.visible_diffuse = ob.visible_glossy = False
+    return ob
+
+
 def floor_points():
     """Centers (N, 3) of the pixels on the floor, row 0 on top."""
     width, height = SIZE
@@ -233,7 +239,7 @@ INSTANCES = ("collection_instances", "vertex_instances", "shared_data", "generat
 def test_shadows_of_shapes_are_those_of_cycles(tmp_path, name):
     start()
     SHAPES[name]()
-    occluders = assert_as_cycles(tmp_path)
+    occluders = assert_as_cycles(tmp_path, "passes it" if name == "not_in_the_picture" else "")
     if name in INSTANCES:
         assert len(occluders.meshes) == 2 and len(occluders.mesh) > 2  # the floor is one
 
@@ -242,14 +248,14 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
     start()
     for ob, name in ((cube((-1, 0, 1)), "A"), (cube((1, 0, 1)), "B"), (cube((0, 0, 1)), "C")):
         ob.name = name
-    bpy.data.objects["A"].visible_shadow = False
+    invisible(bpy.data.objects["A"])
     bpy.data.objects["B"].hide_render = True
     bpy.data.objects["C"].data.materials.append(scene_parts.bsdf_material("ShaderNodeBsdfTransparent", "Clear")[0])
     volume = Build("Mist")
     volume.link(volume.shader("VolumePrincipled", Density=0.0), volume.output.inputs["Volume"])
     cube((0, 0, 2), material=volume.material)
     parent = hidden(scene_parts.add_plane(size=1.0, name="Parent", location=(0.0, 0.0, 1.0)))
-    parent.instance_type, parent.visible_shadow = "VERTS", False
+    invisible(parent).instance_type = "VERTS"
     cube((0.0, 0.0, 0.0), 0.5).parent = parent
     assert seen_by_cycles(tmp_path) == pytest.approx(1.0, abs=2e-3)
     occluders, warnings = scene_parts.collected_occluders()
@@ -409,6 +415,10 @@ NAMED = {
     "colored": "by its mean",
     "color under alpha": "only Cycles knows",
     "displaced": "displacement",
+    "hidden from shadow rays": "still blocks light that surfaces choose",
+    "hidden from reflections": "light that surfaces choose passes it",
+    "in the same place": "in the same place as 'Pane'",
+    "instance in the same place": "in the same place as 'Pane'",
 }
 
 
@@ -426,6 +436,19 @@ def test_what_is_not_as_in_cycles_is_named(name):
     elif name == "color under alpha":
         pane(shown(mixed_by_image))
         bpy.data.images["Mask"].alpha_mode = "STRAIGHT"
+    elif name.startswith("hidden"):
+        ob = pane(scene_parts.principled("Pane")[0])
+        ob.name, ob.visible_shadow, ob.visible_glossy = (
+            "Pane",
+            name.endswith("reflections"),
+            name.endswith("shadow rays"),
+        )
+    elif name.endswith("same place"):
+        ob = pane(scene_parts.principled("Material")[0])
+        ob.name = "Pane"
+        twin = ob.copy()
+        twin.data = ob.data if name.startswith("instance") else ob.data.copy()
+        scene_parts.link(twin, ob.location)
     else:
         made = Build("Pane")
         made.show(made.leaf(0.5))
@@ -435,7 +458,7 @@ def test_what_is_not_as_in_cycles_is_named(name):
         pane(made.material)
     occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
-    share = 0.5 if name == "colored" else 0.0
+    share = {"colored": 0.5, "hidden from shadow rays": 1.0}.get(name, 0.0)
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 

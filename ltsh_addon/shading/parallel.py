@@ -18,7 +18,8 @@ import tempfile
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -229,12 +230,19 @@ def run(
     thread; where it returns False Cancelled is raised. No child is left when this returns or raises.
     """
     queue = _Queue(blocks, result)
-    children = []
-    try:
+    with helpers(queue) as children:
         for _ in range(_children_wanted(task, len(samples), blocks, workers)):
             most = max(2 * FLOAT64_CHUNK if task.single else 0, *map(_size, blocks))
             children.append(_Shader(task, samples, queue, most))
         _work(task, samples, queue, progress)
+
+
+@contextmanager
+def helpers(queue) -> Iterator[list[Child]]:
+    """A list for children that work for `queue`, which are ended in any case."""
+    children: list[Child] = []
+    try:
+        yield children
     finally:
         queue.stop()
         for child in children:

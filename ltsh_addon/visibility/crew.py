@@ -49,8 +49,9 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
     if parallel.interpreter() is None or getattr(tracer, "library", None) is None:
         wanted = 0
     queue = _Queue(blocks)
-    children = [_Tracing(Errand(task, tracer.occluders, tracer.library), queue) for _ in range(wanted)]
-    try:
+    with parallel.helpers(queue) as children:
+        for _ in range(wanted):
+            children.append(_Tracing(Errand(task, tracer.occluders, tracer.library), queue))
         yielded = 0
         while yielded < len(blocks):
             if progress is not None and progress(_STAGE, yielded / len(blocks)) is False:
@@ -61,10 +62,6 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
             for found in queue.found(wait=number is None):
                 yield found
                 yielded += 1
-    finally:
-        queue.stop()
-        for child in children:
-            child.end()
 
 
 class _Queue:

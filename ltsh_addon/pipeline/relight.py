@@ -9,12 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..scene import AreaLight, Progress, listed
+from ..scene import AreaLight, Progress, SurfaceSamples, listed
 from . import picture
 from .lighting import KEPT_SUFFIX, KeptPicture
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
+KEPT_WEIGHTS = (
+    "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
+    "render the picture again for the last digits there"
+)
 
 
 @dataclass(frozen=True)
@@ -50,12 +54,23 @@ def _relit(path: Path, place: Path, changes, output: Path, progress) -> dict:
     options = PictureOptions(output=output, name=name, **kept.options)
     tables = picture.prepare(options)
     warnings = kept.extraction.warnings + ((NO_CYCLES,) if kept.had_cycles else ())
+    if split := _split_at_horizons(kept.extraction.samples):
+        warnings += (KEPT_WEIGHTS.format(split, len(kept.extraction.samples)),)
     extraction = replace(kept.extraction, lights=lights, warnings=warnings)
     results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
     comparison = picture.Comparison(options, extraction, results, kept.shadows)
     changed = [{"light": change.name, "power": change.power, "color": change.color} for change in changes]
     report = {**comparison.report(), "relit": changed}
     return {"files": comparison.write(output, report, False, progress), **report}
+
+
+def _split_at_horizons(samples: SurfaceSamples) -> int:
+    """How many samples are the second part of what `cycles.horizons` has split by the chances of the lights."""
+    same = [
+        (getattr(samples, name)[1:] == getattr(samples, name)[:-1]).all(axis=1)
+        for name in ("position", "normal", "smooth_normal", "geometric_normal")
+    ]
+    return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
 def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:

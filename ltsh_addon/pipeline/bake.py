@@ -264,8 +264,7 @@ class ObjectBaker:
         """Names of the channels of the EXR but for the coverage."""
         layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
         if len(self.groups) > 1:
-            names = [group or "ungrouped" for group in self.groups]
-            layers += [f"{layer}@{group}" for layer in layers for group in names]
+            layers += [f"{layer}@{group}" for layer in layers for group in lighting.group_names(self.groups)]
         for pass_name in self.compared:
             layers += [f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")]
             layers += [f"error_{name}.{pass_name}" for name in self.tables]
@@ -295,8 +294,8 @@ class ObjectBaker:
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
                 if len(self.groups) > 1:
-                    for group, part in zip(self.groups, radiance, strict=True):
-                        layers[f"{name}.{pass_name}@{group or 'ungrouped'}"] = part
+                    for group, part in zip(lighting.group_names(self.groups), radiance, strict=True):
+                        layers[f"{name}.{pass_name}@{group}"] = part
         return layers if weights is None else {name: values * weights[:, None] for name, values in layers.items()}
 
     def _add_cycles(self, layers, tile, first, texels) -> dict[str, np.ndarray]:
@@ -324,14 +323,14 @@ class ObjectBaker:
         wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
         workers = 1 if self._threads() > 1 else None
         if wanted:
-            shaded = lighting.shade_lights(samples, self.lights, table, wanted, shares, workers=workers).shading
+            shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shares,), workers=workers)[0]
             found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
         if "diffuse_light" in self.options.passes:
             first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
             white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
             seen = None if shares is None else {"diffuse": shares["diffuse"][:, first]}
-            lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), seen, workers=workers)
-            found["diffuse_light"] = _summed(lit.shading.diffuse, texel[first], count)
+            lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), (seen,), workers=workers)[0]
+            found["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
         if "combined" in self.options.passes:
             found["combined"] = found["specular"] + found["diffuse"]
         return {name: found[name] for name in self.options.passes}

@@ -5,11 +5,12 @@ radiance = closed form x the share of the light that the sample sees. The shares
 
 from __future__ import annotations
 
+import itertools
 import json
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -114,32 +115,24 @@ def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progre
         return tracer.trace(extraction.samples, passes, rays, film=extraction.film, progress=progress)
 
 
-@dataclass(frozen=True)
-class Lit:
-    """Radiance of one technique with shadows, and without where there are any."""
-
-    shading: shading.Shading
-    unshadowed: shading.Shading | None = None
-
-
 def shade_lights(
     samples: SurfaceSamples,
     lights: Sequence[AreaLight],
     table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
-    shares: dict[str, np.ndarray] | None = None,
+    seen: Sequence[dict[str, np.ndarray] | None] = (None,),
     *,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
-) -> Lit:
-    """Radiance of `samples` (P) under `lights` (L), of which they see `shares` (L, P) by pass; None: everything.
+) -> list[shading.Shading]:
+    """Radiance of `samples` (P) under `lights` (L), one for each of `seen`: shares (L, P) by pass of the lights that
+    the samples see; None: everything.
 
     Light by light, so that a sample that sees all of its lights gets the same bits as without shadows.
     """
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     shape = len(groups), len(samples), 3
-    plain = {name: np.zeros(shape, np.float32) for name in passes}
-    seen = {name: np.zeros(shape, np.float32) for name in passes} if shares is not None else {}
+    sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
     for first in range(0, len(lights), most):
         part = lights[first : first + most]
@@ -156,15 +149,28 @@ def shade_lights(
             group = groups.index(light.group)
             for name in passes:
                 radiance = getattr(found, name)[number]
-                plain[name][group] += radiance
-                if shares is not None:
-                    seen[name][group] += shares[name][first + number][:, None] * radiance
-    unshadowed = _shading(groups, plain, error)
-    return Lit(unshadowed) if shares is None else Lit(_shading(groups, seen, error), unshadowed)
+                for whole, shares in zip(sums, seen, strict=True):
+                    is_all = shares is None
+                    whole[name][group] += radiance if is_all else shares[name][first + number][:, None] * radiance
+    return [shading.Shading(groups, whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
 
 
-def _shading(groups, radiance, error) -> shading.Shading:
-    return shading.Shading(groups, radiance.get("specular"), radiance.get("diffuse"), error)
+def layer_names(names: Iterable[str]) -> list[str]:
+    """Different names for layers, without the dots that separate their parts."""
+    found: list[str] = []
+    for name in names:
+        plain = name.replace(".", "_")
+        others = (f"{plain}_{number}" for number in itertools.count(2))
+        found.append(next(other for other in itertools.chain([plain], others) if other not in found))
+    return found
+
+
+def group_names(groups: Sequence[str]) -> list[str]:
+    """Names of light groups for layers; lights without a group get one that no group has."""
+    ungrouped = "ungrouped"
+    while ungrouped in groups:
+        ungrouped += "_"
+    return layer_names(group or ungrouped for group in groups)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import platform
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -203,7 +203,8 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
         samples = samples.take(subset)
     shares = None if shadows is None else shadows.shares_of(subset)
 
-    lit, seconds = {}, {}
+    wanted = (None,) if shadows is None else (shares, None)
+    lit, seconds = [{} for _ in wanted], {}
     for index, pass_name in enumerate(options.passes):
 
         def report(fraction, done=index):
@@ -213,11 +214,12 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
         if report(0.0) is False:
             raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
         start = time.perf_counter()
-        lit[pass_name] = lighting.shade_lights(samples, extraction.lights, table, (pass_name,), shares, progress=report)
+        found = lighting.shade_lights(samples, extraction.lights, table, (pass_name,), wanted, progress=report)
+        for of_pass, shaded in zip(lit, found, strict=True):
+            of_pass[pass_name] = shaded
         seconds[pass_name] = time.perf_counter() - start
-    shaded = _joined({pass_name: found.shading for pass_name, found in lit.items()})
-    unshadowed = {pass_name: found.unshadowed for pass_name, found in lit.items()}
-    return Result(shaded, seconds, subset, None if shadows is None else _joined(unshadowed))
+    shaded, *unshadowed = map(_joined, lit)
+    return Result(shaded, seconds, subset, *unshadowed)
 
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
@@ -422,7 +424,7 @@ class Comparison:
             result = self.results[name]
             groups = result.shading.groups
             if len(groups) > 1:
-                for group, values in zip(_group_names(groups), self._radiance(result, pass_name), strict=True):
+                for group, values in zip(lighting.group_names(groups), self._radiance(result, pass_name), strict=True):
                     layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)
             if result.unshadowed is not None:
                 values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
@@ -456,7 +458,7 @@ class Comparison:
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)
         for pass_name in self.options.passes:
-            names = layer_names(light.name for light in lights)
+            names = lighting.layer_names(light.name for light in lights)
             for name, share in zip(names, shadows.shares[pass_name], strict=True):
                 found[f"visibility.{pass_name}@{name}"] = imaging.Layer(film.image(share[first]) + nothing, "V")
         return found
@@ -510,24 +512,6 @@ def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:
     statistics, mean = imaging.noisy_error_statistics(image, *halves, mask), halves.mean(axis=0)
     shaded = np.where(mask[..., None], image, mean)
     return {**statistics.to_dict(), "flip": imaging.mean_flip(rec709(mean), rec709(shaded), mask)}
-
-
-def _group_names(groups) -> list[str]:
-    """Names of the light groups for layers; lights without a group get one that no group has."""
-    ungrouped = "ungrouped"
-    while ungrouped in groups:
-        ungrouped += "_"
-    return [group or ungrouped for group in groups]
-
-
-def layer_names(names: Iterable[str]) -> list[str]:
-    """Different names for layers, without the dots that separate their parts."""
-    found: list[str] = []
-    for name in names:
-        plain = name.replace(".", "_")
-        others = (f"{plain}_{number}" for number in itertools.count(2))
-        found.append(next(other for other in itertools.chain([plain], others) if other not in found))
-    return found
 
 
 def _light_report(light) -> dict:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline import PictureOptions, compare_scene, picture, shade_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene, lighting, picture, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
@@ -38,7 +38,7 @@ def test_compare_leaves_its_five_files_and_the_layers_of_the_design(child, tmp_p
         expected |= {f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")}
         for name in TECHNIQUES:
             expected |= {f"{name}.{pass_name}", f"error_{name}.{pass_name}"}
-            expected |= {f"{name}.{pass_name}@{group}" for group in ("Key", "Fill.001", "ungrouped")}
+            expected |= {f"{name}.{pass_name}@{group}" for group in ("Key", "Fill_001", "ungrouped")}
     assert set(layers) == expected
     channels = imaging.read_channels(folder / "compare.exr")
     assert {"ltsh4.specular.R", "error_ltsh4.specular.B", "samples.position.X", "coverage.hit.V"} <= set(channels)
@@ -48,6 +48,12 @@ def test_compare_leaves_its_five_files_and_the_layers_of_the_design(child, tmp_p
     assert names == {"compare.exr", "compare.png", "report.html", "report.json", "timing.json"}
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "ltsh4" in page and "&#x27;Glass&#x27;" in page
+
+
+def test_layers_of_groups_have_names_of_their_own_without_dots():
+    """Blender and compositors take what stands before a dot for the name of a layer."""
+    found = lighting.group_names(["Key.001", "", "Key_001", "ungrouped"])
+    assert found == ["Key_001", "ungrouped_", "Key_001_2", "ungrouped"]
 
 
 def test_a_group_named_ungrouped_and_lights_without_one_are_both_there_and_one_group_is_none(monkeypatch, tmp_path):
@@ -83,7 +89,7 @@ def test_images_are_what_shade_gives_and_light_groups_add_up(child, tmp_path):
         for pass_name in ("specular", "diffuse"):
             image = layers[f"{name}.{pass_name}"]
             assert np.allclose(image, film.image(getattr(shaded, pass_name).sum(axis=0)), rtol=FLOAT32, atol=0.0)
-            groups = [layers[f"{name}.{pass_name}@{group}"] for group in ("Key", "Fill.001", "ungrouped")]
+            groups = [layers[f"{name}.{pass_name}@{group}"] for group in ("Key", "Fill_001", "ungrouped")]
             assert np.allclose(sum(groups), image, rtol=FLOAT32, atol=0.0) and all(part.any() for part in groups)
     assert not layers["ltc.specular"][0].any() and not layers["coverage.hit"][0].any()
     assert layers["coverage.hit"][1, 0] == 0.5 and (layers["coverage.hit"][2:] == 1.0).all()

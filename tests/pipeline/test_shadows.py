@@ -96,10 +96,29 @@ def test_a_picture_lit_anew_keeps_its_shadows(capsys, monkeypatch, room, out):
         layer, _, channel = name.rpartition(".")
         if layer not in ("ltsh4.specular", "ltsh4.diffuse", "reference.specular"):
             continue
-        groups = (first[f"{layer}@{group}.{channel}"] for group in ("Key", "Fill.001", "ungrouped"))
+        groups = (first[f"{layer}@{group}.{channel}"] for group in ("Key", "Fill_001", "ungrouped"))
         expected = sum(factor["RGB".index(channel)] * part for factor, part in zip(factors, groups, strict=True))
         np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-9, err_msg=name)
     assert all(np.array_equal(found[name], first[name]) for name in parts(first, "visibility."))
+
+
+def test_weights_that_hang_on_the_former_lights_are_named(capsys, monkeypatch, room, out):
+    fake = fake_scene.FakeChild()
+
+    def split(options, *, progress=None):
+        """The first three samples become two each, as where two horizons are apart."""
+        found = fake.extract(options, progress=progress)
+        index = np.sort(np.concatenate([np.arange(len(found.samples)), np.arange(3)]))
+        first = np.diff(index, prepend=-1) > 0
+        samples, film = found.samples.take(index), replace(found.film.take(index), first=first)
+        normal = np.where(first[:, None], samples.geometric_normal, samples.geometric_normal[:, [1, 2, 0]])
+        return replace(found, samples=replace(samples, geometric_normal=normal), film=film)
+
+    fake.install(monkeypatch)
+    monkeypatch.setattr(fake_scene.client, "extract", split)
+    assert run(capsys, "shade", room, "-o", out, *ARGUMENTS, "--keep-visibility")[0] == 0
+    _, stdout, _ = run(capsys, "relight", out, "--light", "Light 2", "--power", "x2", "--json", "--quiet")
+    assert any(line.startswith("3 of ") and "weigh both" in line for line in json.loads(stdout)["warnings"])
 
 
 def test_cycles_picture_of_the_former_lights_is_left_out_with_a_word(capsys, monkeypatch, room, out):

@@ -234,15 +234,15 @@ def _images(extraction, technique: str, shares, progress: Progress) -> dict[str,
     images = {}
     for index, name in enumerate(PASSES):
         part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
-        lit = shade_lights(
+        (lit,) = shade_lights(
             extraction.samples,
             extraction.lights,
             technique,
             (name,),
-            shares,
+            (shares,),
             progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
         )
-        image = extraction.film.image(extraction.exposure * lit.shading.combined)
+        image = extraction.film.image(extraction.exposure * lit.combined)
         images[name] = inside_border(image, extraction.border)
     return images
 

@@ -73,7 +73,7 @@ VIEW = """Draw what the camera sees as the viewport does, in a fraction of the t
 takes. Needs OpenGL or Vulkan, with a graphics card or without. OUT gets view.exr, with
 a layer for each technique, combined and by pass, view.png, which shows the first
 technique through the scene's view transform, and report.json. --json also tells draw_s,
-the median seconds of a redraw, and refined_s, the seconds of the N redraws of --refine."""
+the median seconds of a redraw, and refined_s, those of N redraws with all shadow rays."""
 VIEW_EXAMPLES = """examples:
   %(prog)s room.blend -o out/draft --resolution 480x270 --refine 1
   %(prog)s room.blend -o out/playblast --frames 1-240 --resume

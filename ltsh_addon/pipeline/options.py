@@ -422,6 +422,7 @@ class ViewOptions:
         help="mean of N pictures, each of other points of the pixels; 1: pixel centers (default: %(default)s)",
     )  # fmt: skip
     shadows: str = _shadows()
+    shadow_rays: int = _shadow_rays()
     scripts: bool = _scripts()
 
 

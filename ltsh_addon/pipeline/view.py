@@ -15,7 +15,6 @@ from ..scene import SHIPPED_TABLES, VERSION, Cancelled, Progress
 from . import picture
 from .options import ViewOptions, child_job
 
-NO_SHADOWS = "shadows are not drawn in views yet: light goes through surfaces"
 # Of a report, with the seconds of a task: its own names for them.
 TIMES = {"draw_s": "draw", "refined_s": "refined"}
 
@@ -23,7 +22,8 @@ TIMES = {"draw_s": "draw", "refined_s": "refined"}
 def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture.TaskResult:
     """Draw a scene as the viewport does and write its EXR and PNG.
 
-    The seconds have "draw", the median of a redraw with the first technique, and "refined", of all its redraws.
+    The seconds have "draw", the median of a redraw with the first technique and without rays, "shadows", of all rays,
+    and "refined", of as many redraws as are asked for and of the rays.
     Raises SceneError, TableError, OSError, Cancelled.
     """
     from ..blender.process import client
@@ -61,12 +61,14 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture
     }
     imaging.write_layers(path, layers, metadata, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
-    redraws = dict(zip(tables, manifest["redraws"], strict=True))
+    redraws = {name: statistics.median(times) for name, times in zip(tables, manifest["redraws"], strict=True)}
+    draw, shadows = next(iter(redraws.values())), (manifest["shadows"] or {"seconds": 0.0})["seconds"]
     seconds = {
-        "start": manifest["start"],
-        "draw": statistics.median(redraws[next(iter(tables))]),
-        "refined": sum(redraws[next(iter(tables))][: options.refine]),
-        "techniques": {name: {"redraw": statistics.median(times)} for name, times in redraws.items()},
+        "blender": manifest["seconds"],
+        "draw": draw,
+        "shadows": shadows,
+        "refined": draw * options.refine + shadows,
+        "techniques": {name: {"redraw": median} for name, median in redraws.items()},
         "total": time.perf_counter() - start,
     }
     return picture.TaskResult(report, seconds, (f"{name}.exr", f"{name}.png"))
@@ -91,13 +93,18 @@ def _report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) 
         "graphics": manifest["graphics"],
         "tables": dict(zip(tables, options.techniques, strict=True)),
         "reference": None,
-        "shadows": None,
+        "shadows": _shadow_facts(manifest["shadows"]),
         "passes": {
             name: {"techniques": {table: {} for table in tables}} for name in ("combined", "specular", "diffuse")
         },
         "problems": [],
-        "warnings": [*([NO_SHADOWS] if options.shadows == "on" else []), *manifest["warnings"]],
+        "warnings": manifest["warnings"],
     }
+
+
+def _shadow_facts(found: dict | None) -> dict | None:
+    """What a report tells of shadows."""
+    return None if found is None else {name: found[name] for name in ("rays", "noise", "tracer")}
 
 
 def with_times(report: dict, seconds: dict) -> dict:

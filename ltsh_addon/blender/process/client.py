@@ -267,6 +267,8 @@ class ViewJob:
     height: int | None
     frame: int | None
     camera: str | None
+    shadows: str  # "on" or "off"
+    shadow_rays: int  # of a light and a pixel
     scripts: bool = False  # run those of the file
 
 

@@ -164,6 +164,7 @@ class LightingPass:
             bumped=passes != "specular" and gbuffer.smooth_normal is not None,
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
+            shadowed=gbuffer.shares is not None,
         )
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)

@@ -14,8 +14,9 @@ from ..materials.values import Value
 from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
 from .shaders import glsl, pixel_shader
+from .shadows import ShadowRays
 from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import GBufferTextures, UploadedLights, upload_lights
+from .textures import GBufferTextures, UploadedLights, read_texture, upload_lights
 
 MODES = ("single", "split", "difference")
 # The lighting pass is fast for so many indices of refraction, and exact for all.
@@ -39,6 +40,7 @@ class ShownPicture:
     line_width: float = 1.0
     second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
     white: float = 1.0  # brightness of no difference, before the scene's own exposure
+    also: tuple[tuple[str, str], ...] = ()  # techniques and passes that are drawn beside, for `read`
 
 
 def _origin_of(lights, view: View) -> np.ndarray:
@@ -91,9 +93,11 @@ class ViewRenderer:
         self._lobe_horizons: HorizonPass | None = None
         self._gbuffer: GBufferTextures | None = None
         self._lit_gbuffer: GBufferTextures | None = None
+        self._smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None)
         self._still, self.samples = None, 0
+        self.shadows: ShadowRays | None = None
 
     def draw(
         self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer, points=CENTERS
@@ -104,19 +108,20 @@ class ViewRenderer:
         nothing changes, at one more with every call. The picture is their mean; `samples` is their number.
         """
         view = view.around(_origin_of(mirror.lights, view))
-        techniques = [shown.technique]
+        wanted = [(shown.technique, shown.passes)]
         if shown.mode != "single" and shown.second_picture is None:
-            techniques.append(shown.second_technique)
-        with_emission = shown.passes == "combined" and shown.second_picture is None
-        asked = techniques, shown.passes, with_emission
-        still = (mirror, mirror.lights), (mirror.surfaces_version, *_key(view, size), asked)
+            wanted.append((shown.second_technique, shown.passes))
+        pictures = len(wanted)
+        wanted += shown.also
+        asked = wanted, shown.second_picture is None
+        still = (mirror, mirror.lights, self.shadows), (mirror.surfaces_version, *_key(view, size), asked)
         if not _same(still, self._still):
             self.samples = 0
         if self.samples < len(points):
             self._still = None  # until all of the sample is there
             self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
             self._still, self.samples = still, self.samples + 1
-        pictures = [self._targets[number][0] for number in range(len(techniques))]
+        pictures = [self._targets[number][0] for number in range(pictures)]
         weights = [1.0 / self.samples] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
@@ -125,15 +130,16 @@ class ViewRenderer:
             background = mirror.background if shown.passes == "combined" else np.zeros(3)
             self._picture.draw(pictures, weights, size, shown, background)
 
-    def _draw_sample(self, mirror, view: View, size, techniques: list[str], passes: str, with_emission: bool) -> None:
-        """Add one point of every pixel to the targets of `techniques`, or replace what is there by the first."""
+    def _draw_sample(self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool) -> None:
+        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all."""
         surfaces_changed = self._draw_surfaces(mirror, view, size)
         lights_changed = self._upload_lights(mirror, view)
         if surfaces_changed or lights_changed or self._lit_gbuffer is None:
             self._choose_horizons(mirror, view)
-        buffers = self._light(techniques, mirror, view, size, passes)
-        for buffer in buffers if with_emission else ():
-            self._surfaces.add_emission(mirror.instances, view, size, buffer)
+        buffers = self._light(wanted, mirror, view, size)
+        for (_, passes), buffer in zip(wanted, buffers, strict=True):
+            if with_emission and passes == "combined":
+                self._surfaces.add_emission(mirror.instances, view, size, buffer)
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
         """Draw the G-buffer if anything has changed, and tell that."""
@@ -165,21 +171,25 @@ class ViewRenderer:
         self._lit_gbuffer = self._with_horizons(self._gbuffer, self._horizons, mirror, view)
 
     def _with_horizons(self, gbuffer, horizons, mirror, view: View) -> GBufferTextures:
+        self._smooth_normal = gbuffer.smooth_normal
         if gbuffer.geometric_normal is None:
             return gbuffer
         horizon = horizons.draw(gbuffer, self._lights, view.homogeneous_eye)
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
-    def _light(self, techniques: list[str], mirror, view: View, size, passes: str) -> list:
-        """The buffers that `techniques` are drawn into; the surfaces of a further lobe are drawn once for all."""
-        lightings = [self._lighting_of(technique, mirror) for technique in techniques]
-        buffers = [self._target(number, size) for number in range(len(techniques))]
+    def _light(self, wanted: list[tuple[str, str]], mirror, view: View, size) -> list:
+        """The buffers that techniques and passes are drawn into; surfaces and shadows of a lobe are those of all."""
+        lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
+        buffers = [self._target(number, size) for number in range(len(wanted))]
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
         for number in range(max(mirror.most_lobes, 1)):
             gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
+            if self.shadows is not None:
+                whole = replace(gbuffer, smooth_normal=self._smooth_normal)
+                gbuffer = replace(gbuffer, shares=self.shadows.shares(whole, view, self._lights.lights))
             first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
-            for lighting, buffer in zip(lightings, buffers, strict=True):
+            for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
         return buffers
 
@@ -207,7 +217,7 @@ class ViewRenderer:
         return self._targets[number][1]
 
     def read(self, number: int = 0) -> np.ndarray:
-        """The last picture (H, W, 4) of the first technique or the second, row 0 at the bottom."""
+        """The last picture (H, W, 4) of the first technique, the second, or one beside; row 0 at the bottom."""
         return read_texture(self._targets[number][0]) / np.float32(self.samples)
 
     def free(self) -> None:
@@ -220,7 +230,9 @@ class ViewRenderer:
         for horizons in (self._horizons, self._lobe_horizons):
             if horizons is not None:
                 horizons.free()
-        self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = self._lobe_horizons = None
+        self._smooth_normal = self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = (
+            self._lobe_horizons
+        ) = None
         self._drawn, self._uploaded = None, (None, None)
         self._still, self.samples = None, 0
 
@@ -232,13 +244,6 @@ def _key(view: View, size) -> tuple:
 def _same(new, old) -> bool:
     """Do two states have the same things of the scene, their first part, and equal values, their second one?"""
     return old is not None and new[1] == old[1] and all(a is b for a, b in zip(new[0], old[0], strict=True))
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
-    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
-    buffer = texture.read()
-    buffer.dimensions = texture.width * texture.height * 4
-    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

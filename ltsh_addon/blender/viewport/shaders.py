@@ -48,7 +48,7 @@ def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, s
     for name, kind in constants.items():
         info.push_constant(kind, name)
     for slot, name in enumerate(samplers):
-        info.sampler(slot, "FLOAT_2D_ARRAY" if name == "table" else "FLOAT_2D", name)
+        info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "shares") else "FLOAT_2D", name)
     info.vertex_source(glsl("triangle"))
     info.fragment_source(source)
     shader = gpu.shader.create_from_info(info)
@@ -65,6 +65,7 @@ class Features:
     bumped: bool  # a horizon of its own for the diffuse lobe
     focused: bool = False  # lights with a spread or a falloff
     turned: bool = False  # a diffuse normal of its own
+    shadowed: bool = False  # a share of each light that is seen
 
     @property
     def samplers(self) -> tuple[str, ...]:
@@ -78,6 +79,8 @@ class Features:
             names.append("diffuse_normals")
         if self.bumped:
             names.append("smooth_normals")
+        if self.shadowed:
+            names.append("shares")
         return tuple(names)
 
 

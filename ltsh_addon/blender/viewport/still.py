@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -13,15 +14,20 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line
 from .. import render_settings
+from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
 from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
 from .mirror import SceneMirror
-from .renderer import CENTERS, ShownPicture, ViewRenderer, read_texture
+from .renderer import CENTERS, ShownPicture, ViewRenderer
+from .shadows import ShadowRays, too_many
 from .surfaces import View
+from .textures import read_texture
 
-# Redraws of which the median is told, at least.
+# Redraws of which the median is told.
 TIMED = 3
+# Of a light and one point of a pixel, however many it has.
+FEWEST_RAYS = 8
 # Where scripts may always use graphics, its compiled shaders serve the next picture.
 _renderer: list[ViewRenderer] = []
 
@@ -38,11 +44,10 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
     warnings += _not_shown(scene, camera)
     progress(GRAPHICS, 0.0)
     drawn = with_graphics(lambda: _draw(job, scene, camera, size, progress))
-    for number, pictures in enumerate(drawn["pictures"]):
-        for name, pixels in pictures.items():
-            save_array(folder / f"{number}_{name}.npy", pixels)
-    _save_png(scene, drawn["pictures"][0]["combined"], folder / VIEW_PNG)
-    seconds = drawn["seconds"]
+    for number, pixels in enumerate(drawn["pictures"]):
+        technique, index = divmod(number, len(VIEW_PASSES))
+        save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
+    _save_png(scene, drawn["pictures"][0], folder / VIEW_PNG)
     return {
         "blender_version": bpy.app.version_string,
         "graphics": drawn["graphics"],
@@ -56,8 +61,9 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
         "color_space": render_settings.working_space(),
         "lights": drawn["lights"],
         "warnings": [*warnings, *drawn["notes"]],
-        "redraws": seconds,
-        "start": time.monotonic() - started - sum(map(sum, seconds)),
+        "redraws": drawn["seconds"],
+        "shadows": drawn["shadows"],
+        "seconds": time.monotonic() - started,
     }
 
 
@@ -121,7 +127,7 @@ def _not_shown(scene, camera) -> list[str]:
 
 
 def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
-    """Pictures (H, W, 4), row 0 on top, by pass for every technique, seconds of redraws, lights and notes."""
+    """Pictures (H, W, 4), row 0 on top, of every technique by pass, seconds of redraws, shadows, lights and notes."""
     progress("draw", 0.0)
     layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
     with bpy.context.temp_override(scene=scene, view_layer=layer):
@@ -130,35 +136,38 @@ def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
     mirror.sync(depsgraph)
     if not mirror.lights:
         raise no_light(scene, mirror.notes)
+    notes, shadows = list(mirror.notes), None
+    if job["shadows"] == "on":
+        problem = too_many(len(mirror.lights), size)
+        override = depsgraph.view_layer_eval.material_override
+        rays = max(FEWEST_RAYS, job["shadow_rays"] // job["refine"])
+        shadows = None if problem else ShadowRays(collect_occluders(depsgraph, override, notes.append), rays)
+        notes += [problem] if problem else []
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
     points = render_settings.sub_pixel_offsets(scene, job["refine"])
-    pictures, seconds = [], []
-    parts = len(job["techniques"]) * len(VIEW_PASSES)
+    first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)
     try:
-        for technique in job["techniques"]:
-            pictures.append({})
-            for name in VIEW_PASSES:
-                done = sum(map(len, pictures)) / parts
-                shown = _shown(scene, technique, name)
-
-                def report(share, done=done):
-                    progress("draw", done + share / parts)
-
-                pictures[-1][name], times = canvas.draw(shown, points, report)
-                if name == "combined":
-                    seconds.append(times)
+        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job["techniques"]]
+        shown = replace(_shown(scene, first[0]), also=tuple(others))
+        pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take
         raise SceneError(error_line(error)) from error
     finally:
         canvas.free()
-    lights = [light.record() for light in mirror.lights]
     return {
         "pictures": pictures,
         "seconds": seconds,
-        "lights": sorted({light["name"] for light in lights}),
-        "notes": mirror.notes,
+        "shadows": None if shadows is None else _facts(shadows, len(points)),
+        "lights": sorted({light.name for light in mirror.lights}),
+        "notes": notes,
         "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
     }
+
+
+def _facts(shadows: ShadowRays, samples: int) -> dict:
+    """As `pipeline.lighting.Shadows.report` has them, and the seconds."""
+    noise = shadows.noise(samples)
+    return {"rays": shadows.traced, "noise": noise, "tracer": shadows.description, "seconds": shadows.seconds}
 
 
 def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
@@ -169,16 +178,16 @@ def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
     return View.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
 
 
-def _shown(scene, technique: str, passes: str) -> ShownPicture:
+def _shown(scene, technique: str) -> ShownPicture:
     return ShownPicture(
         technique=technique,
-        passes=passes,
+        passes="combined",
         mode="single",
         second_technique=technique,
         split=0.5,
         difference_scale=1.0,
         exposure=cycles_setting(scene, "film_exposure"),
-        transparent=scene.render.film_transparent or passes != "combined",
+        transparent=scene.render.film_transparent,
     )
 
 
@@ -191,26 +200,39 @@ class _Canvas:
         self._texture = gpu.types.GPUTexture(size, format="RGBA32F")
         self._buffer = gpu.types.GPUFrameBuffer(color_slots=[self._texture])
 
-    def draw(self, shown: ShownPicture, points: np.ndarray, progress: Callable) -> tuple[np.ndarray, list[float]]:
-        """The mean (H, W, 4) of `points` as of a view at rest, row 0 on top, and the seconds of redraws, those of
-        `points` first."""
-        # The first picture of all compiles shaders.
-        self._redraw(shown, self._view.shifted((1.0, 0.0), self._size), CENTERS)
+    def seconds_of_redraws(self, shown: ShownPicture) -> list[float]:
+        """The seconds of `TIMED` redraws of a view that moves, after one that compiles shaders."""
         seconds = []
-        for number in range(len(points)):
-            progress(number / len(points))
-            seconds.append(self._redraw(shown, self._view, points))
-        picture = read_texture(self._texture)[::-1]
-        for number in range(TIMED - len(points) if shown.passes == "combined" else 0):
-            seconds.append(self._redraw(shown, self._view.shifted((0.0, 1.0 + number), self._size), CENTERS))
-        return picture, seconds
+        for number in range(TIMED + 1):
+            start = time.perf_counter()
+            self._redraw(shown, self._view.shifted((0.0, 1.0 + number), self._size), CENTERS)
+            seconds.append(time.perf_counter() - start)
+        return seconds[1:]
 
-    def _redraw(self, shown, view, points) -> float:
-        """Draw once more; the seconds until the card has done it."""
-        start = time.perf_counter()
+    def draw(self, shown: ShownPicture, points: np.ndarray, shadows: ShadowRays | None, progress: Callable) -> list:
+        """The mean of `points` as of a view at rest: pictures (H, W, 4), row 0 on top, in the order of `shown`, times
+        the exposure. That of the first has the background, those of other techniques get it here."""
+        self._renderer.shadows = shadows
+        try:
+            for number in range(len(points)):
+                progress(number / len(points))
+                self._redraw(shown, self._view, points)
+        finally:
+            self._renderer.shadows = None
+        background = np.array([*shown.exposure * self._mirror.background, 1.0], np.float32)
+        pictures = [read_texture(self._texture)]
+        for number, (_, name) in enumerate(shown.also, 1):
+            lit = self._renderer.read(number)
+            lit[..., :3] *= np.float32(shown.exposure)
+            if name == "combined" and not shown.transparent:
+                lit += (1.0 - lit[..., 3:]) * background
+            pictures.append(lit)
+        return [picture[::-1] for picture in pictures]
+
+    def _redraw(self, shown, view, points) -> None:
+        """Draw once more, to the end of what the card does for it."""
         self._renderer.draw(self._mirror, view, self._size, shown, self._buffer, points)
         self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
-        return time.perf_counter() - start
 
     def free(self) -> None:
         """Let go of everything, but keep what the next canvas can use."""

@@ -28,7 +28,15 @@ SAMPLERS = {
     "geometric_normals": "geometric_normal",
     "diffuse_normals": "diffuse_normal",
     "smooth_normals": "smooth_normal",
+    "shares": "shares",
 }
+
+
+def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
+    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
+    buffer = texture.read()
+    buffer.dimensions = texture.width * texture.height * 4
+    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,7 @@ class GBufferTextures:
     geometric_normal: gpu.types.GPUTexture | None = None  # `normal`; w is not read
     diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
     smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
+    shares: gpu.types.GPUTexture | None = None  # 1; a layer per light: which share of it is seen, specular and diffuse
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:

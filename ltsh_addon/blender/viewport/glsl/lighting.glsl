@@ -41,6 +41,10 @@ void main()
         bool focused = false;
 #endif
         vec3 reflected = vec3(0.0);
+        vec2 seen = vec2(1.0);
+#ifdef LTSH_SHADOWED
+        seen = texelFetch(shares, ivec3(texel, i), 0).xy;
+#endif
 #ifdef LTSH_SPECULAR
         ltsh_light shining = ltsh_seen_light(header, point.position, weights.width);
         bool shines = received && glossy && (flags & LTSH_SPECULAR_FLAG) != 0;
@@ -58,7 +62,7 @@ void main()
 #endif
         values = specular_limited(values, point, shining, ltsh_light_texel(header + 6).z, profile);
 #endif
-        reflected += ltsh_reflected(point, values);
+        reflected += seen.x * ltsh_reflected(point, values);
 #endif
 #ifdef LTSH_DIFFUSE
         ltsh_light lighting = ltsh_seen_light(header, point.position, 1.0);
@@ -70,7 +74,7 @@ void main()
         lighting = ltsh_seen_light(header, point.position, 1.0);
         form_factor += diffuse_focused(matte, lighting, header, 1.0, lights_up && focused).x;
 #endif
-        reflected += form_factor * base.xyz;
+        reflected += seen.y * form_factor * base.xyz;
 #endif
         radiance += reflected * ltsh_light_texel(header + 4).xyz;
     }

@@ -271,7 +271,7 @@ def round_outline(count: int) -> np.ndarray:
 
 
 # Fields of SurfaceSamples with one number per sample; all others are vectors or colors.
-SCALAR_FIELDS = ("roughness", "ior", "bump_alpha2", "receiver")
+SCALAR_FIELDS = ("roughness", "ior", "bump_alpha2", "receiver", "diffuse_roughness", "sheen_a", "sheen_b")
 
 
 @dataclass(frozen=True)
@@ -285,7 +285,8 @@ class SurfaceSamples:
     away. As in Cycles the specular lobe ends at the horizons of both the shading and the geometric normal, and a
     bump-mapped diffuse lobe at the horizon of the smooth normal; toward that it is shadowed by
     2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)), theta_i the angle of the light from the smooth normal (Estevez,
-    Lecocq and Stein 2019).
+    Lecocq and Stein 2019). The diffuse lobe is Lambert's, but that of a rough surface where there is a
+    `diffuse_roughness`, and that of sheen where there is a `sheen_a` (see `shading.diffuse`).
     """
 
     position: np.ndarray  # (P, 3) m
@@ -302,6 +303,10 @@ class SurfaceSamples:
     smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
     bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
     specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0
+    diffuse_roughness: np.ndarray | None = None  # (P,) sigma of Oren and Nayar in [0, 1]; left out: 0
+    diffuse_rebound: np.ndarray | None = None  # (P, 3) multiple scattering of such a surface; left out: 0
+    sheen_a: np.ndarray | None = None  # (P,) left out, or 0: no sheen
+    sheen_b: np.ndarray | None = None  # (P,)
     receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; left out: 0
 
     def __post_init__(self):
@@ -311,6 +316,10 @@ class SurfaceSamples:
             "smooth_normal": self.diffuse_normal,
             "bump_alpha2": np.broadcast_to(0.0, (count,)),
             "specular_dip": np.broadcast_to(0.0, (count, 3)),
+            "diffuse_roughness": np.broadcast_to(0.0, (count,)),
+            "diffuse_rebound": np.broadcast_to(0.0, (count, 3)),
+            "sheen_a": np.broadcast_to(0.0, (count,)),
+            "sheen_b": np.broadcast_to(0.0, (count,)),
             "receiver": np.broadcast_to(0, (count,)),
         }
         for name, value in defaults.items():

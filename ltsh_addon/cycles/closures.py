@@ -95,20 +95,30 @@ def _masked(cosine, alpha):
     return 0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / cosine**2 - 1.0)) - 1.0)
 
 
-PATH = Path(__file__).with_name("sheen_albedos.npy")
+PATH = Path(__file__).with_name("sheen.npy")
 SHEEN_NODES = 32
 SMALLEST_ROUGHNESS = 1e-3
 
 
-def sheen_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Albedo (P,) of sheen of `roughness` (P,), as in Blender, seen under the cosine (P,) from the normal; within
-    1e-4 of Cycles 4.5 and 5.2."""
-    table = _table()
+def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Albedo, a and b (3, P) of sheen of `roughness` (P,), as in Blender, seen under the cosine (P,) from the normal.
+
+    The lobe times cosine is albedo z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2, z the normal and x the side of the
+    view: a linearly transformed cosine (Zeltner, Burley and Chiang 2022, "Practical multiple-scattering sheen using
+    linearly transformed cosines"). Albedos are within 1e-4 of Cycles 4.5 and 5.2, and so is the lobe.
+    """
+    tables = _sheen_tables()
     x, y = np.clip(cosine, 0.0, 1.0), np.clip(roughness, SMALLEST_ROUGHNESS, 1.0)
-    found = 0.0
+    found = np.zeros((3, len(x)))
     for index, weight in corners(x, y):
-        found = found + weight * table[index]
-    return np.maximum(found, 0.0)
+        found += weight * tables[:, index]
+    found[0] = np.maximum(found[0], 0.0)
+    return found
+
+
+def sheen_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """The albedo (P,) of `sheen_lobe`."""
+    return sheen_lobe(cosine, roughness)[0]
 
 
 def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
@@ -135,8 +145,8 @@ def corners(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]
 
 
 @cache
-def _table() -> np.ndarray:
-    return np.load(PATH).astype(np.float64).ravel()
+def _sheen_tables() -> np.ndarray:
+    return np.load(PATH).astype(np.float64).reshape(3, -1)
 
 
 @cache

@@ -8,8 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from ..scene import SurfaceSamples
+from ..shading import diffuse as rough_diffuse
 from . import closures
-from .closures import sheen_albedo, velvet_albedo
+from .closures import sheen_albedo, sheen_lobe, velvet_albedo
 from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal
 
 AOV_PREFIX = "ltsh_"
@@ -34,6 +35,7 @@ LOBE_AOVS = {
     "roughness": ("VALUE", None),
     "metallic": ("VALUE", 0.0),
     "ior": ("VALUE", 1.5),
+    "diffuse_roughness": ("VALUE", 0.0),
     "specular_level": ("VALUE", 0.5),
     "tint": ("COLOR", (1.0, 1.0, 1.0)),  # of conductors the extinction coefficient
     "multiple_scattering": ("VALUE", 0.0),  # 1 for Multiscatter GGX
@@ -201,6 +203,10 @@ class LobeSlot:
         return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
 
 
+# What of SurfaceSamples makes another diffuse lobe than Lambert's.
+DIFFUSE_SHAPE = ("diffuse_roughness", "diffuse_rebound", "sheen_a", "sheen_b")
+
+
 @dataclass
 class _Part:
     """Samples of one kind at the hits `index` (Q,); what is left out is zero or that of the hit."""
@@ -213,6 +219,7 @@ class _Part:
     specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, dip, dielectric
     diffuse: np.ndarray = field(default=None)  # (Q, 3) estimate of the diffuse albedo
     behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is that of the other side
+    shape: dict[str, np.ndarray] = field(default_factory=dict)  # those of DIFFUSE_SHAPE that are not 0
 
     def __post_init__(self):
         count = len(self.index)
@@ -251,6 +258,12 @@ def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]
     index, behind = index[order], joined["behind"]
     at_hit = hits.take(index)
     smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
+    shape = {}
+    for name in DIFFUSE_SHAPE:
+        if any(name in part.shape for part in parts):
+            width = (3,) if name == "diffuse_rebound" else ()
+            own = [part.shape.get(name, np.zeros((len(part.index), *width))) for part in parts]
+            shape[name] = np.concatenate(own)[order]
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -265,6 +278,7 @@ def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,
+        **shape,
         bump_alpha2=np.where(at_hit.corrected, bump_alpha2(joined["diffuse_normal"], smooth_normal), 0.0),
     )
     return samples, index
@@ -314,21 +328,31 @@ def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_P
 
 
 def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
-    """Take away from the slot's `own` parts what its sheen reflects, and let it reflect that as diffuse light."""
+    """Take away from the slot's `own` parts what its sheen reflects, and add a part that reflects it."""
     base = own[0]
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)
     most = shine.max(axis=1, keepdims=True)
-    if hits.diffuse_albedo is None:
-        albedo = sheen_albedo(slot.cosine(slot.sheen_normal()), slot.value("sheen_roughness"))[:, None]
-    else:
+    normal = slot.sheen_normal()
+    albedo, a, b = sheen_lobe(slot.cosine(normal), slot.value("sheen_roughness"))
+    albedo = albedo[:, None]
+    if hits.diffuse_albedo is not None:
         albedo = _albedo_of_sheen(hits, slot, shine, base, parts)
     left = np.ones((len(hits.position), 1))
     left[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
     for part in own:
         part.specular *= left[part.index]
         part.diffuse *= left[part.index]
-    base.diffuse += slot.weight[:, None] * shine * albedo
+    shine = slot.weight[:, None] * shine * albedo
+    at = np.nonzero(shine.any(axis=1))[0]
+    shape = {"sheen_a": _tilted(a[at]), "sheen_b": b[at]}
+    ones = np.ones(len(at))
+    parts.append(_Part(slot.index[at], normal[at], normal[at], ones, ones, diffuse=shine[at], shape=shape))
+
+
+def _tilted(a: np.ndarray) -> np.ndarray:
+    """`a` (Q,) of sheen, which is never quite 0: that means no sheen."""
+    return np.where(np.abs(a) < 1e-5, 1e-5, a)
 
 
 def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
@@ -409,6 +433,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
         if slot.of(kind).any():
             albedo = albedo_of(slot.cosine(slot.normal), slot.roughness)[:, None]
             diffuse = np.where(slot.of(kind), slot.color * albedo, diffuse)
+    shape = _diffuse_shape(slot)
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
     for kind in ("conductor", "conductor_4_5"):
         if slot.of(kind).any():
@@ -434,7 +459,22 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
         specular * under,
         diffuse * under,
         behind[:, 0],
+        shape,
     )
+
+
+def _diffuse_shape(slot: LobeSlot) -> dict[str, np.ndarray]:
+    """What of DIFFUSE_SHAPE the base of the slot has."""
+    shape = {}
+    if slot.has("diffuse_roughness"):
+        roughness = np.clip(slot.value("diffuse_roughness"), 0.0, 1.0)
+        roughness = np.where((slot.of("diffuse") | slot.of("principled"))[:, 0], roughness, 0.0)
+        shape["diffuse_roughness"] = roughness
+        shape["diffuse_rebound"] = rough_diffuse.rebound(slot.color, slot.cosine(slot.normal), roughness)
+    if slot.of("sheen").any():
+        _, a, b = sheen_lobe(slot.cosine(slot.normal), slot.roughness)
+        shape |= {"sheen_a": np.where(slot.of("sheen")[:, 0], _tilted(a), 0.0), "sheen_b": b}
+    return shape
 
 
 def _metal_terms(slot: LobeSlot) -> np.ndarray:

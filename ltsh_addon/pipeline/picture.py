@@ -52,6 +52,10 @@ SAMPLE_LAYERS = {
     "dielectric": "RGB",
     "ior": "V",
     "diffuse_albedo": "RGB",
+    "diffuse_roughness": "V",
+    "diffuse_rebound": "RGB",
+    "sheen_a": "V",
+    "sheen_b": "V",
     "receiver": "V",
 }
 

@@ -46,6 +46,9 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     if samples.diffuse_normal is not samples.smooth_normal:
         bumped = _any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
+    shaped = ((samples.sheen_a != 0.0) | (samples.diffuse_roughness != 0.0))[lit]
+    lighting.add_in_float64(lit[shaped])
+    lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
             rows = _normal_frame(_columns(samples.diffuse_normal, index))

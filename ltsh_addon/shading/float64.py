@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..scene import REFERENCE
-from . import facing, light_cone
+from . import diffuse, facing, light_cone
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
@@ -68,29 +68,49 @@ def shade_diffuse(samples, lights, radiance):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     frame = local_frames(samples.diffuse_normal, samples.view)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
-    bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
-
-    def open_lobe(polygon, _):
-        return np.abs(form_factor(polygon))
-
-    def shadowed_lobe(polygon, index):
-        return _shadowed_form_factor(samples, frame, index, polygon)
-
-    kinds = ((lit[~bumped], None, open_lobe), (lit[bumped], samples.smooth_normal, shadowed_lobe))
+    kinds = list(_diffuse_kinds(samples, frame, lit))
     for light, group, corners in lights:
         if not light.affects_diffuse:
             continue
-        for candidates, second_normal, integral in kinds:
+        for candidates, second_normal, count, integral in kinds:
             for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
                 if light.is_profiled:
                     view = light_view(samples, frame, light, index, lambda vectors: vectors)
-                    irradiance = _profiled(light, view, effort, index, polygon, integral, 1)[0]
+                    irradiance = _profiled(light, view, effort, index, polygon, integral, count)
                 else:
                     irradiance = integral(polygon, index)
                 if light.is_facing:
                     irradiance = irradiance * _mean_emission(light, samples, index, facing.Lobe(frame[2][:, index]))
-                reflected = irradiance[:, None] * samples.diffuse_albedo[index]
+                reflected = irradiance[0][:, None] * samples.diffuse_albedo[index]
+                if count > 1:
+                    rebound = irradiance[1][:, None] * samples.diffuse_rebound[index]
+                    reflected += rebound * samples.diffuse_albedo[index]
                 radiance[group, index] += reflected * _of(light.radiance, index)
+
+
+def _diffuse_kinds(samples, frame, lit):
+    """Yield (candidates (Q,), second normal, count, integral) of the samples `lit` by their diffuse lobes:
+    integral(polygon, index) is (count, Q)."""
+
+    def lambert(polygon, _):
+        return np.abs(form_factor(polygon))[None]
+
+    def sheen(polygon, index):
+        return np.abs(diffuse.sheen_form_factor(polygon, samples.sheen_a[index], samples.sheen_b[index]))[None]
+
+    def rough(polygon, index):
+        cosine = (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1)
+        return diffuse.rough_integrals(polygon, cosine, samples.diffuse_roughness[index])
+
+    def shadowed(lobe):
+        return lambda polygon, index: lobe(polygon, index) * _bump_shadowing(samples, frame, index, polygon)
+
+    bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
+    shiny = samples.sheen_a[lit] != 0.0
+    coarse = (samples.diffuse_roughness[lit] != 0.0) & ~shiny
+    for count, lobe, chosen in ((1, lambert, ~(shiny | coarse)), (1, sheen, shiny), (2, rough, coarse)):
+        yield lit[chosen & ~bumped], None, count, lobe
+        yield lit[chosen & bumped], samples.smooth_normal, count, shadowed(lobe)
 
 
 def _mean_emission(light, samples, index, lobe):
@@ -113,14 +133,14 @@ def _profiled(light, view, effort, index, polygon, integral, count):
     return result
 
 
-def _shadowed_form_factor(samples, frame, index, polygon):
-    """Form factor (Q,) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+def _bump_shadowing(samples, frame, index, polygon):
+    """The bump shadowing (Q,) of `SurfaceSamples`, taken at the mean direction of the polygon."""
     direction = -integrals_on_sphere(vector_irradiance, polygon)
     smooth = to_local(frame[:, :, index], samples.smooth_normal[index].T)
     along = (direction * smooth).sum(axis=0)
     tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
     shadowing = 2.0 / (1.0 + np.sqrt(1.0 + samples.bump_alpha2[index] * np.maximum(tangent2, 0.0)))
-    return np.where(along > 0.0, np.abs(form_factor(polygon)) * shadowing, 0.0)
+    return np.where(along > 0.0, shadowing, 0.0)
 
 
 def shade_specular(samples, lights, table, radiance, error=None):

@@ -37,7 +37,10 @@ CORES_VARIABLE = "LTSH_CORES"
 _PACKAGE = __package__.rpartition(".")[0]
 _logger = logging.getLogger(__name__)
 # Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
-_ONLY_DIFFUSE = {"diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo"}
+_ONLY_DIFFUSE = {
+    "diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo", "diffuse_roughness", "diffuse_rebound",
+    "sheen_a", "sheen_b",
+}  # fmt: skip
 _ONLY_SPECULAR = {
     "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
 }  # fmt: skip

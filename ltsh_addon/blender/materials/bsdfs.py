@@ -41,6 +41,7 @@ COLOR, ROUGHNESS = {"color": "Color"}, {"roughness": "Roughness"}
 PRINCIPLED_SOCKETS = {
     "color": "Base Color", "roughness": "Roughness", "metallic": "Metallic", "ior": "IOR", "tint": "Specular Tint",
     "specular_level": "Specular IOR Level", "transmission": "Transmission Weight",
+    "diffuse_roughness": "Diffuse Roughness",
     "sheen_weight": "Sheen Weight", "sheen_tint": "Sheen Tint", "sheen_roughness": "Sheen Roughness",
     "coat_weight": "Coat Weight", "coat_roughness": "Coat Roughness", "coat_ior": "Coat IOR", "coat_tint": "Coat Tint",
     "coat_normal": "Coat Normal",
@@ -55,17 +56,15 @@ BSDFS = {
         "principled",
         PRINCIPLED_SOCKETS,
         not_shaded={
-            "Diffuse Roughness": AS_ZERO,
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
             "Anisotropic": AS_ZERO,
             "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded, of back faces about"),
-            "Sheen Weight": (0.0, "adds diffuse reflection of the same albedo"),
             "Thin Wall": (0.0, "is shaded as off"),
             "Thin Film Thickness": AS_ZERO,
         },
     ),
     ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", {**COLOR, **ROUGHNESS}, "", {"Anisotropy": AS_ZERO}),
-    ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", COLOR, "", {"Roughness": AS_ZERO}),
+    ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", {**COLOR, "diffuse_roughness": "Roughness"}),
     ("ShaderNodeBsdfTranslucent", ""): Bsdf("translucent", COLOR),
     (GLASS, ""): Bsdf(
         "glass",
@@ -77,7 +76,7 @@ BSDFS = {
     (METALLIC, "PHYSICAL_CONDUCTOR"): Bsdf(
         CONDUCTOR, {**ROUGHNESS, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
-    (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo"),
+    (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}),
     (SHEEN, "ASHIKHMIN"): Bsdf(
         "velvet", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo, and in Cycles' passes it is specular"
     ),

@@ -298,6 +298,9 @@ class _Reader:
             weight = constant_inputs(source, "Sheen Weight")
             if weight is None or weight[0][0] > 0.0:
                 self.note("sheen is not shown")
+        rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
+        if rough is None or rough[0][0] > 0.0:
+            self.note("rough diffuse reflection is shown as smooth")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)

@@ -16,14 +16,18 @@ GLOSSY, METALLIC, GLASS = "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic",
 CYCLES_SAMPLES = 512
 
 
-def material(node_type="ShaderNodeBsdfPrincipled", bump=False, textured=(), settings=(), name="Material", **inputs):
-    """A material of one BSDF; its sockets are those of `inputs`, or fed by the texture coordinates if in `textured`."""
+def material(
+    node_type="ShaderNodeBsdfPrincipled", bump=False, textured=(), settings=(), name="Material", sigma=0.0, **inputs
+):
+    """A material of one BSDF; its sockets are those of `inputs`, or fed by the texture coordinates if in `textured`.
+    `sigma` is the roughness of a Diffuse BSDF."""
     made, node = bsdf_material(node_type, name)
     for name, value in settings:
         setattr(node, name, value)
     for name, value in {"Color": COLOR, "Base Color": COLOR, "Roughness": 0.5, **inputs}.items():
-        if name in node.inputs and not (node_type == "ShaderNodeBsdfDiffuse" and name == "Roughness"):
-            node.inputs[name].default_value = value
+        if name in node.inputs:
+            is_sigma = node_type == "ShaderNodeBsdfDiffuse" and name == "Roughness"
+            node.inputs[name].default_value = sigma if is_sigma else value
     if textured:
         coordinates = made.node_tree.nodes.new("ShaderNodeTexCoord")
         for name in textured:
@@ -53,6 +57,13 @@ EXACT = {
     "diffuse": {"node_type": "ShaderNodeBsdfDiffuse", "textured": ("Color",)},
     "metallic node": {"node_type": METALLIC, "Edge Tint": TINT, "settings": MULTIPLE},
     "conductor": {"node_type": METALLIC, "settings": (*MULTIPLE, ("fresnel_type", "PHYSICAL_CONDUCTOR"))},
+    "diffuse roughness": {"Diffuse Roughness": 0.5},
+    "rough diffuse node": {"node_type": "ShaderNodeBsdfDiffuse", "sigma": 1.0},
+    "rough diffuse, bump": {"Diffuse Roughness": 1.0, "bump": True, "Specular IOR Level": 0.0},
+    "sheen": {"Sheen Weight": 0.3, "Sheen Tint": TINT},
+    "sheen on metal": {"Sheen Weight": 0.6, "Metallic": 1.0, "settings": MULTIPLE, **COAT},
+    "sheen on bumps": {"Sheen Weight": 1.0, "bump": True, "Specular IOR Level": 0.0},
+    "sheen node": {"node_type": "ShaderNodeBsdfSheen", "Roughness": 0.7},
     "translucent": {"node_type": "ShaderNodeBsdfTranslucent"},
     "translucent, bump": {"node_type": "ShaderNodeBsdfTranslucent", "bump": True},
 }
@@ -65,11 +76,8 @@ APPROXIMATED = {
     "IOR below 1": ({"IOR": 0.7}, (13.0, 0.5)),
     "subsurface": ({"Subsurface Weight": 0.5, "Subsurface Scale": 0.02}, (0.5, 3.0)),
     "anisotropic": ({"Metallic": 1.0, "Anisotropic": 0.5}, (25.0, None)),
-    "sheen": ({"Sheen Weight": 0.3, "Sheen Tint": TINT}, (0.5, 5.0)),
-    "sheen on metal": ({"Sheen Weight": 0.6, "Metallic": 1.0, "settings": MULTIPLE, **COAT}, (0.5, 60.0)),
     "Beckmann": ({"node_type": GLOSSY, "settings": (("distribution", "BECKMANN"),)}, (15.0, None)),
     "Ashikhmin": ({"node_type": GLOSSY, "settings": (("distribution", "ASHIKHMIN_SHIRLEY"),)}, (12.0, None)),
-    "diffuse roughness": ({"Diffuse Roughness": 0.5}, (0.5, 30.0)),
 }
 
 

@@ -1,0 +1,113 @@
+"""Diffuse lobes that are not Lambert's, over polygons: sheen, and rough surfaces.
+
+Sheen is a linearly transformed cosine (Zeltner, Burley and Chiang 2022). Rough surfaces are Fujii's variant of Oren and
+Nayar 1994 with multiple scattering, as in OpenPBR and in Cycles. With the normal z and the view direction
+(sin theta_o, 0, cos theta_o) its lobe times cosine is
+
+    z (A + B t + R (1 - E(z))),   t = x sin(theta_o), over max(z, cos(theta_o)) where it is positive,
+
+A = 1 / (pi + sigma (pi / 2 - 2 / 3)), B = sigma A, E(z) = pi A + B G(z) the albedo of A + B t. On the sphere
+d omega = dz dphi, so that by Green's theorem the integral of x h(z) is that of y h(z) dz around the polygon, and the
+integral of h(z) that of the normal's z times (integral of h above z) / (1 - z^2) along its arcs: integrals over arcs of
+functions without poles, which Gauss-Legendre nodes do. What t has for x > 0 needs the polygon cut there.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from .lobes import form_factor
+from .polygon import project_to_sphere, split_at_horizon
+
+# Of an arc: integrals are off by 4e-4 at the ends of t, where z = cos(theta_o), and by 1e-9 elsewhere (median 1e-10).
+ARC_NODES = 8
+_ANGLES = 2048
+
+
+def sheen_form_factor(polygon: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Signed integral (P,) of z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2 over polygons (3, V, P) in z >= 0."""
+    x, y, z = polygon
+    return form_factor(np.stack([a * x + b * z, a * y, z]))
+
+
+def rough_terms(roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B (P,) of a surface whose sigma is `roughness` (P,), 0 to 1."""
+    sigma = np.clip(roughness, 0.0, 1.0)
+    a = 1.0 / (np.pi + sigma * (np.pi / 2.0 - 2.0 / 3.0))
+    return a, sigma * a
+
+
+def albedo_slope(cosine: np.ndarray) -> np.ndarray:
+    """G (P,): what B adds to the directional albedo of A + B t."""
+    cosine = np.clip(cosine, 0.0, 1.0)
+    sine, angle = np.sqrt(1.0 - cosine * cosine), np.arccos(cosine)
+    tangent = sine / np.maximum(cosine, 1e-6)
+    found = sine * (angle - 2.0 / 3.0 - sine * cosine) + 2.0 / 3.0 * tangent * (1.0 - sine**3)
+    return np.where(cosine < 1e-6, np.pi / 2.0 - 2.0 / 3.0 - cosine, found)
+
+
+def rebound(color: np.ndarray, cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """R (P, 3): what light that is scattered several times adds, of a surface of `color` (P, 3) seen under the cosine
+    (P,)."""
+    a, b = rough_terms(roughness)
+    color = np.clip(color, 0.0, 1.0)
+    average = (np.pi * a + (2.0 * np.pi - 5.6) / 3.0 * b)[:, None]
+    scattered = color**2 / np.pi * average / (1.0 - average) / (1.0 - color * (1.0 - average))
+    return scattered * (1.0 - np.pi * a - b * albedo_slope(cosine))[:, None]
+
+
+def rough_integrals(polygon: np.ndarray, cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+    """Integrals (2, P) of z (A + B t) and of z (1 - E(z)) over polygons (3, V, P) in z >= 0, either way around."""
+    cosine = np.clip(cosine, 0.0, 1.0)
+    a, b = rough_terms(roughness)
+    signed = form_factor(polygon)
+    sign, factor = np.sign(signed), np.pi * np.abs(signed)
+    y, z, rise, turn, weights = _arcs(polygon)
+    sine = np.sqrt(1.0 - cosine * cosine)
+    across = (weights * y * z * rise).sum(axis=(0, 1)) * sine
+    for index, half in split_at_horizon(polygon, axis=0):
+        own_y, own_z, own_rise, _, own_weights = _arcs(half)
+        more = own_z / np.maximum(np.maximum(own_z, cosine[index]), 1e-12) - own_z
+        across[index] += (own_weights * own_y * more * own_rise).sum(axis=(0, 1)) * sine[index]
+    scattered = (weights * turn * _mean_slope_above(z)).sum(axis=(0, 1))
+    single = a * factor + b * sign * across
+    return np.stack([np.maximum(single, 0.0), np.maximum((1.0 - np.pi * a) * factor - b * sign * scattered, 0.0)])
+
+
+def _arcs(polygon):
+    """y, z and dz / d angle (N, V, P) at nodes of the edges of polygons (3, V, P), the z of the edges' normals (V, P),
+    and weights (N, V, P)."""
+    start = project_to_sphere(polygon)
+    end = np.roll(start, -1, axis=1)
+    normal = np.cross(start, end, axis=0)
+    sine, cosine = np.sqrt((normal * normal).sum(axis=0)), (start * end).sum(axis=0)
+    length = np.arctan2(sine, cosine)
+    normal = normal / np.maximum(sine, 1e-300)
+    # At a right angle to the start, toward the end.
+    side = np.cross(normal, start, axis=0)
+    nodes, weights = np.polynomial.legendre.leggauss(ARC_NODES)
+    angle = 0.5 * (nodes[:, None, None] + 1.0) * length
+    cos, sin = np.cos(angle), np.sin(angle)
+    y, z = (start[axis] * cos + side[axis] * sin for axis in (1, 2))
+    return y, z, side[2] * cos - start[2] * sin, normal[2], 0.5 * weights[:, None, None] * length
+
+
+def _mean_slope_above(z):
+    """Integral of z G(z) from z to 1, over 1 - z^2."""
+    return np.interp(np.arccos(np.clip(z, -1.0, 1.0)), *_slope_table())
+
+
+@cache
+def _slope_table():
+    angle = np.linspace(0.0, np.pi / 2.0, _ANGLES)
+    middle = 0.5 * (angle[1:] + angle[:-1])
+
+    def integrand(theta):
+        return np.cos(theta) * np.sin(theta) * albedo_slope(np.cos(theta))
+
+    # Simpson's rule for each piece.
+    pieces = (integrand(angle[:-1]) + 4.0 * integrand(middle) + integrand(angle[1:])) * (angle[1] / 6.0)
+    total = np.concatenate([[0.0], np.cumsum(pieces)])
+    return angle, np.divide(total, np.sin(angle) ** 2, out=np.zeros_like(total), where=angle > 0.0)

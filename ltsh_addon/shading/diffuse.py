@@ -111,3 +111,21 @@ def _slope_table():
     pieces = (integrand(angle[:-1]) + 4.0 * integrand(middle) + integrand(angle[1:])) * (angle[1] / 6.0)
     total = np.concatenate([[0.0], np.cumsum(pieces)])
     return angle, np.divide(total, np.sin(angle) ** 2, out=np.zeros_like(total), where=angle > 0.0)
+
+
+def diffuse_factor(directions, height, normal, view, shape):
+    """Lobe over cosine, times pi (S, Q), toward unit directions (3, S, Q) of the cosines `height` (S, Q), of Q samples
+    with the axes (3, Q) and the `shape` (4, Q): sigma, a and b of sheen, R. It is 1 where all these are 0."""
+    sigma, sheen_a, sheen_b, scattered = shape
+    cosine = (normal * view).sum(axis=0)
+    # The part of the view along the surface, of a length that is the sine.
+    along = ((view - cosine * normal)[:, None] * directions).sum(axis=0)
+    sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 1e-12))
+    x = along / sine
+    squared = np.maximum(1.0 - height * height - x * x, 0.0)
+    q = (sheen_a * x + sheen_b * height) ** 2 + sheen_a * sheen_a * squared + height * height
+    sheen = (sheen_a / np.maximum(q, 1e-12)) ** 2
+    a, b = rough_terms(sigma)
+    t = np.where(along > 0.0, along / np.maximum(np.maximum(height, cosine), 1e-6), along)
+    rough = np.pi * (a + b * t + scattered * (1.0 - np.pi * a - b * albedo_slope(height)))
+    return np.where(sheen_a != 0.0, sheen, np.where(sigma != 0.0, rough, 1.0)).astype(height.dtype)

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
 from ..shading.brdf import dielectric_reflectance, schlick_curve
+from ..shading.diffuse import diffuse_factor
 from ..shading.facing import FacingDisk, emission, ray_length
 from ..shading.light_polygons import has_lobe, may_reach
 from . import crew
@@ -211,6 +212,11 @@ class Surface:
         self.geometric_normal = self._rows(samples.geometric_normal)
         self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
         self.bump_alpha2 = samples.bump_alpha2.astype(np.float32)
+        self.shapes = None
+        if samples.sheen_a.any() or samples.diffuse_roughness.any():
+            names = ("diffuse_roughness", "sheen_a", "sheen_b")
+            rebound = samples.diffuse_rebound.mean(axis=1, dtype=np.float32)
+            self.shapes = np.stack([*(getattr(samples, name).astype(np.float32) for name in names), rebound])
         self.alpha = np.maximum(np.square(samples.roughness.astype(np.float32)), _MIN_ALPHA)
         names = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo")
         terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
@@ -522,6 +528,10 @@ class View:
         if "diffuse" in lobes:
             self.horizons = [np.take(normal, index, axis=1) for normal in surface.horizons("diffuse")]
             self.bump_alpha2 = surface.bump_alpha2[index]
+            self.shape = None
+            if surface.shapes is not None:
+                axes = (surface.diffuse_normal, surface.view)
+                self.shape = (*(np.take(axis, index, axis=1) for axis in axes), surface.shapes[:, index])
         if "specular" in lobes:
             normal, view = np.take(surface.normal, index, axis=1), np.take(surface.view, index, axis=1)
             self.geometric_normal = np.take(surface.geometric_normal, index, axis=1)
@@ -593,9 +603,11 @@ class View:
         return factor, np.where(inside, own, distance).astype(np.float32)
 
     def _diffuse(self, directions):
-        """The cosine (S, Q), shadowed where a bump map has another horizon."""
+        """The lobe (S, Q), the cosine for most, shadowed where a bump map has another horizon."""
         cosine = dot(directions, self.horizons[0])
         np.maximum(cosine, _ZERO, out=cosine)
+        if self.shape is not None:
+            cosine *= diffuse_factor(directions, cosine, *self.shape)
         if len(self.horizons) == 1:
             return cosine
         above = dot(directions, self.horizons[1])

@@ -8,6 +8,7 @@ from ltsh_addon.scene import AreaLight, SpotCone, SurfaceSamples
 
 EYE = np.array([0.25, -4.0, 2.0])
 SURFACES = ("plain", "sharp", "grazing", "head-on", "tilted")
+SHAPED = ("rough", "sheen")  # with other diffuse lobes than Lambert's
 LIGHTS = ("plain", "near", "horizon", "tiny", "tiny disk", "huge", "disk", "polygon", "linked")
 PROFILED_LIGHTS = ("spread", "narrow", "spread disk", "linear", "constant disk", "smooth")
 FACING_LIGHTS = ("ball", "facing disk", "spot", "spot disk")
@@ -61,7 +62,16 @@ def samples(kind: str, count: int, random: np.random.Generator) -> SurfaceSample
         diffuse_albedo=_colors(random, count),
         receiver=random.integers(0, GROUPS, count),
         **_fresnel(random, count),
+        **_shape(kind, count, random),
     )
+
+
+def _shape(kind, count, random):
+    if kind == "rough":
+        return {"diffuse_roughness": random.uniform(0.05, 1.0, count), "diffuse_rebound": 0.1 * _colors(random, count)}
+    if kind == "sheen":
+        return {"sheen_a": random.uniform(0.2, 1.4, count), "sheen_b": random.uniform(-1.5, 0.3, count)}
+    return {}
 
 
 def _colors(random, count):

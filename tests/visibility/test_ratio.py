@@ -16,6 +16,7 @@ KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light)
     for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS, *random_surfaces.FACING_LIGHTS)
 ]
+KINDS += [(surface, light) for surface in random_surfaces.SHAPED for light in ("plain", "horizon", "polygon", "spread")]
 
 
 class Tracer:

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ltsh_addon.shading import brdf, evaluate_lobe, layouts, spherical_harmonics
+from ltsh_addon.shading import brdf, evaluate_lobe, header, spherical_harmonics
 from ltsh_addon.shading.lookup_table import LookupTable
 
 from .brdfs import gauss_legendre
@@ -77,7 +77,7 @@ def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_the
 
 def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
     """Mean errors of `validate` of the layouts for other engines, by their names."""
-    halves = layouts.half_layers(table)
+    halves = header.half_layers(table)
     rows, columns, parameters = table.warp.shape
     channels = np.moveaxis(halves, 0, 2).reshape(rows, columns, -1).astype(np.float32)
     coefficients = channels[..., parameters : parameters + table.coefficients[0, 0].size]
@@ -86,7 +86,7 @@ def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
     )
     found = {"half": float(error_map(rounded, count).mean())}
     if table.family == "ltc":
-        textures = layouts.two_textures(table)
+        textures = header.two_textures(table)
         found["two_textures"] = float(np.mean([_textures_error(textures, *point) for point in grid(count)]))
     return found
 

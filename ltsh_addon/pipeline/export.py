@@ -18,8 +18,7 @@ import numpy as np
 from ..files import replacing
 from ..imaging.exr import write_channels
 from ..scene import VERSION
-from ..shading import layouts, load_table
-from ..shading.header import header_text, wgsl_text
+from ..shading import header, load_table
 from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
 from ..shading.spherical_harmonics import hemisphere_integrals
 
@@ -70,13 +69,13 @@ def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> li
     """Write the files of a table to `folder`, all or none; returns them. Raises OSError, TableError."""
     about = _about(table, name)
     contents = {
-        f"{name}.h": header_text(table, prefix, about).encode("ascii"),
-        f"{name}.wgsl": wgsl_text(table, prefix, about).encode("ascii"),
-        f"{name}.dds": layouts.dds(layouts.half_layers(table)),
+        f"{name}.h": header.header_text(table, prefix, about).encode("ascii"),
+        f"{name}.wgsl": header.wgsl_text(table, prefix, about).encode("ascii"),
+        f"{name}.dds": header.dds(header.half_layers(table)),
     }
     if table.family == "ltc":
-        for number, texture in enumerate(layouts.two_textures(table), start=1):
-            contents[f"{name}_{number}.dds"] = layouts.dds(texture[None])
+        for number, texture in enumerate(header.two_textures(table), start=1):
+            contents[f"{name}_{number}.dds"] = header.dds(texture[None])
     image = folder / f"{name}.exr"
     with ExitStack() as stack:
         for own, data in contents.items():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.shading import layouts
+from ltsh_addon.shading import header
 from ltsh_addon.shading.header import data_blocks
 from tables import validate
 
@@ -47,7 +47,7 @@ def shader(textures, cosine, roughness, corners):
 def test_a_shader_of_the_usual_kind_takes_the_two_textures():
     """Beside the table's own lookup: the same at its nodes, close to it between them."""
     table, generator = shading.load_table("ltc"), np.random.default_rng(1)
-    textures = layouts.two_textures(table)
+    textures = header.two_textures(table)
     for number in range(60):
         row, column = generator.integers(8, 64), generator.integers(0, 63)
         at_node = number % 2 == 0
@@ -83,7 +83,7 @@ def test_the_clipped_sphere_is_the_cosine_over_its_cap_above_the_horizon(height,
     cosine = np.cos(turn) * z[:, None] + np.sin(turn) * np.sqrt(1.0 - z * z)[:, None] * np.cos(angle)
     weights = 0.5 * (1.0 - np.cos(sigma)) * weights * 2.0 * np.pi / 800
     expected = (weights @ np.maximum(cosine, 0.0)).sum() / np.pi / form_factor
-    assert layouts.clipped_sphere_factor(np.array([height]), np.array([form_factor]))[0] == pytest.approx(
+    assert header.clipped_sphere_factor(np.array([height]), np.array([form_factor]))[0] == pytest.approx(
         expected, abs=2e-4
     )
 
@@ -91,7 +91,7 @@ def test_the_clipped_sphere_is_the_cosine_over_its_cap_above_the_horizon(height,
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_the_array_texture_holds_the_nodes_four_channels_to_a_layer(name):
     table = shading.load_table(name)
-    data = layouts.dds(layouts.half_layers(table))
+    data = header.dds(header.half_layers(table))
     magic, size, _, height, width = struct.unpack_from("<4s4I", data)
     form, dimension, _, layers, _ = struct.unpack_from("<5I", data, 128)
     rows, columns = table.warp.shape[:2]
@@ -108,4 +108,4 @@ def test_numbers_that_no_half_float_holds_are_refused():
     coefficients = table.coefficients.copy()
     coefficients[3, 3, 0, 0] = 1e6
     with pytest.raises(shading.TableError, match="its largest number is 1e\\+06, expected at most 65504"):
-        layouts.half_layers(replace(table, coefficients=coefficients))
+        header.half_layers(replace(table, coefficients=coefficients))

@@ -129,7 +129,8 @@ class Occluders:
 
     `terminators` (I,) are as `shadow_terminator_geometry_offset` of Cycles; left out: its default.
     A ray through more than `transparent_surfaces` ends. `light_masks` are the masks of rays to lights, by their names,
-    and `lone_choices` says which lights are met by rays that the "light" or the "surface" chooses alone.
+    and `lone_choices` says which lights are met by rays that the "light" or the "surface" chooses alone. Rays that the
+    surface chooses have the mask of the light shifted by `surface_shift` bits: some objects block them alone, or not.
     """
 
     meshes: tuple[OccluderMesh, ...]
@@ -140,6 +141,7 @@ class Occluders:
     transparent_surfaces: int = TRANSPARENT_SURFACES
     light_masks: dict[str, int] = field(default_factory=dict)
     lone_choices: dict[str, str] = field(default_factory=dict)
+    surface_shift: int = 0
 
     def __post_init__(self):
         mesh = np.asarray(self.mesh, np.int64)
@@ -169,6 +171,10 @@ class Occluders:
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name; 0: nothing is in its way."""
         return self.light_masks.get(light, 1)
+
+    def surface_mask_of(self, light: str) -> int:
+        """As `mask_of`, of rays that the surface chooses."""
+        return self.mask_of(light) << self.surface_shift
 
     def chosen_by(self, light: str) -> ChosenBy:
         """Which rays to the light of that name there are."""
@@ -204,7 +210,7 @@ class Occluders:
         arrays |= {f"image{number}": image for number, image in enumerate(images.values())}
         head = {
             "meshes": about,
-            **{name: getattr(self, name) for name in ("transparent_surfaces", "light_masks", "lone_choices")},
+            **{name: getattr(self, name) for name in _SETTINGS},
         }
         arrays["about"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(path) as temporary, temporary.open("wb") as file:
@@ -229,8 +235,11 @@ class Occluders:
             more = (arrays.get(f"{name}{number}") for name in ("normals", "thickness"))
             meshes.append(OccluderMesh(*shape, clear, *more))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
-        own = {name: head[name] for name in ("transparent_surfaces", "light_masks", "lone_choices")}
+        own = {name: head[name] for name in _SETTINGS}
         return cls(tuple(meshes), **instances, **own)
+
+
+_SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
 
 
 @dataclass(frozen=True)

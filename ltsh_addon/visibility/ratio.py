@@ -265,6 +265,7 @@ class Pairs:
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
         offset = (light.center[:, None] - light.origins(surface.position)).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
@@ -358,15 +359,17 @@ class Pairs:
             if self.light.is_distant:
                 distance[:] = _FARTHEST
             aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
-            found = self._transmittance(*(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
+            found = (
+                self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
+            )
             # Next to no light: it counts in no sum of samples.
             self.weights[number][:, unmet] = _TINY
             self.arriving[number][:, unmet] = found * _TINY
 
-    def _transmittance(self, origins, directions, distances):
-        """Of rays: origins and directions (3, R), distances (R,)."""
+    def _transmittance(self, mask, origins, directions, distances):
+        """Of rays with a mask: origins and directions (3, R), distances (R,)."""
         self.traced += len(distances)
-        masks = np.broadcast_to(self.mask, distances.shape)
+        masks = np.broadcast_to(mask, distances.shape)
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last, split):
@@ -394,7 +397,7 @@ class Pairs:
         flat = np.flatnonzero(met)
         aimed = self.surface.starts.aimed(view.index, directions, distance)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
-        arriving.ravel()[flat] = self._transmittance(origins, *rest) if self.chosen_by.light else _ONE
+        arriving.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
         if self.chosen_by.surface:
             others = self._chosen_by_surface(view, (directions, distance), flat, origins, arriving)
         least, most = arriving, arriving
@@ -421,7 +424,8 @@ class Pairs:
         """What those of the `rays` at the places `flat` (R,) meet that the surface chooses: of those for which this is
         not what rays from `origins` (3, R) have met, which the light chooses."""
         starts = self.surface.starts
-        if self.chosen_by.light and not starts.terminator[view.index].any():
+        meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
+        if meet_the_same and not starts.terminator[view.index].any():
             return None
         directions, distance = (_taken(rows, flat) for rows in rays)
         column = flat % arriving.shape[1]
@@ -434,10 +438,10 @@ class Pairs:
         )
         is_alone = (smooth <= 0.0) & (flat_facing > 0.0)
         chosen = (smooth <= 0.0) | (flat_facing > 0.0)
-        if self.chosen_by.light:
+        if meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        found = self._transmittance(start[:, chosen], directions[:, chosen], distance[chosen])
+        found = self._transmittance(self.surface_mask, start[:, chosen], directions[:, chosen], distance[chosen])
         differ = np.flatnonzero(found != arriving.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None

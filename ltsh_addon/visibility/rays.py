@@ -370,6 +370,10 @@ class Tracer:
         """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
         return self.occluders.mask_of(light)
 
+    def surface_mask_of(self, light: str) -> int:
+        """As `mask_of`, of the rays that the surface chooses."""
+        return self.occluders.surface_mask_of(light)
+
     def chosen_by(self, light: str) -> ChosenBy:
         """Which rays to the light of that name there are."""
         return self.occluders.chosen_by(light)

@@ -30,6 +30,8 @@ class Tracer:
     def mask_of(self, name):
         return 0xFFFFFFFF
 
+    surface_mask_of = mask_of
+
     def chosen_by(self, name):
         return ChosenBy(surface=False)
 

@@ -25,6 +25,8 @@ from ..render_settings import cycles_setting
 AS_IT_IS = np.eye(4)[None]
 # Names of a kind in a warning.
 NAMED = 3
+# Bits of a mask from those for rays that lights choose to those for rays that surfaces choose, where they differ.
+SURFACE_SHIFT = 16
 # Beyond, hair and points are left out: hair would take some 0.7 GiB.
 MOST_PIECES = 1_000_000
 TUBE_SIDES = 3
@@ -49,7 +51,10 @@ class _Collector:
         objects = {
             instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
         }
-        self._blockers = Blockers(list(objects.values()))
+        # Where some rays meet other things, each half of a mask is for those of one kind.
+        self._shift = SURFACE_SHIFT if any(map(_is_met_by_some, depsgraph.object_instances)) else 0
+        self._most_sets = (SURFACE_SHIFT if self._shift else MOST_BLOCKER_SETS + 1) - 1
+        self._blockers = Blockers(list(objects.values()), self._most_sets)
         self._meshes: list[OccluderMesh] = []
         # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
         self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
@@ -66,7 +71,7 @@ class _Collector:
             ob = instance.object
             if ob.type not in SURFACE_TYPES or ob.original.name_full in self._left_out:
                 continue
-            if not self._casts_shadow(instance):
+            if not any(_meets(instance)):
                 continue
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
@@ -80,21 +85,9 @@ class _Collector:
         if self._blockers.unnumbered:
             warn(
                 f"shadows: all objects block lights {listed(map(repr, self._blockers.unnumbered), NAMED)}: more than "
-                f"{MOST_BLOCKER_SETS} blocker collections are not told apart"
+                f"{self._most_sets} blocker collections are not told apart"
             )
         return self._joined()
-
-    def _casts_shadow(self, instance) -> bool:
-        ob, owner = instance.object, owner_of(instance)
-        shadow, diffuse, glossy = (
-            getattr(ob, name) and getattr(owner, name)
-            for name in ("visible_shadow", "visible_diffuse", "visible_glossy")
-        )
-        if not shadow and (diffuse or glossy):
-            self._note("hidden from shadow rays alone: in Cycles it still blocks light that surfaces choose", ob)
-        elif shadow and not (diffuse and glossy):
-            self._note("hidden from diffuse or glossy rays: in Cycles light that surfaces choose passes it", ob)
-        return shadow
 
     def _joined(self) -> Occluders:
         counts = [len(matrices) for _, matrices, _, _ in self._instances]
@@ -111,13 +104,16 @@ class _Collector:
             int(cycles_setting(self._depsgraph.scene, "transparent_max_bounces")),
             {name: mask for name, mask in self._blockers.light_masks.items() if mask != OTHER_LIGHTS},
             self._blockers.lone_choices,
+            self._shift,
         )
 
     def _note(self, kind: str, block) -> None:
         self._notes.setdefault(kind, {})[block.original.name if block.original else block.name] = None
 
     def _place(self, instance, matrix, numbers, places=AS_IT_IS) -> None:
-        mask = self._blockers.mask_of(instance)
+        mask, (by_light, by_surface) = self._blockers.mask_of(instance), _meets(instance)
+        if self._shift:
+            mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
         self._instances += [(number, (matrix @ places)[:, :3], mask, terminator) for number in numbers]
         # Metaballs are told twice.
@@ -139,6 +135,9 @@ class _Collector:
         materials = [slot.material for slot in ob.material_slots] or [None]
         if self._override:
             materials = [self._override] * len(materials)
+        owner = owner_of(instance)
+        if (ob.visible_diffuse and owner.visible_diffuse) != _meets(instance)[1]:
+            self._note("diffuse and glossy rays do not both meet it: light that surfaces choose counts as glossy", ob)
         if self._simplified(ob):
             self._note("camera or distance culling is on, but it blocks everywhere", ob)
         key = (*_shape_key(ob), tuple(material.name_full if material else "" for material in materials))
@@ -232,6 +231,17 @@ class _Collector:
             meshes = [_tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
             # Particles are in world space.
             self._place(instance, np.eye(4), self._number(meshes))
+
+
+def _meets(instance) -> tuple[bool, bool]:
+    """Is the instance met by rays that lights choose, and by those that surfaces choose, glossy ones?"""
+    ob, owner = instance.object, owner_of(instance)
+    return tuple(getattr(ob, name) and getattr(owner, name) for name in ("visible_shadow", "visible_glossy"))
+
+
+def _is_met_by_some(instance) -> bool:
+    by_light, by_surface = _meets(instance)
+    return instance.object.type in SURFACE_TYPES and by_light != by_surface
 
 
 def _is_same(mesh, other):

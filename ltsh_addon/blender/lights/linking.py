@@ -54,8 +54,8 @@ OTHER_LIGHTS = 1
 class Blockers:
     """Masks of lights and of what blocks them: a light is blocked by what has a bit of its mask."""
 
-    def __init__(self, emitters: list):
-        """`emitters` are the original objects that light."""
+    def __init__(self, emitters: list, most: int = MOST_BLOCKER_SETS):
+        """`emitters` are the original objects that light; at most `most` blocker collections count."""
         self._sets, self.light_masks, self.lone_choices, self.unnumbered = [], {}, {}, []
         numbers: dict[str, int] = {}
         for ob in emitters:
@@ -63,7 +63,7 @@ class Blockers:
             collection = None if linking is None else linking.blocker_collection
             mask = OTHER_LIGHTS
             if collection is not None:
-                if collection.name_full not in numbers and len(numbers) < MOST_BLOCKER_SETS:
+                if collection.name_full not in numbers and len(numbers) < most:
                     numbers[collection.name_full] = len(numbers) + 1
                     self._sets.append(linked_objects(collection))
                 if collection.name_full in numbers:

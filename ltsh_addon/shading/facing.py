@@ -17,6 +17,8 @@ from .polygon import dot
 NEAR_DISK = 1e-3
 # Of the squared distance: what a point on a ball is at least outside of it.
 LEAST_SHRINKING = 1e-6
+# Radius of a disk by its distance, at least: the edges of smaller ones differ by too few digits of double precision.
+LEAST_SIZE = 1e-5
 # Shares of the brightest place of a disk: what changes by less has a mean, what falls below has a step.
 CHANGING, STEP = 0.01, 0.1
 # Rules of Chebyshev (second kind) along the first axis of a disk, of Legendre across: their orders. The second is for
@@ -50,7 +52,7 @@ class FacingDisk:
     half_v: np.ndarray  # (3, Q)
     length: np.ndarray  # (Q,) of the offset
     radius: np.ndarray  # (Q,)
-    is_inside: np.ndarray  # (Q,) bool, points in a ball
+    gain: np.ndarray  # (Q,) by which the radiance is multiplied of disks that are drawn larger than they are
 
     @classmethod
     def of(cls, light, offset: np.ndarray, normal: np.ndarray) -> FacingDisk:
@@ -70,6 +72,11 @@ class FacingDisk:
         if inside.any():
             offset = np.where(inside, offset.dtype.type(distance) * radius * normal, offset)
         length = np.sqrt(dot(offset, offset))
+        gain = np.ones_like(length)
+        tiny = own < LEAST_SIZE * length
+        if tiny.any():
+            gain = np.where(tiny, np.square(own / (LEAST_SIZE * length)), gain)
+            own = np.where(tiny, LEAST_SIZE * length, own)
         x, y, z = -offset / length
         # A frame around the direction of the light (Duff et al. 2017).
         sign = np.copysign(offset.dtype.type(1.0), z)
@@ -77,10 +84,10 @@ class FacingDisk:
         b = x * y * a
         half_u = own * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
         half_v = own * np.stack([b, sign + y * y * a, -y])
-        return cls(offset, half_u, half_v, length, own, inside)
+        return cls(offset, half_u, half_v, length, own, gain)
 
     def _sizes(self):
-        return self.length, self.radius, self.is_inside
+        return self.length, self.radius, self.gain
 
     def take(self, part) -> FacingDisk:
         """Those of the points `part`."""

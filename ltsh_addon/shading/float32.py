@@ -158,6 +158,7 @@ class _Lighting:
                 seen, factor = light, 1.0
                 if light.is_facing:
                     seen, factor = self._seen(light, index[part], position[:, part])
+                    factor = factor * seen.gain
                     offset, facing = seen.offset, np.ones(offset.shape[1], bool)
                 else:
                     toward = dot(offset, light.direction.astype(np.float32))

@@ -116,7 +116,8 @@ def _diffuse_kinds(samples, frame, lit):
 def _mean_emission(light, samples, index, lobe):
     """As `facing.mean_emission`, of a light as the samples `index` see it."""
     offset = (light.center - samples.position[index]).T
-    return facing.mean_emission(light, offset, FacingDisk.of(light, offset, lobe.normal), lobe)
+    disk = FacingDisk.of(light, offset, lobe.normal)
+    return disk.gain * facing.mean_emission(light, offset, disk, lobe)
 
 
 def lobe_width(samples, index) -> np.ndarray:

@@ -306,6 +306,8 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
         alpha = samples.roughness[index] ** 2
         setting = (cosine[index], alpha, samples.ior[index])
         integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone)
+        if light.is_facing:
+            integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
         error[index] += estimate
         yield index, integrals
 

@@ -603,7 +603,7 @@ class View:
         place = directions * distance - disk.offset[:, None]
         inside = dot(place, place) <= disk.radius * disk.radius
         own = ray_length(self.emitter.light, offset, directions)
-        factor = inside * np.asarray(emission(self.emitter.light, offset, directions), np.float32)
+        factor = inside * disk.gain * np.asarray(emission(self.emitter.light, offset, directions), np.float32)
         return factor, np.where(inside, own, distance).astype(np.float32)
 
     def _diffuse(self, directions):

@@ -11,7 +11,7 @@ SURFACES = ("plain", "sharp", "grazing", "head-on", "tilted")
 SHAPED = ("rough", "sheen")  # with other diffuse lobes than Lambert's
 LIGHTS = ("plain", "near", "horizon", "tiny", "tiny disk", "huge", "disk", "polygon", "linked")
 PROFILED_LIGHTS = ("spread", "narrow", "spread disk", "linear", "constant disk", "smooth")
-FACING_LIGHTS = ("ball", "facing disk", "spot", "spot disk")
+FACING_LIGHTS = ("ball", "facing disk", "spot", "spot disk", "bulb", "sun")
 GROUPS = 4
 
 
@@ -138,6 +138,19 @@ def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
 
 def _facing(kind, number, random):
     """A ball or disk that faces every point, half of them a spot aimed at the origin."""
+    if kind == "sun":
+        toward, half = unit(np.array([*random.uniform(-1.0, 1.0, 2), 0.5])), random.uniform(0.01, 0.5)
+        first = np.sin(half) * unit(np.cross(toward, random.normal(size=3)))
+        return AreaLight(
+            name=f"{kind} {number}",
+            shape="DISK",
+            center=rounded(np.cos(half) * toward),
+            half_u=rounded(first),
+            half_v=rounded(np.cross(first, toward)),
+            direction=-toward,
+            radiance=rounded(random.uniform(0.5, 1.0, 3) / (np.pi * np.sin(half) ** 2)),
+            is_distant=True,
+        )
     center, radius = (
         np.array([*random.uniform(-2.0, 2.0, 2), random.uniform(0.8, 2.5)]),
         10.0 ** random.uniform(-2.0, -0.2),
@@ -148,6 +161,8 @@ def _facing(kind, number, random):
         axes = np.stack([u, random.uniform(0.6, 1.6) * np.cross(toward, u), toward])
         cosine = np.cos(random.uniform(0.3, 1.2))
         cone = SpotCone(axes, cosine, 1.0 / (random.uniform(0.05, 1.0) * (1.0 - cosine)))
+    if kind == "bulb":
+        radius = 1e-6
     return AreaLight(
         name=f"{kind} {number}",
         shape="FACING_DISK" if "disk" in kind else "BALL",

@@ -14,7 +14,7 @@ import numpy as np
 from ...scene import AreaLight, SpotCone
 
 # In m and rad: what has no size is that large. Only its solid angle times its radiance matters.
-LEAST_RADIUS = 1e-6
+LEAST_RADIUS, LEAST_ANGLE = 1e-6, 2e-5
 # Suns fill at most this half angle in rad: as far as a plane in front of the eye reaches.
 WIDEST_SUN = 1.5698
 # Of a cone without blend.
@@ -63,8 +63,8 @@ def _cone(light, matrix) -> SpotCone:
 def _sun(light, name, axis, traits) -> AreaLight:
     half = 0.5 * light.angle
     value = strength(light)
-    if half <= LEAST_RADIUS:
-        half = LEAST_RADIUS
+    if half <= LEAST_ANGLE:
+        half = LEAST_ANGLE
         value = value / (math.pi * math.sin(half) ** 2)
     elif light.normalize:
         value = value / (math.pi * math.sin(half) ** 2)

@@ -132,6 +132,7 @@ class LightingPass:
         self._lights = uploaded.texture
         self._shares = shares([_loops(light) for light in uploaded.lights])
         self._has_focused = any(light.is_profiled for light in uploaded.lights)
+        self._has_facing = any(light.is_facing for light in uploaded.lights)
 
     def draw(
         self,
@@ -165,6 +166,7 @@ class LightingPass:
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
             shadowed=gbuffer.shares is not None,
+            facing=self._has_facing,
         )
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)

@@ -64,9 +64,6 @@ def view_lights(depsgraph, in_view: Callable, textures: ShownTextures) -> tuple[
             notes.append(f"{ob.original.name}: {problem}")
             continue
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-        if plain.is_facing or plain.is_distant:
-            notes.append(f"{ob.original.name}: {ob.data.type} lights are not shown here yet")
-            continue
         shown = [light for light in _with_nodes(plain, ob.data, textures, notes) if np.any(light.radiance != 0.0)]
         if shown:
             lights.extend(shown)

@@ -16,7 +16,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...cycles import horizons
-from ...shading import light_cone, moments32
+from ...shading import facing, light_cone, moments32
 from ...shading.float64 import LEAST_ROUGHNESS
 from ...shading.header import core_text, definitions, filled, float_literal, moment_lines, source_text, table_sizes
 from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
@@ -27,6 +27,10 @@ from . import textures
 # Half diagonals of a light, as the lobe sees it, up to which it is sampled: there both that and the rounding of edges,
 # which grows with the inverse of the size, are below 2e-4 of the result.
 TINY_LIGHT = 0.2
+# The same for round lights of which the center is all that counts.
+POINT_LIGHT = 0.02
+# Nodes along disks over which a cone ends, see `shading.facing`.
+NODES_ALONG = 20
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _AXES = "xyz"
 
@@ -66,6 +70,7 @@ class Features:
     focused: bool = False  # lights with a spread or a falloff
     turned: bool = False  # a diffuse normal of its own
     shadowed: bool = False  # a share of each light that is seen
+    facing: bool = False  # lights that face every point
 
     @property
     def samplers(self) -> tuple[str, ...]:
@@ -105,6 +110,8 @@ def _lighting_source(table, features) -> str:
     parts += [glsl("light_texels"), filled(glsl("lights"), values)]
     if features.focused:
         parts.append(glsl("spread"))
+    if features.facing:
+        parts.append(glsl("facing"))
     if features.specular:
         parts.append(_specular_text(table, is_cosine, features))
     if features.diffuse:
@@ -128,6 +135,9 @@ def _lighting_constants(table) -> dict:
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
         "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
         "TINY": float_literal(TINY_LIGHT**2),
+        "POINT": float_literal(POINT_LIGHT**2),
+        "CHANGING": float_literal(facing.CHANGING),
+        "NODES_ALONG": NODES_ALONG,
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
         "FEW_NODES": textures.NODES_FIRST[plain.layers],

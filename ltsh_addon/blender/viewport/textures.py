@@ -12,6 +12,8 @@ from ...cycles import closures, horizons
 from ...cycles.lobes import LOBE_KINDS
 from ...scene import AreaLight, SurfaceSamples
 from ...shading import light_cone, moments32
+from ...shading.facing import LEAST_SHRINKING, NEAR_DISK
+from ...shading.header import float_literal
 from ...shading.light_polygons import ROUND_CORNERS, ROUND_LIMITS
 from ...shading.lookup_table import LookupTable
 from ..materials.looks import COAT, IMAGE_SLOTS, Look
@@ -114,7 +116,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
 
 HEADER = 7
 WIDTH = 256
-DIFFUSE, SPECULAR, ROUND = 1, 2, 4
+DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -144,7 +146,7 @@ FIRST_LIGHT = sum(len(part) for part in _SHARED)
 ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, (*_FEW_LIMITS, *ROUND_LIMITS, np.inf), strict=True))
 
 
-def constants() -> dict[str, int]:
+def constants() -> dict[str, int | str]:
     """What GLSL that reads the texture needs to know, by name."""
     return {
         "LIGHT_HEADER": HEADER,
@@ -153,6 +155,12 @@ def constants() -> dict[str, int]:
         "DIFFUSE_FLAG": DIFFUSE,
         "SPECULAR_FLAG": SPECULAR,
         "ROUND_FLAG": ROUND,
+        "DISTANT_FLAG": DISTANT,
+        "FACING_FLAG": FACING,
+        "BALL_FLAG": BALL,
+        "CONE_FLAG": CONE,
+        "NEAR_DISK": float_literal(NEAR_DISK),
+        "LEAST_SHRINKING": float_literal(LEAST_SHRINKING),
     }
 
 
@@ -165,7 +173,8 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
     """Texels (H, `WIDTH`, 4) of `lights` in float32; leave out lights without area by `visible_lights`.
 
     A corner of a light is center + s * half_u + t * half_v. First come lists of corners s, t that lights share, nodes
-    and weights of quadratures over cones, then `HEADER` texels per light, then corners and receivers of single lights.
+    and weights of quadratures over cones, then `HEADER` texels per light, then corners and receivers of single lights;
+    in the place of corners, where a light has a `SpotCone`, its axes with the cosine, the sharpness and 0.
     Headers:
 
         0   center; texel of the first corner
@@ -210,11 +219,16 @@ def _outline(light, place):
     if np.dot(light.area_vector, light.direction) < 0.0:
         half_v = -half_v
     own = np.zeros((0, 2))
+    if light.cone is not None:
+        values = [[light.cone.cosine], [light.cone.sharpness], [0.0]]
+        return place, 0, half_v, np.concatenate([light.cone.axes, values], axis=1)
     return (0, 0, half_v, own) if light.is_round else (QUAD_FIRST, 4, half_v, own)
 
 
 def _header(light, first, count, half_v, first_receiver):
     flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
+    flags += DISTANT * light.is_distant + FACING * light.is_facing + BALL * (light.shape == "BALL")
+    flags += CONE * (light.cone is not None)
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_cone.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)

@@ -21,17 +21,21 @@ def seen():
     return lights, "\n".join(notes)
 
 
-def test_area_lights_are_those_that_shading_takes():
+def test_lights_are_those_that_shading_takes():
     parts.empty_scene()
+    for kind in ("POINT", "SPOT", "SUN"):
+        parts.link(bpy.data.objects.new(kind, bpy.data.lights.new("Bulb", kind)), (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
     for shape in ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE"):
         parts.add_area_light(shape, shape=shape, spread=1.2 if shape == "ELLIPSE" else np.pi)
     parts.add_camera()
     lights, notes = seen()
     _, _, inventory, _ = parts.prepare()
     expected = {light.name: light for light in inventory.lights}
-    assert {light.name for light in lights} == set(expected) == {"SQUARE", "RECTANGLE", "DISK", "ELLIPSE"}
+    kinds = {"SQUARE", "RECTANGLE", "DISK", "ELLIPSE", "POINT", "SPOT", "SUN"}
+    assert {light.name for light in lights} == set(expected) == kinds
     assert not notes
     for light in lights:
+        assert (light.cone is None) == (light.name != "SPOT") and light.is_distant == (light.name == "SUN")
         for field in ("shape", "spread", "group", "receivers"):
             assert getattr(light, field) == getattr(expected[light.name], field), (light.name, field)
         for field in ("center", "half_u", "half_v", "direction", "radiance"):
@@ -41,15 +45,15 @@ def test_area_lights_are_those_that_shading_takes():
 
 def test_what_is_shown_otherwise_or_not_at_all_is_named():
     parts.empty_scene()
-    for kind in ("POINT", "SPOT", "SUN"):
-        parts.link(bpy.data.objects.new(kind.lower(), bpy.data.lights.new("Bulb", kind)))
+    torn = bpy.data.objects.new("Torn", bpy.data.lights.new("Torn", "SPOT"))
+    parts.link(torn, scale=(1.0, 0.0, 1.0))
     parts.add_area_light("Dark", energy=-5.0)
     parent = parts.link(bpy.data.objects.new("Parent", None), scale=(1.0, 3.0, 1.0))
     sheared = parts.add_area_light("Sheared", rotation=(0.3, 0.2, 0.7))
     sheared.parent = parent
     lights, notes = seen()
     assert {light.name for light in lights} == {"Dark", "Sheared"}
-    assert all(kind.lower() in notes and kind in notes for kind in ("POINT", "SPOT", "SUN"))
+    assert "Torn: its scale is zero" in notes
     assert "'Dark': negative power" in notes and "'Sheared': its transform is sheared" in notes
 
 

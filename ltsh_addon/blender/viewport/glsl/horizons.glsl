@@ -10,17 +10,18 @@ struct seen_light {
     vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float radiance; float end; bool faces;
 };
 
-seen_light light_from(int number, vec3 position)
+seen_light light_from(int number, vec3 position, vec3 normal)
 {
     int header = LTSH_FIRST_LIGHT + number * LTSH_LIGHT_HEADER;
     vec4 center = ltsh_light_texel(header);
     vec4 half_u = ltsh_light_texel(header + 1);
     vec3 radiance = abs(ltsh_light_texel(header + 4).xyz);
     seen_light light;
-    light.offset = center.xyz - position;
-    light.half_u = half_u.xyz;
-    light.half_v = ltsh_light_texel(header + 2).xyz;
-    light.direction = ltsh_light_texel(header + 3).xyz;
+    ltsh_placed placed = ltsh_place_light(header, position, normal);
+    light.offset = placed.offset;
+    light.half_u = placed.half_u;
+    light.half_v = placed.half_v;
+    light.direction = placed.direction;
     light.count = half_u.w > 0.0 ? int(half_u.w) : LTSH_ROUND_CORNERS;
     light.first = half_u.w > 0.0 ? int(center.w) : LTSH_ROUND_FIRST;
     light.radiance = radiance.x + radiance.y + radiance.z;
@@ -109,7 +110,7 @@ void main()
     vec3 smooth_normal = texelFetch(smooth_normals, texel, 0).xyz;
     vec3 total = vec3(0.0);
     for (int i = place.x; i < end; ++i) {
-        seen_light light = light_from(i, position);
+        seen_light light = light_from(i, position, smooth_normal);
         total += bounds(light, smooth_normal, extent(light).y);
     }
     color = vec4(total, 0.0);
@@ -223,7 +224,7 @@ void main()
     int end = has_two_horizons(texel) ? place.y : 0;
     vec2 excess = vec2(0.0);
     for (int i = place.x; i < end; ++i) {
-        seen_light light = light_from(i, position);
+        seen_light light = light_from(i, position, smooth_normal);
         int directions = crosses(light, smooth_normal, true_normal) ? LTSH_AROUND * LTSH_HEIGHTS : 0;
         float density = 0.0;
         if (directions > 0) {

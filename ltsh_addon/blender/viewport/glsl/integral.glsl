@@ -39,7 +39,15 @@
     vec3 extent = light.bound * (abs(along_u) + abs(along_v));
     bool tiny = dot(extent, extent) < LTSH_TINY * dot(center, center);
 
+    /* Of a round one that is smaller still its center stands for all of it. */
+    bool is_point = whole && light.is_round && light.whole_count > 0 && dot(extent, extent) < LTSH_POINT * dot(center, center);
+
     @name@_sum sum = @name@_empty();
+    for (int i = 0; i < (is_point ? 1 : 0); ++i) {
+        float inverse = inversesqrt(max(dot(center, center), 1e-37));
+        float solid_angle = LTSH_PI * dot(inverse * center, cross(inverse * along_u, inverse * along_v));
+        sum = @name@_with_spot(sum, inverse * center, solid_angle);
+    }
     int first_count = whole && !tiny ? light.whole_count : 0;
     vec2 place = ltsh_corner(light.whole_first + light.whole_count - 1);
     vec3 start = ltsh_unit(center + place.x * along_u + place.y * along_v);
@@ -50,7 +58,7 @@
         start = end;
     }
 
-    int tiny_count = whole && tiny ? light.whole_count : 0;
+    int tiny_count = whole && tiny && !is_point ? light.whole_count : 0;
     start = place.x * along_u + place.y * along_v;
     for (int i = 0; i < tiny_count; ++i) {
         place = ltsh_corner(light.whole_first + i);

@@ -46,13 +46,13 @@ void main()
         seen = texelFetch(shares, ivec3(texel, i), 0).xy;
 #endif
 #ifdef LTSH_SPECULAR
-        ltsh_light shining = ltsh_seen_light(header, point.position, weights.width);
+        ltsh_light shining = ltsh_seen_light(header, point, weights.width);
         bool shines = received && glossy && (flags & LTSH_SPECULAR_FLAG) != 0;
         shining.count = shines && !focused ? shining.count : 0;
         shining.whole_count = shines && !focused ? shining.whole_count : 0;
         vec4 values = specular_values(weights, specular_integral(shine, shining));
 #ifdef LTSH_FOCUSED
-        shining = ltsh_seen_light(header, point.position, weights.width);
+        shining = ltsh_seen_light(header, point, weights.width);
         values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
 #endif
 #ifndef LTSH_COSINE
@@ -60,19 +60,27 @@ void main()
 #ifdef LTSH_FOCUSED
         profile = focused ? ltsh_range_of_profile(shining, header) : profile;
 #endif
-        values = specular_limited(values, point, shining, ltsh_light_texel(header + 6).z, profile);
+        float area = ltsh_light_texel(header + 6).z;
+        area = (flags & LTSH_FACING_FLAG) != 0 ? LTSH_PI * dot(shining.half_u, shining.half_u) : area;
+        values = specular_limited(values, point, shining, area, profile);
+#endif
+#ifdef LTSH_FACING
+        values *= shines ? ltsh_mean_emission(header, point, shining, point.normal, weights.width) : 1.0;
 #endif
         reflected += seen.x * ltsh_reflected(point, values);
 #endif
 #ifdef LTSH_DIFFUSE
-        ltsh_light lighting = ltsh_seen_light(header, point.position, 1.0);
+        ltsh_light lighting = ltsh_seen_light(header, point, 1.0);
         bool lights_up = received && (flags & LTSH_DIFFUSE_FLAG) != 0;
         lighting.count = lights_up && !focused ? lighting.count : 0;
         lighting.whole_count = lights_up && !focused ? lighting.whole_count : 0;
         float form_factor = diffuse_form_factor(matte, diffuse_integral(matte, lighting));
 #ifdef LTSH_FOCUSED
-        lighting = ltsh_seen_light(header, point.position, 1.0);
+        lighting = ltsh_seen_light(header, point, 1.0);
         form_factor += diffuse_focused(matte, lighting, header, 1.0, lights_up && focused).x;
+#endif
+#ifdef LTSH_FACING
+        form_factor *= lights_up ? ltsh_mean_emission(header, point, lighting, matte.plane_0, -1.0) : 1.0;
 #endif
         reflected += seen.y * form_factor * base.xyz;
 #endif

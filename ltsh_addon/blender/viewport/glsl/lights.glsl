@@ -11,24 +11,21 @@ struct ltsh_point {
 };
 
 /* The light as lobes `width` radians wide need it: of round ones the number of corners depends on that. */
-ltsh_light ltsh_seen_light(int header, vec3 position, float width)
+ltsh_light ltsh_seen_light(int header, ltsh_point point, float width)
 {
-    vec4 center = ltsh_light_texel(header);
-    vec4 half_u = ltsh_light_texel(header + 1);
-    vec4 half_v = ltsh_light_texel(header + 2);
-    vec4 direction = ltsh_light_texel(header + 3);
     vec4 more = ltsh_light_texel(header + 5);
     ltsh_light light;
-    light.offset = center.xyz - position;
-    light.half_u = half_u.xyz;
-    light.half_v = half_v.xyz;
-    light.direction = direction.xyz;
+    ltsh_placed placed = ltsh_place_light(header, point.position, point.normal);
+    light.offset = placed.offset;
+    light.half_u = placed.half_u;
+    light.half_v = placed.half_v;
+    light.direction = placed.direction;
     light.bound = more.w;
-    float reach = more.z;
+    float reach = min(more.z, max(length(light.half_u), length(light.half_v)));
     float beyond = sqrt(dot(light.offset, light.offset)) - reach;
     float wide = reach / (max(max(abs(dot(light.offset, light.direction)), beyond), 1e-12 * reach) * width);
-    light.first = int(center.w);
-    light.count = int(half_u.w);
+    light.first = int(ltsh_light_texel(header).w);
+    light.count = int(ltsh_light_texel(header + 1).w);
     light.is_round = light.count == 0;
     bool round = light.is_round;
 @LEVELS@
@@ -43,9 +40,11 @@ bool ltsh_receives(int header, ltsh_point point)
 {
     vec4 direction = ltsh_light_texel(header + 3);
     vec3 center = ltsh_light_texel(header).xyz;
+    int flags = int(ltsh_light_texel(header + 2).w);
+    vec3 position = (flags & LTSH_DISTANT_FLAG) != 0 ? vec3(0.0) : point.position;
     /* A flat surface that shines must not light itself where its points are rounded to behind it. */
-    float rounding = 4e-7 * dot(abs(center) + abs(point.position), vec3(1.0));
-    bool facing = dot(center - point.position, direction.xyz) < -rounding;
+    float rounding = 4e-7 * dot(abs(center) + abs(position), vec3(1.0));
+    bool facing = (flags & LTSH_FACING_FLAG) != 0 || dot(center - position, direction.xyz) < -rounding;
     int count = int(ltsh_light_texel(header + 4).w);
     bool received = count < 0;
     for (int i = 0; i < count; ++i) {

@@ -1,0 +1,102 @@
+/* What the cone and the falloff of lights that face every point leave of them: `mean_emission` of `shading.facing`. */
+
+/* The factor along a unit direction that meets the light, its own center at `offset`. */
+float ltsh_emission(int header, int flags, vec3 offset, vec3 direction)
+{
+    float radius = length(ltsh_light_texel(header + 1).xyz);
+    vec2 falloff = ltsh_light_texel(header + 6).xy;
+    float squared = dot(offset, offset);
+    bool ball = (flags & LTSH_BALL_FLAG) != 0;
+    float factor = 1.0;
+    if ((flags & LTSH_CONE_FLAG) != 0 && !(ball && squared <= radius * radius)) {
+        int first = int(ltsh_light_texel(header).w);
+        vec4 u = ltsh_light_texel(first);
+        vec4 v = ltsh_light_texel(first + 1);
+        vec4 w = ltsh_light_texel(first + 2);
+        vec3 local = vec3(dot(u.xyz, direction), dot(v.xyz, direction), dot(w.xyz, direction));
+        float cosine = local.z * inversesqrt(max(dot(local, local), 1e-37));
+        float share = clamp((cosine - u.w) * v.w, 0.0, 1.0);
+        factor = share * share * (3.0 - 2.0 * share);
+    }
+    if (falloff.x > 0.0 || falloff.y > 0.0) {
+        float along = dot(offset, direction);
+        float least = 1e-9 * sqrt(squared) + 1e-37;
+        float rest = radius * radius - squared;
+        float root = sqrt(max(rest + along * along, 0.0));
+        float reach = rest < 0.0 ? -rest / max(along + root, least) : along + root;
+        reach = ball ? reach : squared / max(along, least);
+        float power = falloff.x < 0.5 ? 1.0 : (falloff.x < 1.5 ? reach : reach * reach);
+        factor *= power * reach * reach / (reach * reach + falloff.y);
+    }
+    return factor;
+}
+
+/* BRDF times cosine of a white lobe, but for constants: GGX, or a cosine where alpha is negative. */
+float ltsh_lobe_value(vec3 normal, vec3 view, float alpha, vec3 direction)
+{
+    float cosine = max(dot(normal, direction), 0.0);
+    if (alpha < 0.0) {
+        return cosine;
+    }
+    vec3 half_way = view + direction;
+    vec3 across = cross(normal, half_way);
+    float vertical = dot(normal, half_way);
+    float alpha2 = alpha * alpha;
+    float horizontal = dot(across, across);
+    float ratio = (horizontal + vertical * vertical) / max(horizontal + alpha2 * vertical * vertical, 1e-30);
+    float facing = max(dot(normal, view), 0.0);
+    float masking = facing * sqrt(cosine * cosine + alpha2 * (1.0 - cosine * cosine))
+        + cosine * sqrt(facing * facing + alpha2 * (1.0 - facing * facing));
+    return ratio * ratio * cosine / max(masking, 1e-30);
+}
+
+float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 normal, float alpha)
+{
+    int flags = int(ltsh_light_texel(header + 2).w);
+    vec2 falloff = ltsh_light_texel(header + 6).xy;
+    bool plain = (flags & LTSH_FACING_FLAG) == 0
+        || ((flags & LTSH_CONE_FLAG) == 0 && falloff.x == 0.0 && falloff.y == 0.0);
+    vec3 own = ltsh_light_texel(header).xyz - point.position;
+    /* Toward the axis of the cone, where its factor changes most. */
+    vec3 u = light.half_u;
+    if (!plain && (flags & LTSH_CONE_FLAG) != 0) {
+        int first = int(ltsh_light_texel(header).w);
+        vec3 row_x = ltsh_light_texel(first).xyz;
+        vec3 row_y = ltsh_light_texel(first + 1).xyz;
+        vec3 row_z = ltsh_light_texel(first + 2).xyz;
+        vec3 axis = ltsh_unit(light.offset);
+        vec3 local = vec3(dot(row_x, axis), dot(row_y, axis), dot(row_z, axis));
+        vec3 rise = row_z * dot(local, local) - local.z * (local.x * row_x + local.y * row_y + local.z * row_z);
+        rise -= dot(rise, axis) * axis;
+        u = dot(rise, rise) > 0.0 ? length(light.half_u) * ltsh_unit(rise) : u;
+    }
+    vec3 v = cross(light.direction, u);
+    float middle = plain ? 1.0 : ltsh_emission(header, flags, own, ltsh_unit(light.offset));
+    float least = middle;
+    float most = middle;
+    float rim = 0.0;
+    for (int i = 0; i < (plain ? 0 : 6); ++i) {
+        float angle = float(i) * (LTSH_PI / 3.0);
+        float value = ltsh_emission(header, flags, own, ltsh_unit(light.offset + cos(angle) * u + sin(angle) * v));
+        least = min(least, value);
+        most = max(most, value);
+        rim += value / 6.0;
+    }
+    float mean = plain ? 1.0 : 0.5 * (middle + rim);
+    bool changes = !plain && most - least > LTSH_CHANGING * most;
+    float total = 0.0;
+    float weights = 0.0;
+    for (int i = 0; i < (changes ? LTSH_NODES_ALONG : 0); ++i) {
+        float angle = LTSH_PI * float(i + 1) / float(LTSH_NODES_ALONG + 1);
+        for (int j = -1; j < 2; ++j) {
+            vec3 place = light.offset + cos(angle) * u + float(j) * 0.7745967 * sin(angle) * v;
+            float inverse = inversesqrt(dot(place, place));
+            vec3 direction = inverse * place;
+            float weight = sin(angle) * sin(angle) * (j == 0 ? 8.0 : 5.0) * inverse * inverse * inverse;
+            weight *= ltsh_lobe_value(normal, point.view, alpha, direction);
+            total += weight * ltsh_emission(header, flags, own, direction);
+            weights += weight;
+        }
+    }
+    return changes && weights > 0.0 ? total / weights : mean;
+}

@@ -155,7 +155,7 @@ def test_a_command_that_works_gives_its_report_and_its_progress(monkeypatch, roo
 @pytest.mark.parametrize(
     ("arguments", "error", "complaint"),
     [
-        ([], SceneError("no area light\nthat renders"), "no area light that renders"),
+        ([], SceneError("no light\nthat renders"), "no light that renders"),
         (["--aa", "none"], None, "ltsh shade: argument --aa: 'none' was given"),
         (["--camera", "A"], RuntimeError("what?"), "unexpected error: RuntimeError: what?"),
     ],

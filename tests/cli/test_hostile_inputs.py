@@ -285,7 +285,7 @@ def test_a_folder_whose_path_is_no_utf8_is_refused(tmp_path):
 def test_a_scene_that_fails_leaves_no_empty_folder(capsys, monkeypatch, room, tmp_path):
     from ltsh_addon.scene import SceneError
 
-    fake_scene.FakeChild(error=SceneError("no area light")).install(monkeypatch)
+    fake_scene.FakeChild(error=SceneError("no light")).install(monkeypatch)
     assert fake_scene.run(capsys, "shade", room, "-o", tmp_path / "a" / "b")[0] == 1
     assert not (tmp_path / "a").exists()
 

@@ -167,7 +167,7 @@ def test_a_frame_that_cannot_be_rendered_is_an_error(blender, demo, tmp_path):
         *("-b", demo[0] / "demo.blend", "--python-expr", no_lights, "-E", "LTSH", "-o", tmp_path / "dark_", "-f", "1")
     )
     assert done.returncode == 1
-    assert "LTSH: scene 'Scene': no area light that renders" in done.stdout + done.stderr
+    assert "LTSH: scene 'Scene': no light that renders" in done.stdout + done.stderr
     assert not list(tmp_path.glob("dark_*"))
 
 

@@ -121,7 +121,7 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
 
     def fail_at_two(options, *, progress=None):
         if options.frame == 2:
-            raise SceneError("room.blend: no area light\nat this frame")
+            raise SceneError("room.blend: no light\nat this frame")
         return extract(options, progress=progress)
 
     from ltsh_addon.blender.process import client
@@ -129,7 +129,7 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
     monkeypatch.setattr(client, "extract", fail_at_two)
     arguments = ["shade", room, "--frames", "1-3", *SMALL]
     code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one")
-    assert code == 1 and "failed: shade_0002: room.blend: no area light at this frame" in stderr.splitlines()
+    assert code == 1 and "failed: shade_0002: room.blend: no light at this frame" in stderr.splitlines()
     stderr = run(capsys, *arguments[:-1], "-o", tmp_path / "told")[2]
     assert "2 of 3: shade_0002 failed in " in stderr and "3 of 3: shade_0003 in " in stderr
     codes = [run(capsys, *arguments, "-o", tmp_path / "two", "--shard", shard)[0] for shard in ("1/2", "2/2")]

@@ -34,7 +34,7 @@ REST_SECONDS, LONGEST_REST = 0.25, 1.0
 QUICK_SECONDS = 0.03
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
-NO_LIGHTS = "No area light and no glowing mesh shines here: add an area light"
+NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
 # Shares by which the shapes of two pictures may differ: sizes are whole pixels.
 SAME_SHAPE = 0.01
 MOST_NOTES = 4

@@ -201,7 +201,7 @@ def no_light(scene, reasons: list[str]) -> SceneError:
     text = f"found lights {listed(found, NAMED)}" if found else "found no lights at all"
     if reasons:
         text += f" ({listed((line.partition('; left out')[0] for line in reasons), NAMED, '; ')})"
-    return SceneError(f"scene {scene.name!r}: no area light that renders, {text}; add an area light")
+    return SceneError(f"scene {scene.name!r}: no light that renders, {text}; add a light")
 
 
 def extract(job: dict, folder: Path, progress) -> dict:

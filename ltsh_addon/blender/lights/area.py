@@ -1,4 +1,4 @@
-"""Lights of an evaluated scene as `AreaLight` (runs in the child); see `points` for those that are no area lights.
+"""Lights of an evaluated scene as `AreaLight` (runs in the child); see `points` for those that are no lights.
 
 Radiance as Cycles has it: L = color * temperature color * energy * 2^exposure / pi [/ area if normalize], one-sided
 along the local -Z axis. Size and shape follow the first two columns of the world matrix. Measured against

@@ -132,18 +132,13 @@ def _camera(scene) -> list[Problem]:
 
 
 def _lights(scene) -> list[Problem]:
-    areas = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.data.type == "AREA"]
-    if any(not ob.hide_render for ob in areas) or any(glows(material) for material in materials_of(scene)):
+    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
         return []
-    if areas:
-        text = f"Light {areas[0].name!r} is hidden in renders, and no other area light is there"
-        return [Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": areas[0].name})]
-    others = [ob.name for ob in scene.objects if ob.type == "LIGHT"]
-    if others:
-        text = f"No area light: {others[0]!r} is a light of another kind, which is not shaded"
-    else:
-        text = "No area light"
-    return [Problem(text, True, "ltsh.add_area_light", "Add Light")]
+    if lights:
+        text = f"Light {lights[0].name!r} is hidden in renders, and no other light is there"
+        return [Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": lights[0].name})]
+    return [Problem("No light", True, "ltsh.add_area_light", "Add Light")]
 
 
 def materials_of(scene) -> list:

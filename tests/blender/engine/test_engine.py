@@ -280,7 +280,7 @@ def test_faults_fail_the_render_with_their_reason(scene, monkeypatch):
         bpy.ops.render.render()
     bpy.data.objects.remove(bpy.data.objects["Cover"])
     bpy.data.objects.remove(bpy.data.objects["Light"])
-    with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no area light"):
+    with pytest.raises(RuntimeError, match="LTSH: scene 'Scene': no light"):
         bpy.ops.render.render()
     assert not render_module._copy
 

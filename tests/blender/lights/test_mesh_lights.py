@@ -124,7 +124,7 @@ def test_dark_materials_are_no_lights():
         add_lamp_plane(lamp_material(f"Dark {number}", **settings)[0])
     hidden = add_lamp_plane()
     hidden.visible_diffuse = hidden.visible_glossy = False
-    with pytest.raises(SceneError, match="no area light"):
+    with pytest.raises(SceneError, match="no light"):
         scene_parts.prepare()
 
 

@@ -116,7 +116,7 @@ def test_a_process_that_dies_is_told(scene):
 
 def test_what_cannot_be_shaded_or_started_is_told(scene, monkeypatch):
     bpy.data.objects["Light"].data.energy = 0.0
-    assert "no area light" in faults_of(bpy.ops.ltsh.shade)
+    assert "no light" in faults_of(bpy.ops.ltsh.shade)
     monkeypatch.setattr(blender_process, "start", fail)
     assert "cannot read" in faults_of(bpy.ops.ltsh.compare)
 

@@ -19,6 +19,7 @@ from .facing import FacingDisk, Lobe, mean_emission
 from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .lookup_table import MIN_ALPHA
+from .patch_tree import PatchTree
 from .polygon import convex_pieces, dot
 from .tails import SeenLight, TailLimits
 
@@ -30,6 +31,9 @@ CHUNK = 24592
 CORNERS = 4 * CHUNK
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
+# Pairs of samples and patches of a distant light at a time; and the share of small lights' size in that of patches that
+# are shaded by their centers: what is lost on one patch its neighbors gain.
+PAIR_CHUNK, PATCH_SHARE = 16384, 0.25
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -140,6 +144,9 @@ class _Lighting:
         sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
         for (light, group, corners), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
             allowed = light.receives(samples.receiver, index)
+            if float64.has_patches(light):
+                self._add_patches(lobes, light, group, sums[group])
+                continue
             if light.is_focused or light.cone is not None:
                 near = may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
@@ -239,9 +246,68 @@ class _Lighting:
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
         return Lobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
 
+    def _add_patches(self, lobes, light, group, total) -> None:
+        """Add the patches of a distant light to total (F, 3, Q)."""
+        tree, samples, is_specular = PatchTree.of(light), self.samples, lobes.sharpest is not None
+        names = ("normal", "geometric_normal") if is_specular else ("diffuse_normal", "smooth_normal")
+        columns = np.arange(len(lobes.index))
+        allowed = light.receives(samples.receiver, lobes.index)
+        columns = columns if allowed is None else columns[allowed]
+        horizons = [getattr(samples, name) for name in names]
+        if not is_specular and len(lobes.clip_rows) == 1:
+            total[0][:, columns] += tree.form_factors(samples.diffuse_normal[lobes.index[columns]])
+            return
+        redone = []
+        for chosen, patches in tree.pairs(samples, horizons, lobes.index[columns], is_specular):
+            for part in moments32.pieces(len(chosen), PAIR_CHUNK):
+                column, patch = columns[chosen[part]], patches[part]
+                found, redo = self._patch_integrals(lobes, tree, column, patch)
+                if redo.any():
+                    redone.append((lobes.index[column[redo]], patch[redo]))
+                low = int(column.min())
+                column, radiance = column - low, tree.radiance[:, patch]
+                width = int(column.max()) + 1
+                for integral, target in zip(found, total, strict=True):
+                    for channel in range(3):
+                        target[channel, low : low + width] += np.bincount(column, integral * radiance[channel], width)
+        for members, patches in redone:
+            target = np.zeros((len(samples), 3))
+            float64.shade_patches(samples, members, patches, tree, target, self._shade_one)
+            self.radiance[group] += target.astype(np.float32)
+
+    def _shade_one(self, samples, lights, radiance, _):
+        self.shade_in_float64(samples, lights, radiance)
+
+    def _patch_integrals(self, lobes, tree, column, patch):
+        """Integrals (F, Q) of the lobes `column` (Q,) over one patch each, and the mask (Q,) of those that are left to
+        float64, which are 0."""
+        offset, area = tree.center[:, patch], tree.area_vectors(patch)
+        half_u, half_v = tree.half_u[:, patch], tree.half_v[:, patch]
+        diagonal = dot(half_u, half_u) + dot(half_v, half_v)
+        rays = small_lights.Rays.along(offset, area, diagonal)
+        size = small_lights.seen_sizes(lobes, column, rays, np.sqrt(diagonal))
+        rays = replace(rays, slack=small_lights.VARIATION * size)
+        small, lit = small_lights.small_and_lit(lobes, column, rays, np.sqrt(diagonal), PATCH_SHARE * size)
+        found, redo = np.zeros((len(lobes.colors), len(column)), np.float32), np.zeros(len(column), bool)
+        chosen = np.flatnonzero(lit)
+        if len(chosen):
+            rays = replace(rays.take(chosen), diagonal=diagonal[chosen])
+            found[:, chosen] = lobes.at_point(column[chosen], rays)
+        chosen = np.flatnonzero(~small)
+        if len(chosen):
+            column, patch = column[chosen], patch[chosen]
+            axes = lobes.rows[:, :, column]
+            corners = tree.corners(patch)
+            polygons = np.stack([dot(row[:, None], corners) for row in axes])
+            facing, integrate = np.ones(len(column), bool), partial(lobes.integrate, column)
+            found[:, chosen], redo[chosen] = integrate_visible(polygons, facing, lobes.clip_rows, len(found), integrate)
+            found[:, redo] = 0.0
+        return found, redo
+
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""
-        if len(members) * len(self.lights) < FLOAT64_CHUNK:
+        has_patches = any(float64.has_patches(light) for light, _, _ in self.lights)
+        if not has_patches and len(members) * len(self.lights) < FLOAT64_CHUNK:
             for (light, _, _), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
                 allowed = light.receives(self.samples.receiver, members)
                 needs_float64.append(members if allowed is None else members[allowed])

@@ -14,8 +14,9 @@ from . import diffuse, facing, light_cone
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
-from .lobes import LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
+from .lobes import FLOAT64_CHUNK, LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import MIN_ALPHA, Lobe, LookupTable
+from .patch_tree import PatchTree
 from .polygon import dot
 from .reference import reference_integrals
 from .spherical_harmonics import coefficient_index
@@ -44,6 +45,9 @@ class LightOfEachSample:
     is_round: bool = False
     is_distant: bool = False
     is_facing: bool = False
+    shape: str = "RECTANGLE"
+    has_falloff: bool = False
+    detail: tuple = ()
 
     def take(self, index) -> LightOfEachSample:
         """The lights of the samples `index`."""
@@ -59,6 +63,27 @@ class LightOfEachSample:
         return None
 
 
+def has_patches(light) -> bool:
+    """True for a distant light with a detail: the paths of both precisions choose its patches themselves."""
+    return light.is_distant and len(light.detail) > 0
+
+
+def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -> None:
+    """Add to radiance (P, 3) what samples `members` (N,) reflect of one patch each; shade(samples, lights, radiance,
+    members) does it for one light per sample."""
+    for start in range(0, len(members), FLOAT64_CHUNK):
+        index, patch = members[start : start + FLOAT64_CHUNK], patches[start : start + FLOAT64_CHUNK]
+        vectors = (tree.center, tree.half_u, tree.half_v, tree.radiance)
+        center, half_u, half_v, light = (values[:, patch].T.astype(np.float64) for values in vectors)
+        direction = np.broadcast_to(tree.direction.astype(np.float64), center.shape)
+        area = tree.area_vectors(patch).T.astype(np.float64)
+        own = LightOfEachSample(center, direction, light, half_u, half_v, area, is_distant=True)
+        corners = tree.corners(patch).transpose(1, 2, 0).astype(np.float64)
+        target = np.zeros((1, len(index), 3))
+        shade(samples.take(index), [(own, 0, corners)], target, index)
+        np.add.at(radiance, index, target[0])
+
+
 def _of(vector, index):
     """The vector (3,) that is the same for all samples, or those of the samples `index`."""
     return vector if vector.ndim == 1 else vector[index]
@@ -69,8 +94,23 @@ def shade_diffuse(samples, lights, radiance):
     frame = local_frames(samples.diffuse_normal, samples.view)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
     kinds = list(_diffuse_kinds(samples, frame, lit))
+    is_plain = (samples.diffuse_normal[lit] == samples.smooth_normal[lit]).all(axis=1)
+    is_plain &= (samples.sheen_a[lit] == 0.0) & (samples.diffuse_roughness[lit] == 0.0)
+
+    def shade_own(part, own, target, _):
+        shade_diffuse(part, own, target)
+
     for light, group, corners in lights:
         if not light.affects_diffuse:
+            continue
+        if has_patches(light):
+            tree, normals = PatchTree.of(light), (samples.diffuse_normal, samples.smooth_normal)
+            index = _receiving(samples, light, lit[is_plain])
+            reflected = tree.form_factors(samples.diffuse_normal[index]).T * samples.diffuse_albedo[index]
+            radiance[group, index] += reflected
+            index = _receiving(samples, light, lit[~is_plain])
+            for columns, patches in tree.pairs(samples, normals, index, False):
+                shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
             continue
         for candidates, second_normal, count, integral in kinds:
             for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
@@ -120,6 +160,12 @@ def _mean_emission(light, samples, index, lobe):
     return disk.gain * facing.mean_emission(light, offset, disk, lobe)
 
 
+def _receiving(samples, light, index):
+    """Those of the samples `index` that the light lights."""
+    allowed = light.receives(samples.receiver, index)
+    return index if allowed is None else index[allowed]
+
+
 def lobe_width(samples, index) -> np.ndarray:
     """About how many radians (Q,) wide the specular lobes are: alpha."""
     return np.maximum(samples.roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
@@ -153,8 +199,21 @@ def shade_specular(samples, lights, table, radiance, error=None):
     lobe = None
     if table != REFERENCE and len(lit):
         lobe = _fresnel_lobe(table, cosine, samples)
+
+    def shade_own(part, own, target, index):
+        estimates = None if error is None else np.zeros(len(index))
+        shade_specular(part, own, table, target, estimates)
+        if error is not None:
+            np.add.at(error, index, estimates)
+
     for light, group, corners in lights:
         if not light.affects_specular:
+            continue
+        if has_patches(light):
+            tree, normals = PatchTree.of(light), (samples.normal, samples.geometric_normal)
+            index = _receiving(samples, light, lit)
+            for columns, patches in tree.pairs(samples, normals, index, True):
+                shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
             continue
         if table == REFERENCE:
             parts = reference_integrals(samples, cosine, frame, light, corners, lit, error)

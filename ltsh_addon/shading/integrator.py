@@ -73,8 +73,11 @@ class Task:
         leftovers: dict[str, list] = {name: [] for name in self.passes}
         plain = self._prepared(light for light in self.lights if not light.detail)
         self._add(samples, plain, radiance, error, scratch, leftovers)
+        with_patches = [light for light in self.lights if float64.has_patches(light)]
+        if with_patches:
+            self._add(samples, self._prepared(with_patches), radiance, error, scratch, {})
         for light in self.lights:
-            if light.detail:
+            if light.detail and not float64.has_patches(light):
                 for name in self.passes:
                     self._add_detailed(samples, light, name, radiance[name], error, scratch)
         return radiance, error, leftovers

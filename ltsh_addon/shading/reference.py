@@ -297,7 +297,7 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
     else:
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
         batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
-    profile = light_cone.Profile.of(light)
+    profile = light_cone.Profile.of(light) if light.has_falloff else None
     for index, make_boundary, cone in batches:
         if light.is_facing and (light.has_falloff or light.cone is not None):
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)

@@ -105,7 +105,7 @@ def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np
     small = size < np.float32(LARGEST)
     lit = rays.flux > 0.0
     for row, length in zip(lobes.clip_rows, lobes.clip_lengths, strict=True):
-        height = dot(lobes.rows[row, :, part], rays.offset)
+        height = dot(lobes.rows[row][:, part], rays.offset)
         small &= np.abs(height) > np.float32(radius) * length[part]
         lit &= height > 0.0
     return small, lit & small

@@ -1,0 +1,262 @@
+"""Light from all directions, of which square pictures are known, as distant lights. Needs no bpy.
+
+Six pictures make up the cube around a sample. Each becomes a distant rectangle with its mean radiance; the tree of its
+`detail` has the parts that differ from it, each of which has its own mean. Where something as small and bright as the
+sun stands, it becomes a light of its own, and the pictures keep the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..scene import AreaLight
+
+# Half axes (right, up) of the pictures of a cube, by where they look.
+CUBE = tuple(
+    (np.array(ahead, float), np.array(right, float), np.array(up, float))
+    for ahead, right, up in (
+        ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
+        ((-1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        ((0, 1, 0), (1, 0, 0), (0, 0, 1)),
+        ((0, -1, 0), (-1, 0, 0), (0, 0, 1)),
+        ((0, 0, 1), (1, 0, 0), (0, -1, 0)),
+        ((0, 0, -1), (1, 0, 0), (0, 1, 0)),
+    )
+)
+# Mean absolute difference of the radiance from that of the smallest patches, by the mean radiance.
+ERROR = 0.02
+# Of all pictures together.
+MOST_PATCHES = 6144
+# Levels of halving both sides of a patch from a patch to its parts.
+LEVELS = 2
+# What is so many times as bright as the mean, has this share of the light and fits into this angle, in rad, is a spot.
+SPOT_BRIGHTNESS, SPOT_SHARE, SPOT_RADIUS = 100.0, 0.01, 0.06
+MOST_SPOTS, SPOT_PATCHES = 8, 256
+# What a disk of constant radiance may miss of a spot.
+DISK_ERROR = 0.25
+
+
+@dataclass(frozen=True)
+class SkyPicture:
+    """Radiance (N, N, 3) from the directions ahead + s right + t up, s and t in [-1, 1]; row 0 is at t = 1."""
+
+    ahead: np.ndarray  # (3,) unit
+    right: np.ndarray  # (3,)
+    up: np.ndarray  # (3,)
+    radiance: np.ndarray
+
+    def offsets(self) -> np.ndarray:
+        """Directions (N, N, 3) of the pixels' centers, not unit."""
+        count = len(self.radiance)
+        place = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
+        return self.ahead + place[None, :, None] * self.right - place[:, None, None] * self.up
+
+    def solid_angles(self) -> np.ndarray:
+        """Solid angles (N, N) of the pixels in sr."""
+        offsets = self.offsets()
+        area = 4.0 * np.linalg.norm(self.right) * np.linalg.norm(self.up) / len(self.radiance) ** 2
+        return area * np.square(offsets).sum(axis=-1) ** -1.5
+
+
+@dataclass(frozen=True)
+class Spot:
+    """Something small and bright: where it is, how far (in rad) its parts are from there, and its radiance above
+    which it is one."""
+
+    direction: np.ndarray  # (3,) unit
+    radius: float
+    least: float  # mean of the three colors
+
+
+def luminance(radiance: np.ndarray) -> np.ndarray:
+    """Mean absolute value (...) of colors (..., 3)."""
+    return np.abs(radiance).mean(axis=-1)
+
+
+def above(radiance: np.ndarray, least: float) -> np.ndarray:
+    """What colors (..., 3) have above the luminance `least`."""
+    own = luminance(radiance)
+    return radiance * np.maximum(1.0 - least / np.maximum(own, 1e-30), 0.0)[..., None]
+
+
+def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
+    """The spots in the pictures of a cube, the one with the most light first."""
+    values = np.concatenate([luminance(picture.radiance).ravel() for picture in pictures])
+    angles = np.concatenate([picture.solid_angles().ravel() for picture in pictures])
+    power = values * angles
+    least, total = SPOT_BRIGHTNESS * power.sum() / angles.sum(), power.sum()
+    index = np.flatnonzero(values > least)
+    if len(index) == 0:
+        return []
+    offsets = np.concatenate([picture.offsets().reshape(-1, 3) for picture in pictures])[index]
+    offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
+    power, pixel = power[index], np.sqrt(angles.max())
+    found = []
+    while len(power) and len(found) < MOST_SPOTS:
+        center = offsets[np.argmax(power)]
+        for _ in range(3):
+            near = np.linalg.norm(offsets - center, axis=1) < SPOT_RADIUS
+            center = power[near] @ offsets[near]
+            center /= np.linalg.norm(center)
+        near = np.linalg.norm(offsets - center, axis=1) < SPOT_RADIUS
+        if not near.any() or power[near].sum() < SPOT_SHARE * total:
+            break
+        radius = np.linalg.norm(offsets[near] - center, axis=1).max() + 1.5 * pixel
+        found.append(Spot(center, float(radius), float(least)))
+        offsets, power = offsets[~near], power[~near]
+    return found
+
+
+def spot_frame(spot: Spot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ahead, right and up of the picture that has all of a spot."""
+    axis = np.eye(3)[np.argmin(np.abs(spot.direction))]
+    right = np.cross(spot.direction, axis)
+    right *= np.tan(spot.radius) / np.linalg.norm(right)
+    return spot.direction, right, np.cross(right, spot.direction)
+
+
+def without_spots(picture: SkyPicture, spots: list[Spot]) -> SkyPicture:
+    """The picture with no more than the least radiance of each spot where it is."""
+    radiance = picture.radiance
+    offsets = picture.offsets()
+    for spot in spots:
+        ahead, right, up = spot_frame(spot)
+        along = offsets @ ahead
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = [np.abs(offsets @ axis / along) / (axis @ axis) for axis in (right, up)]
+        inside = (along > 0.0) & (np.maximum(*places) < 1.0)
+        radiance = radiance - np.where(inside[..., None], above(radiance, spot.least), 0.0)
+    return replace(picture, radiance=radiance)
+
+
+def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLight]:
+    """What a close `picture` of a spot shows of it as a light with the name and traits of `like`: a disk, where that is
+    what it looks like; [] where it shows none."""
+    radiance, angles = above(picture.radiance, spot.least), picture.solid_angles()
+    values = luminance(radiance)
+    power = (values * angles).sum()
+    if power <= 0.0:
+        return []
+    # The edge of the sun is dark: it counts up to a fourth of the mean.
+    mean = (values * values * angles).sum() / power
+    solid_angle = min(angles[values > 0.25 * mean].sum(), np.pi)
+    offsets = picture.offsets()
+    offsets /= np.linalg.norm(offsets, axis=-1, keepdims=True)
+    center = ((values * angles)[..., None] * offsets).sum(axis=(0, 1))
+    center /= np.linalg.norm(center)
+    radius = np.arccos(1.0 - solid_angle / (2.0 * np.pi))
+    inside = np.linalg.norm(offsets - center, axis=-1) < 2.0 * np.sin(0.5 * radius)
+    light = (radiance * angles[..., None]).sum(axis=(0, 1)) / solid_angle
+    missed = (np.abs(values - inside * luminance(light)) * angles).sum()
+    if missed > DISK_ERROR * power:
+        return sky_lights(like, [replace(picture, radiance=radiance)], SPOT_PATCHES)[0]
+    _, right, up = spot_frame(replace(spot, direction=center, radius=radius))
+    return [replace(like, shape="DISK", center=center, half_u=right, half_v=up, direction=-center, radiance=light)]
+
+
+def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[AreaLight], float]:
+    """A distant light with a `detail` for each of the pictures that is not dark, with the name and traits of `like`,
+    and the mean absolute difference of the smallest patches from the pictures, by the mean radiance."""
+    trees = [_Tree.of(picture) for picture in pictures]
+    total = sum((luminance(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
+    limit, error = _limit(trees, ERROR * total, most)
+    lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
+    found = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]
+    return found, error / total if total > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """Squares of a picture by level: 2^k of them along each side."""
+
+    means: list[np.ndarray]  # (2^k, 2^k, 3)
+    errors: list[np.ndarray]  # (2^k, 2^k), about, of the luminance, by sr
+
+    @classmethod
+    def of(cls, picture: SkyPicture) -> _Tree:
+        """Of a picture with a power of two of pixels along each side."""
+        weight = picture.solid_angles()
+        light, squares = picture.radiance * weight[..., None], np.square(picture.radiance).mean(axis=-1) * weight
+        means, errors = [], []
+        while True:
+            mean = light / weight[..., None]
+            variance = np.maximum(squares / weight - np.square(mean).mean(axis=-1), 0.0)
+            means.append(mean)
+            # The mean absolute difference is less than the standard deviation, by about so much.
+            errors.append(0.8 * weight * np.sqrt(variance))
+            if len(weight) == 1:
+                break
+            light, squares, weight = (_summed(values) for values in (light, squares, weight))
+        errors[0][:] = 0.0
+        return cls(means[::-1], errors[::-1])
+
+
+def _summed(values):
+    """Sums over squares of 2 x 2."""
+    rows = values[0::2] + values[1::2]
+    return rows[:, 0::2] + rows[:, 1::2]
+
+
+def _leaves(trees, limit: float) -> tuple[int, float]:
+    """How many squares there are, and their error, where those with an error beyond the limit are cut."""
+    count, error = 0, 0.0
+    for tree in trees:
+        exists = np.ones((1, 1), bool)
+        for level, own in enumerate(tree.errors):
+            cut = exists & (own > limit) if level + 1 < len(tree.errors) else np.zeros_like(exists)
+            leaf = exists & ~cut
+            count += np.count_nonzero(leaf)
+            error += own[leaf].sum()
+            if not cut.any():
+                break
+            exists = np.repeat(np.repeat(cut, 2, axis=0), 2, axis=1)
+    return count, float(error)
+
+
+def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
+    """The largest error of a square, so that all together have the error `wanted`, or are `most`; and theirs."""
+    low, high = 0.0, max(float(errors.max()) for tree in trees for errors in tree.errors)
+    if high <= wanted * 1e-6 or high == 0.0:
+        return high, _leaves(trees, high)[1]
+    # All squares are cut at 0; none at `high`.
+    low = high * 1e-9
+    for _ in range(40):
+        middle = np.sqrt(low * high)
+        count, error = _leaves(trees, middle)
+        low, high = (middle, high) if error <= wanted or count > most else (low, middle)
+    count, error = _leaves(trees, low)
+    limit = low if count <= most else high
+    return limit, _leaves(trees, limit)[1]
+
+
+def _light(like: AreaLight, picture: SkyPicture, tree: _Tree, limit: float, place) -> AreaLight:
+    """The square `place` (level, row, column) of a picture as a light, with its parts as detail."""
+    level, row, column = place
+    size = 2.0**-level
+    across, upward = (2 * column + 1) * size - 1.0, 1.0 - (2 * row + 1) * size
+    parts = _parts(tree, limit, place)
+    return replace(
+        like,
+        center=picture.ahead + across * picture.right + upward * picture.up,
+        half_u=size * picture.right,
+        half_v=size * picture.up,
+        direction=-picture.ahead / np.linalg.norm(picture.ahead),
+        radiance=tree.means[level][row, column],
+        detail=tuple(_light(like, picture, tree, limit, part) for part in parts) if len(parts) > 1 else (),
+    )
+
+
+def _parts(tree: _Tree, limit: float, place) -> list:
+    found = [place]
+    for _ in range(LEVELS):
+        cut = []
+        for level, row, column in found:
+            is_last = level + 1 == len(tree.errors)
+            if is_last or level >= place[0] + LEVELS or tree.errors[level][row, column] <= limit:
+                cut.append((level, row, column))
+                continue
+            cut += [(level + 1, 2 * row + i, 2 * column + j) for i in (0, 1) for j in (0, 1)]
+        found = cut
+    return found

@@ -1,0 +1,76 @@
+"""Distant lights with a detail: patches chosen by the lobes give what the smallest ones do."""
+
+import numpy as np
+import pytest
+from surface_scenes import random_samples
+
+from ltsh_addon.cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, without_spots
+from ltsh_addon.scene import AreaLight
+from ltsh_addon.shading import shade
+
+LIKE = AreaLight("Sky", "RECTANGLE", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3), is_distant=True)
+
+
+def pictures(count=32, seed=1):
+    """A smooth sky with bright windows."""
+    rng = np.random.default_rng(seed)
+    waves = rng.normal(0.0, 2.0, (3, 3))
+    found = []
+    for axes in CUBE:
+        picture = SkyPicture(*axes, np.zeros((count, count, 3)))
+        offsets = picture.offsets()
+        unit = offsets / np.linalg.norm(offsets, axis=-1, keepdims=True)
+        radiance = 1.0 + 0.8 * np.sin(unit @ waves)
+        radiance[5:8, 9:14] *= 6.0
+        found.append(SkyPicture(*axes, radiance))
+    return found
+
+
+@pytest.mark.parametrize(("technique", "dtype"), [("ltsh4", np.float32), ("ltc", np.float64)])
+def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
+    """In single and in double precision; 0.5 % are what `patch_tree.PATCH_PRODUCT` allows."""
+    samples = random_samples(150, seed=2, lowest_roughness=0.25)
+    lights, error = sky_lights(LIKE, pictures())
+    assert len(lights) == 6 and error < 0.03
+    leaves = [leaf for light in lights for leaf in light.patches]
+    found = shade(samples, lights, technique, dtype=dtype, workers=1)
+    expected = shade(samples, leaves, technique, dtype=dtype, workers=1)
+    for name, most in (("specular", 0.01), ("diffuse", 2e-3)):
+        own, exact = (getattr(shading, name).sum(axis=0) for shading in (found, expected))
+        assert np.linalg.norm(own - exact) < most * np.linalg.norm(exact), name
+
+
+def test_a_constant_sky_is_one_patch_a_side_and_reflects_the_albedo():
+    """From above a plane half of the sky is seen: the diffuse reflection is the albedo."""
+    constant = [SkyPicture(*axes, np.ones((8, 8, 3))) for axes in CUBE]
+    lights, error = sky_lights(LIKE, constant)
+    assert len(lights) == 6 and error < 1e-6 and not any(light.detail for light in lights)
+    samples = random_samples(100, seed=3)
+    flat = (samples.diffuse_normal == samples.smooth_normal).all(axis=1)
+    diffuse = shade(samples, lights, "ltc", passes=("diffuse",), workers=1).diffuse.sum(axis=0)
+    assert flat.any()
+    np.testing.assert_allclose(diffuse[flat], samples.diffuse_albedo[flat], atol=2e-5)
+
+
+def test_patches_have_all_of_the_light():
+    """Radiance times solid angle, by sums over pixels that share no code with the trees."""
+    taken = pictures()
+    for light, picture in zip(sky_lights(LIKE, taken)[0], taken, strict=True):
+        (lone,) = sky_lights(LIKE, [picture], 1)[0]
+        weights = picture.solid_angles()
+        assert weights.sum() == pytest.approx(4.0 * np.pi / 6.0, rel=1e-2)
+        mean = (picture.radiance * weights[..., None]).sum(axis=(0, 1)) / weights.sum()
+        np.testing.assert_allclose(lone.radiance, mean)
+        np.testing.assert_allclose(light.radiance, mean)
+
+
+def test_a_spot_is_found_and_taken_out_of_the_pictures():
+    taken = pictures(64)
+    taken[2].radiance[20:22, 30:32] = 4e4
+    (spot,) = bright_spots(taken)
+    expected = taken[2].offsets()[20:22, 30:32].mean(axis=(0, 1))
+    np.testing.assert_allclose(spot.direction, expected / np.linalg.norm(expected), atol=2e-3)
+    left = [without_spots(picture, [spot]).radiance.max() for picture in taken]
+    assert max(left) <= 1.001 * spot.least and min(left) > 1.0
+    ahead, right, up = spot_frame(spot)
+    assert np.linalg.norm(right) == pytest.approx(np.tan(spot.radius))

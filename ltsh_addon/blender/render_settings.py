@@ -279,7 +279,6 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
             warnings.append(f"{label} is switched off, in the Cycles reference as well")
             setattr(owner, name, False)
     warnings.extend(_steps_after_rendering(scene))
-    _leave_out_world(scene, view_layer, warnings)
     scene.camera = camera
     hold_still(scene, camera)
     render.engine = "CYCLES"
@@ -295,7 +294,7 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     # The exposure is multiplied into what is read from the file, free of the property's limits.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
-    cycles.use_animated_seed = False
+    cycles.use_animated_seed = cycles.use_fast_gi = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
     # What is wholly transparent is seen through, however much of it there is, and leaves no trace in the passes.
@@ -348,30 +347,6 @@ def _steps_after_rendering(scene) -> list[str]:
     if render.use_sequencer and editor is not None and len(editor.strips):
         found.append("the video sequencer")
     return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in found]
-
-
-def _leave_out_world(scene, view_layer, warnings: list[str]) -> None:
-    world = view_layer.world_override or scene.world
-    if world is not None and _world_shines(world):
-        warnings.append(f"world {world.name!r}: its light is not shaded; left out of the Cycles reference as well")
-    has_nodes = world is not None and (bpy.app.version >= (5, 0, 0) or world.use_nodes) and world.node_tree
-    output = world.node_tree.get_output_node("CYCLES") if has_nodes else None
-    if output is not None and output.inputs["Volume"].is_linked:
-        warnings.append(f"world {world.name!r}: its volume is not shaded; left out of the Cycles reference as well")
-    view_layer.world_override = scene.world = None
-
-
-def _world_shines(world) -> bool:
-    tree = world.node_tree
-    if bpy.app.version < (5, 0, 0) and not world.use_nodes:
-        return max(world.color) > 0.0
-    for node in tree.nodes if tree else ():
-        if node.bl_idname == "ShaderNodeBackground":
-            color, strength = node.inputs["Color"], node.inputs["Strength"]
-            dark = not color.is_linked and max(color.default_value[:3]) <= 0.0
-            if not dark and (strength.is_linked or strength.default_value > 0.0):
-                return True
-    return False
 
 
 GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")

@@ -17,7 +17,8 @@ from ...files import save_array
 from ...scene import FARTHEST, SceneError, error_line, listed
 from .. import render_settings
 from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
-from ..lights.area import collect_lights, seen_lights
+from ..lights.area import collect_lights
+from ..lights.world import take_world
 from ..materials.aovs import (
     RECEIVER_PROPERTY,
     MaterialLobes,
@@ -363,6 +364,7 @@ def _open(job: dict) -> BakeScene:
         names = list(dict.fromkeys([*names, *job["following"]]))
     objects = chosen_objects(scene, view_layer, names)
     render_settings.neutralize(scene, view_layer, camera, warnings)
+    world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
     if view_layer.material_override is not None:
         override = view_layer.material_override.name
@@ -379,11 +381,14 @@ def _open(job: dict) -> BakeScene:
         if material.name_full not in inventory.emitting_materials:
             material.cycles.emission_sampling = "NONE"
     inventory.receivers.mark()
-    lights = [light.moved(origin) for light in seen_lights(scene, inventory)]
+    pixels.add_world(inventory, scene, world)
+    lights = [light.moved(origin) for light in inventory.lights]
     warnings.extend(inventory.warnings)
     if not lights:
         raise pixels.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    if job["cycles_samples"]:
+        scene.world = inventory.world
     view = view_of(seen_from, camera, bent=job["cycles_samples"] > 0)
     if view.kind == "point":
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))

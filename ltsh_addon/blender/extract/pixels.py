@@ -13,6 +13,7 @@ from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
+from ..lights.world import blocks_nothing, take_world, world_lights
 from ..materials.aovs import (
     declare_aovs,
     give_default_material,
@@ -168,6 +169,7 @@ def _reason(error: RuntimeError, path: Path) -> str:
 def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False) -> LightInventory:
     """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
+    world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
     origin = move_to_origin(scene, np.array(camera.matrix_world, dtype=np.float64)[:3, 3], warnings)
 
@@ -186,13 +188,22 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occlud
     materials += [default] if default else []
     of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque)
     inventory.receivers.mark()
-    inventory.lights = seen_lights(scene, inventory)
+    add_world(inventory, scene, world)
     warnings.extend(inventory.warnings)
     if not inventory.lights:
         raise no_light(scene, inventory.warnings)
     warnings.extend(of_materials)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     return inventory
+
+
+def add_world(inventory: LightInventory, scene, world) -> None:
+    """Look at what the lights of `inventory` emit, and at the `world`, which was that of `scene`."""
+    of_world = world_lights(scene, world, inventory.warn)
+    inventory.lights = seen_lights(scene, inventory) + of_world
+    inventory.world = world if of_world else None
+    if inventory.occluders is not None:
+        inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)
 
 
 def no_light(scene, reasons: list[str]) -> SceneError:
@@ -232,6 +243,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
             let_shadow_rays_through(inventory.made_opaque)
         else:
             remove_occlusion(scene)
+        scene.world = inventory.world
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
     return {

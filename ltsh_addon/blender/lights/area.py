@@ -45,6 +45,7 @@ class LightInventory:
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m in the file, of all positions here
     unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
+    world: Any = None  # that lights the scene
     occluders: Any = None  # visibility.Occluders, where shadows are wanted
     made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
 

@@ -268,12 +268,16 @@ class Studio:
         lens.ortho_scale = width
         lens.clip_start, lens.clip_end = (1.0 - CLIP) * distance, (1.0 + CLIP) * distance
         self._fit_pixels(width / height, pixels)
+        light = self.picture()
+        return light[..., :3], light[..., 3] > 0.5
+
+    def picture(self) -> np.ndarray:
+        """What the camera sees (H, W, 4), row 0 on top."""
         with tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
             path = Path(name) / "look.exr"
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True, scene=self.scene.name)
-            light = _read_pixels(path)
-        return light[..., :3], light[..., 3] > 0.5
+            return _read_pixels(path)
 
     def _fit_pixels(self, ratio: float, pixels: int) -> None:
         """Spread about `pixels` x `pixels` over a rectangle of `ratio` width to height."""

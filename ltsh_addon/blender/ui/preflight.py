@@ -15,6 +15,7 @@ from bpy.props import StringProperty
 from ...scene import error_line
 from ..extract.bake import ObjectError, check_object
 from ..lights.emission import emission_of
+from ..lights.world import may_shine
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from .preview import view_of
 
@@ -132,6 +133,8 @@ def _camera(scene) -> list[Problem]:
 
 
 def _lights(scene) -> list[Problem]:
+    if may_shine(scene.world):
+        return []
     lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
     if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
         return []

@@ -58,12 +58,6 @@ def settings_of_the_layer(scene):
     layer.lightgroups.add(name="Key")
     user = layer.aovs.add()
     user.name, user.type = "ltsh_roughness", "COLOR"
-    layer.world_override = world = bpy.data.worlds.new("Sky")
-    if bpy.app.version < (5, 0, 0):
-        world.use_nodes = True
-    background = next((node for node in world.node_tree.nodes if node.type == "BACKGROUND"), None)
-    background = background or world.node_tree.nodes.new("ShaderNodeBackground")
-    background.inputs["Strength"].default_value = 3.0
 
 
 def shadow_catcher(scene):
@@ -87,7 +81,7 @@ def steps_after_rendering(scene):
     ("change", "named"),
     [
         (transparent_film, ()),
-        (settings_of_the_layer, ("world 'Sky'",)),
+        (settings_of_the_layer, ()),
         (shadow_catcher, ("'Tile': shadow catcher",)),
         (steps_after_rendering, ("Freestyle", "compositing", "sequencer")),
     ],

@@ -143,14 +143,19 @@ def hair_curves(count, points=6):
 
 def add_white_world():
     """A sky of radiance 1."""
-    world = bpy.data.worlds.new("World")
+    add_world("World", Color=(1.0, 1.0, 1.0, 1.0), Strength=1.0)
+
+
+def add_world(name="World", **inputs):
+    """A sky of one Background node; (world, that node)."""
+    world = bpy.context.scene.world = bpy.data.worlds.new(name)
     if bpy.app.version < (5, 0, 0):
         world.use_nodes = True
     world.node_tree.nodes.clear()
-    sky = add_node(world.node_tree, "ShaderNodeBackground", Color=(1.0, 1.0, 1.0, 1.0), Strength=1.0)
+    sky = add_node(world.node_tree, "ShaderNodeBackground", **inputs)
     output = world.node_tree.nodes.new("ShaderNodeOutputWorld")
     world.node_tree.links.new(sky.outputs[0], output.inputs["Surface"])
-    bpy.context.scene.world = world
+    return world, sky
 
 
 def new_material(name="Material"):
@@ -243,7 +248,8 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
 
 def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
     """The Cycles reference without shadows: {"specular", "diffuse"} -> (2, H, W, 3)."""
-    scene, layer = prepared[:2]
+    scene, layer, inventory = prepared[:3]
+    scene.world = inventory.world
     pixels.remove_occlusion(scene)
     manifest = {
         "reference": pixels.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),

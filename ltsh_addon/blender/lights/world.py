@@ -1,0 +1,211 @@
+"""The light of the world: Cycles' own pictures of it, as distant lights (runs in the child)."""
+
+from __future__ import annotations
+
+import math
+from contextlib import contextmanager
+from dataclasses import replace
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
+from ...scene import AreaLight, listed
+from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
+from .emission import CONSTANT_NODES, open_studio
+
+# Pixels along each side of a picture: of a world without images, and of one with, at least and at most.
+PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
+SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
+# What patches differ by, on average, that is worth a warning.
+COARSE = 0.05
+NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1  # "NONE" and "AUTOMATIC" of a world's sampling method
+# What Light Path nodes say of the light that surfaces see, as where Cycles samples the world.
+LIGHT_PATH = "ShaderNodeLightPath"
+SEEN_BY_SURFACES = {"Is Camera Ray": 0.0, "Ray Depth": 1.0}
+EVERYWHERE_THE_SAME = (
+    CONSTANT_NODES
+    | {LIGHT_PATH, "NodeGroupInput", "NodeGroupOutput"}
+    | {"ShaderNode" + name for name in ("OutputWorld", "Background", "Emission", "AddShader", "MixShader")}
+)
+
+
+def take_world(scene, view_layer, warnings: list[str]):
+    """The world that Cycles renders, or None, which `scene` has no more from then on."""
+    world = view_layer.world_override or scene.world
+    view_layer.world_override = scene.world = None
+    if world is None:
+        return None
+    if _without_volume(world):
+        warnings.append(f"world {world.name!r}: its volume is not shaded; left out of the Cycles reference as well")
+    # What the file says here only changes how well Cycles samples the world.
+    if world.cycles.sampling_method == "NONE":
+        _store(world.cycles, "sampling_method", SAMPLED_BY_ITSELF)
+    return world
+
+
+def _store(settings, name: str, value) -> None:
+    """Set a property of Cycles past its update function, which wants the world to be that of a scene."""
+    stored = settings.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else settings
+    stored[name] = value
+
+
+def blocks_nothing(occluders, world):
+    """`occluders`, which let the light of `world` through where the file says so."""
+    if world is None or getattr(world.cycles, "use_shadows", True):
+        return occluders
+    return replace(occluders, light_masks={**occluders.light_masks, world.name: 0})
+
+
+def world_lights(scene, world, warn) -> list[AreaLight]:
+    """The light of `world`, which is that of `scene`, as distant lights that have its name; [] of a dark one."""
+    if not may_shine(world):
+        return []
+    sees = world.cycles_visibility
+    like = AreaLight(
+        name=world.name,
+        shape="RECTANGLE",
+        center=np.array([0.0, 0.0, 1.0]),
+        half_u=np.array([1.0, 0.0, 0.0]),
+        half_v=np.array([0.0, 1.0, 0.0]),
+        direction=np.array([0.0, 0.0, -1.0]),
+        radiance=np.ones(3),
+        group=world.lightgroup,
+        affects_diffuse=sees.diffuse,
+        affects_specular=sees.glossy,
+        is_distant=True,
+    )
+    if not (sees.diffuse or sees.glossy):
+        return []
+    with _observatory(scene, world, warn) as look:
+        pixels = _pixels(world)
+        pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+        spots = bright_spots(pictures)
+        lights = []
+        for number, spot in enumerate(spots):
+            close = look(*spot_frame(spot), SPOT_PIXELS, SPOT_SAMPLES)
+            lights += spot_light(like, without_spots(close, spots[:number]), spot)
+    pictures = [without_spots(picture, spots) for picture in pictures]
+    found, error = sky_lights(like, pictures)
+    if error > COARSE:
+        count = sum(len(light.patches) for light in found)
+        warn(
+            f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
+            f"{100.0 * error:.0f} % on average"
+        )
+    return found + lights
+
+
+def may_shine(world) -> bool:
+    """True unless it is plain that `world`, which may be None, is dark."""
+    if world is None:
+        return False
+    if tree_in_use(world) is None:
+        return max(world.color) > 0.0
+    surface = surface_of(world)
+    source = None if surface is None else source_of(surface)
+    if source is None or source.node is None:
+        return False
+    if source.node.bl_idname != "ShaderNodeBackground":
+        return True
+    color, strength = (value_of(source.node.inputs[name]) for name in ("Color", "Strength"))
+    return not (strength == 0.0 or (not is_socket(color) and max(color[:3]) <= 0.0))
+
+
+def _pixels(world) -> int:
+    """How many pixels along each side a picture of a quarter of the horizon needs."""
+    if all(is_group(node) or node.bl_idname in EVERYWHERE_THE_SAME for node in _nodes(world)):
+        return PLAIN
+    widths = [node.image.size[0] for node in _nodes(world) if getattr(node, "image", None) is not None]
+    if not widths:
+        return PROCEDURAL
+    return int(2 ** np.clip(round(math.log2(max(max(widths) / 4, 1))), math.log2(LEAST), math.log2(MOST)))
+
+
+def _nodes(world) -> list:
+    """All nodes of a world, also in groups."""
+    found, waiting = {}, [tree_in_use(world)]
+    while waiting:
+        tree = waiting.pop()
+        if tree is not None and tree not in found:
+            found[tree] = list(tree.nodes)
+            waiting += [node.node_tree for node in tree.nodes if is_group(node)]
+    return [node for nodes in found.values() for node in nodes]
+
+
+@contextmanager
+def _observatory(scene, world, warn):
+    """look(ahead, right, up, pixels, samples): a `SkyPicture` of what surfaces see of `world`."""
+    own = world.copy()
+    groups = []
+    try:
+        _store(own.cycles, "sampling_method", NOT_SAMPLED)
+        _store(own.cycles_visibility, "camera", True)
+        if tree_in_use(own) is not None:
+            groups = _own_groups(own.node_tree)
+            _as_surfaces_see(own, world.name, warn)
+        with open_studio(scene) as studio:
+            studio.scene.world = own
+            studio.scene.render.film_transparent = False
+            lens = studio.camera.data
+            lens.type, lens.clip_start, lens.clip_end = "PERSP", 0.1, 1.0
+
+            def look(ahead, right, up, pixels, samples):
+                axes = np.eye(4)
+                axes[:3, 0], axes[:3, 1] = right / np.linalg.norm(right), up / np.linalg.norm(up)
+                axes[:3, 2] = -ahead / np.linalg.norm(ahead)
+                studio.camera.matrix_world = Matrix(axes.tolist())
+                lens.angle = 2.0 * math.atan(np.linalg.norm(right) / np.linalg.norm(ahead))
+                render = studio.scene.render
+                render.resolution_x = render.resolution_y = pixels
+                studio.scene.cycles.samples = samples
+                return SkyPicture(ahead, right, up, studio.picture()[..., :3])
+
+            yield look
+    finally:
+        bpy.data.worlds.remove(own)
+        for group in groups:
+            bpy.data.node_groups.remove(group)
+
+
+def _without_volume(world) -> bool:
+    """Take the volume out of `world`; True where there was one."""
+    tree = tree_in_use(world)
+    outputs = () if tree is None else [node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputWorld"]
+    links = [link for node in outputs for link in node.inputs["Volume"].links]
+    for link in links:
+        tree.links.remove(link)
+    return bool(links)
+
+
+def _own_groups(tree) -> list:
+    """Give `tree`, and the groups in it, copies of their groups, which are returned."""
+    made = []
+    for node in tree.nodes:
+        if is_group(node) and node.node_tree is not None:
+            node.node_tree = node.node_tree.copy()
+            made += [node.node_tree, *_own_groups(node.node_tree)]
+    return made
+
+
+def _as_surfaces_see(world, name: str, warn) -> None:
+    """Let the Light Path nodes of `world` say what they say where Cycles samples the world for a surface."""
+    unclear = set()
+    for node in _nodes(world):
+        if node.bl_idname != LIGHT_PATH:
+            continue
+        tree = node.id_data
+        for output in node.outputs:
+            targets = [link.to_socket for link in output.links]
+            if targets and output.name not in SEEN_BY_SURFACES:
+                unclear.add(output.name)
+            value = tree.nodes.new("ShaderNodeValue").outputs[0] if targets else None
+            for target in targets:
+                value.default_value = SEEN_BY_SURFACES.get(output.name, 0.0)
+                tree.links.new(value, target)
+    if unclear:
+        warn(
+            f"world {name!r}: its light depends on {listed(sorted(unclear))} of a Light Path node, of which Cycles "
+            "takes a mixture that hangs on how it samples; shaded as for rays that are none of these"
+        )

@@ -22,6 +22,8 @@ def main(rig):
     yield from eyes.engine_started(rig)
     eyes.bare_view(rig)
     eyes.plain_colors(scene, EXPOSURE)
+    # The view has none.
+    scene.ltsh.shadows = False
     yield from cameras(rig)
     whole = yield from eyes.settled(rig, "changes_2_whole.png")
     yield from deleted_and_undone(rig, whole)

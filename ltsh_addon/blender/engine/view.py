@@ -7,6 +7,7 @@ import hashlib
 import logging
 import textwrap
 import time
+import weakref
 from dataclasses import dataclass
 
 import blf
@@ -17,6 +18,7 @@ import numpy as np
 from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
 from ...scene import CYCLES, TECHNIQUES, error_line
+from ..extract.occluders import collect_occluders
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
@@ -24,6 +26,7 @@ from ..ui.job import output_folder
 from ..ui.preview import ENGINE
 from ..viewport.mirror import SceneMirror
 from ..viewport.renderer import ShownPicture, ViewRenderer
+from ..viewport.shadows import LiveShadows, too_many
 from ..viewport.surfaces import View
 from ..viewport.textures import float_texture, look_values
 
@@ -32,6 +35,7 @@ REFINEMENTS = 64
 # For so long nothing may change before a view is refined; and drawing that takes longer makes pauses.
 REST_SECONDS, LONGEST_REST = 0.25, 1.0
 QUICK_SECONDS = 0.03
+LOOK_SECONDS = 0.05
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
@@ -58,6 +62,12 @@ class EngineView:
         self._reference = ReferenceTexture()
         self._error = ""
         self._content: tuple[tuple, str] | None = None
+        self._shadows = LiveShadows()
+        self._shadow_notes: tuple[str, ...] = ()
+        _at_work.add(self._shadows)
+
+    def __del__(self):
+        self._shadows.stop()
 
     def update(self, context, depsgraph) -> None:
         """Take over what has changed in the scene."""
@@ -85,6 +95,7 @@ class EngineView:
             if mode != "single" and settings.second_technique == CYCLES:
                 mode, reference, notes = self._beside_cycles(context, depsgraph, view, mode)
             shown = _shown(depsgraph.scene, mode, reference, context.preferences.system.ui_scale)
+            self._follow_shadows(depsgraph)
             points = sub_pixel_offsets(depsgraph.scene, REFINEMENTS)
             self._renderer.draw(self.mirror, view, size, shown, frame_buffer, points)
             captions = _captions(settings, mode)
@@ -94,9 +105,31 @@ class EngineView:
                 frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
         if not error and not self.mirror.lights:
             notes = [NO_LIGHTS, *notes]
-        show(region, error, [*notes, *self.mirror.notes], captions)
+        show(region, error, [*notes, *self.mirror.notes, *self._notes_of_shadows(size)], captions)
         if not error and self._renderer.samples < REFINEMENTS:
             _redraw_later(start, self._renderer.samples)
+        if self._shadows.is_busy and not bpy.app.timers.is_registered(_look_for_shadows):
+            bpy.app.timers.register(_look_for_shadows, first_interval=LOOK_SECONDS)
+
+    def _follow_shadows(self, depsgraph) -> None:
+        """Let the renderer draw shadows, if the scene has them."""
+        self._renderer.shadows = self._shadows if depsgraph.scene.ltsh.shadows else None
+
+        def collect():
+            notes: list[str] = []
+            override = depsgraph.view_layer_eval.material_override
+            occluders = collect_occluders(depsgraph, override, notes.append)
+            self._shadow_notes = tuple(notes)
+            return occluders
+
+        self._shadows.follow((id(self.mirror), self.mirror.surfaces_version), collect)
+
+    def _notes_of_shadows(self, size) -> list[str]:
+        """What is to be said about shadows."""
+        if self._renderer is None or self._renderer.shadows is None:
+            return []
+        found = [too_many(len(self.mirror.lights), size), self._shadows.problem, *self._shadow_notes]
+        return [note for note in found if note]
 
     def _beside_cycles(self, context, depsgraph, view: View, mode: str):
         """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""
@@ -319,15 +352,31 @@ def _redraw_later(start: float, samples: int) -> None:
         bpy.app.timers.register(_redraw, first_interval=wait)
 
 
+# Shadows of all views.
+_at_work: weakref.WeakSet = weakref.WeakSet()
+
+
+def _look_for_shadows() -> float | None:
+    """Draw the views again for which there are new shadows; look again while any are on their way."""
+    if any(shadows.has_news for shadows in _at_work):
+        _tag_views()
+        return None
+    return LOOK_SECONDS if any(shadows.is_busy for shadows in _at_work) else None
+
+
 def _redraw() -> float | None:
     left = _next["at"] - time.monotonic()
     if left > 0.0:
         return left
+    _tag_views()
+    return None
+
+
+def _tag_views() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
                 area.tag_redraw()
-    return None
 
 
 # Region -> (error, notes, captions).
@@ -427,8 +476,11 @@ def register() -> None:
 
 def unregister() -> None:
     """Remove it."""
-    if bpy.app.timers.is_registered(_redraw):
-        bpy.app.timers.unregister(_redraw)
+    for timer in (_redraw, _look_for_shadows):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
+    for shadows in _at_work:
+        shadows.stop()
     while _handle:
         bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
     _texts.clear()

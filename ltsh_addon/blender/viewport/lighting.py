@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 
 import gpu
+from mathutils import Matrix
 
 from ...cycles import horizons
 from ...scene import PASSES, AreaLight
@@ -26,6 +27,7 @@ from .shaders import (
 )
 from .textures import (
     SAMPLERS,
+    SHARE_SAMPLERS,
     GBufferTextures,
     UploadedLights,
     dielectric_texels,
@@ -181,6 +183,8 @@ class LightingPass:
                     shader.uniform_sampler(name, self._texture(name, gbuffer))
                 if features.specular:
                     shader.uniform_float("view", view)
+                if features.shadowed:
+                    shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
                 for first, end in self._shares:
                     shader.uniform_int("place", (x, y, first, end))
                     batch.draw(shader)
@@ -191,7 +195,11 @@ class LightingPass:
 
     def _texture(self, name, gbuffer):
         own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}
-        return own[name] if name in own else getattr(gbuffer, SAMPLERS[name])
+        if name in own:
+            return own[name]
+        if name in SHARE_SAMPLERS:
+            return getattr(gbuffer.shares, SHARE_SAMPLERS[name])
+        return getattr(gbuffer, SAMPLERS[name])
 
 
 def _loops(light: AreaLight) -> int:

@@ -14,7 +14,7 @@ from ..materials.values import Value
 from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
 from .shaders import glsl, pixel_shader
-from .shadows import ShadowRays
+from .shadows import LiveShadows, ShadowRays
 from .surfaces import SurfacePass, View, has_bent_lobes
 from .textures import GBufferTextures, UploadedLights, read_texture, upload_lights
 
@@ -97,7 +97,7 @@ class ViewRenderer:
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None)
         self._still, self.samples = None, 0
-        self.shadows: ShadowRays | None = None
+        self.shadows: ShadowRays | LiveShadows | None = None
 
     def draw(
         self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer, points=CENTERS
@@ -114,7 +114,11 @@ class ViewRenderer:
         pictures = len(wanted)
         wanted += shown.also
         asked = wanted, shown.second_picture is None
-        still = (mirror, mirror.lights, self.shadows), (mirror.surfaces_version, *_key(view, size), asked)
+        traced = None
+        if self.shadows is not None:
+            self.shadows.take_news()
+            traced = self.shadows.version
+        still = (mirror, mirror.lights, self.shadows), (mirror.surfaces_version, *_key(view, size), asked, traced)
         if not _same(still, self._still):
             self.samples = 0
         if self.samples < len(points):
@@ -187,7 +191,7 @@ class ViewRenderer:
             gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
             if self.shadows is not None:
                 whole = replace(gbuffer, smooth_normal=self._smooth_normal)
-                gbuffer = replace(gbuffer, shares=self.shadows.shares(whole, view, self._lights.lights))
+                gbuffer = replace(gbuffer, shares=self.shadows.shares(whole, view, self._lights.lights, self.samples))
             first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")

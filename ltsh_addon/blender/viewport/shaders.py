@@ -85,13 +85,15 @@ class Features:
         if self.bumped:
             names.append("smooth_normals")
         if self.shadowed:
-            names.append("shares")
+            names += ["shares", "grid_positions"]
         return tuple(names)
 
 
 def lighting_shader(table: LookupTable, features: Features):
     """The lighting shader for `table` of degree 1 to 4, and its batch."""
     constants = {"place": "IVEC4", "view": "VEC4"} if features.specular else {"place": "IVEC4"}
+    if features.shadowed:
+        constants["grid"] = "MAT4"
     return pixel_shader(_lighting_source(table, features), features.samplers, constants)
 
 

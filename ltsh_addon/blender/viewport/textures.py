@@ -30,8 +30,9 @@ SAMPLERS = {
     "geometric_normals": "geometric_normal",
     "diffuse_normals": "diffuse_normal",
     "smooth_normals": "smooth_normal",
-    "shares": "shares",
 }
+# The same of `ShareGrid`.
+SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
 
 
 def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
@@ -39,6 +40,15 @@ def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
     buffer = texture.read()
     buffer.dimensions = texture.width * texture.height * 4
     return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+
+
+@dataclass(frozen=True)
+class ShareGrid:
+    """Which shares of lights are seen at points of a picture, which may be another one of the same surfaces."""
+
+    shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
+    positions: gpu.types.GPUTexture  # of the points, around the same origin; w = 0 where there is no surface
+    projection: np.ndarray  # (4, 4) to clip space, in which the texels fill what is seen
 
 
 @dataclass(frozen=True)
@@ -57,7 +67,7 @@ class GBufferTextures:
     geometric_normal: gpu.types.GPUTexture | None = None  # `normal`; w is not read
     diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
     smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
-    shares: gpu.types.GPUTexture | None = None  # 1; a layer per light: which share of it is seen, specular and diffuse
+    shares: ShareGrid | None = None  # all of each light is seen
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:
@@ -65,7 +75,7 @@ class GBufferTextures:
         sizes = {
             field.name: (texture.width, texture.height)
             for field in fields(self)
-            if (texture := getattr(self, field.name)) is not None
+            if field.name != "shares" and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
             raise ValueError(f"G-buffer: textures have the sizes {sizes}, expected one size for all")

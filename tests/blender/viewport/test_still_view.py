@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -16,10 +17,11 @@ from graphics_card import Canvas, edits_with_graphics, with_graphics
 from view_pictures import textured
 
 from ltsh_addon import imaging
+from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.shadows import too_many
+from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
 from ltsh_addon.blender.viewport.still import view_of_camera
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -181,3 +183,76 @@ def test_a_view_at_rest_is_the_mean_of_its_points_and_starts_again_after_a_chang
         np.testing.assert_allclose(picture, np.mean(alone[: number + 1], axis=0), rtol=1e-5, atol=1e-6)
     assert not np.array_equal(alone[0], alone[1])
     np.testing.assert_array_equal(changed, expected)
+
+
+class LiveView:
+    """A view with live shadows, its scene, and what it draws."""
+
+    def __init__(self):
+        self.camera = set_up_scene()
+        self.depsgraph = bpy.context.evaluated_depsgraph_get()
+        self.mirror, self.canvas, self.renderer = SceneMirror(), Canvas(*SIZE), ViewRenderer()
+        self.mirror.sync(self.depsgraph)
+        self.view = view_of_camera(self.camera, self.depsgraph, SIZE)
+        self.live = LiveShadows()
+
+    def drawn(self, shadows):
+        """The diffuse picture (H, W, 3)."""
+        self.live.follow((0,), self.occluders)
+        self.renderer.shadows = shadows
+        shown = ShownPicture("ltsh4", "diffuse", "single", "ltc", 0.5, 1.0, 1.0, True)
+        self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer)
+        return self.renderer.read()[..., :3].astype(np.float64)
+
+    def occluders(self):
+        return collect_occluders(self.depsgraph, None, lambda text: None)
+
+    def traced(self):
+        """The picture after the thread has ended, and numbers of the lights and level of what it has done."""
+        request = self.live._request
+        self.live._thread.join()
+        return self.drawn(self.live), request.numbers, request.level
+
+
+def live_pictures():
+    scene = LiveView()
+    try:
+        plain, exact = scene.drawn(None), scene.drawn(ShadowRays(scene.occluders(), 256))
+        first = scene.drawn(scene.live)
+        levels = [scene.traced() for _ in range(3)]
+        rest = scene.live.is_busy
+        lights = scene.mirror.lights
+        scene.mirror.lights = tuple(replace(light, radiance=2.0 * light.radiance) for light in lights)
+        recolored = scene.drawn(scene.live), scene.live.is_busy
+        moved = replace(lights[0], center=lights[0].center + [0.0, 0.2, 0.1])
+        scene.mirror.lights = (moved, *lights[1:])
+        scene.drawn(scene.live)
+        after_move = scene.traced()[1:]
+        scene.live.stop()
+        scene.live._thread.join()
+        scene.live.follow((1,), lambda: 1 / 0)
+        scene.live._scene_before = (1,)
+        scene.live.take_news()
+        scene.live.shares(scene.renderer._gbuffer, scene.view, scene.renderer._lights.lights, 0)
+        return plain, exact, first, levels, rest, recolored, after_move, scene.live.problem
+    finally:
+        scene.live.stop()
+        scene.renderer.free()
+
+
+@edits_with_graphics
+def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
+    plain, exact, first, levels, rest, (recolored, traces), after_move, problem = with_graphics(live_pictures)
+    np.testing.assert_array_equal(first, plain)
+    without = relative(plain, exact)
+    coarse, fine, finest = (relative(picture, exact) for picture, _, _ in levels)
+    # Two lights, and the two sides of the sign.
+    assert [(numbers, level) for _, numbers, level in levels] == [((0, 1, 2, 3), level) for level in range(3)]
+    assert without > 0.1 and coarse < 0.7 * without and fine < 0.05 and fine < coarse
+    # Half precision, and the same rays.
+    assert finest < 1e-3
+    assert not rest and not traces, "at rest, and for other colors, nothing is traced"
+    np.testing.assert_allclose(recolored, 2.0 * levels[-1][0], rtol=1e-3, atol=1e-5)
+    # Of the other lights all is known.
+    assert after_move == ((0,), 0)
+    assert problem == "shadows: division by zero"

@@ -1,3 +1,43 @@
+#ifdef LTSH_SHADOWED
+/* The texels of the grid of shares around a point, and how much each counts: those of its own surface, where there are
+   any. */
+struct ltsh_nearby { ivec2 first; ivec2 last; vec4 weights; };
+
+ltsh_nearby ltsh_grid_at(ltsh_point point)
+{
+    vec4 clip = grid * vec4(point.position, 1.0);
+    ivec2 size = textureSize(grid_positions, 0);
+    vec2 at = (0.5 + 0.5 * clip.xy / clip.w) * vec2(size) - 0.5;
+    at = clamp(at, vec2(0.0), vec2(size - 1));
+    vec2 low = floor(at), share = at - low;
+    ltsh_nearby near;
+    near.first = ivec2(low);
+    near.last = min(near.first + 1, size - 1);
+    near.weights = vec4((1.0 - share.x) * (1.0 - share.y), share.x * (1.0 - share.y), (1.0 - share.x) * share.y,
+                        share.x * share.y);
+    for (int k = 0; k < 4; ++k) {
+        ivec2 place = ivec2((k & 1) == 0 ? near.first.x : near.last.x, k < 2 ? near.first.y : near.last.y);
+        vec4 other = texelFetch(grid_positions, place, 0);
+        vec3 way = other.xyz - point.position;
+        float off = abs(dot(way, point.geometric)) / max(0.2 * sqrt(dot(way, way)), 1e-6 * abs(clip.w));
+        near.weights[k] *= other.w > 0.0 ? max(exp(-off * off), 1e-4) : 0.0;
+    }
+    float all = dot(near.weights, vec4(1.0));
+    near.weights = all > 0.0 && clip.w > 0.0 ? near.weights / all : vec4(0.0);
+    return near;
+}
+
+/* The shares of a light that are seen, specular and diffuse. */
+vec2 ltsh_seen(ltsh_nearby near, int light)
+{
+    vec2 seen = near.weights.x * texelFetch(shares, ivec3(near.first, light), 0).xy
+              + near.weights.y * texelFetch(shares, ivec3(near.last.x, near.first.y, light), 0).xy
+              + near.weights.z * texelFetch(shares, ivec3(near.first.x, near.last.y, light), 0).xy
+              + near.weights.w * texelFetch(shares, ivec3(near.last, light), 0).xy;
+    return dot(near.weights, vec4(1.0)) > 0.0 ? seen : vec2(1.0);
+}
+#endif
+
 void main()
 {
     ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
@@ -30,6 +70,9 @@ void main()
 #ifdef LTSH_DIFFUSE
     diffuse_lobe matte = diffuse_at(point, texel);
 #endif
+#ifdef LTSH_SHADOWED
+    ltsh_nearby near = ltsh_grid_at(point);
+#endif
     int end = here ? place.w : 0;
     for (int i = place.z; i < end; ++i) {
         int header = LTSH_FIRST_LIGHT + i * LTSH_LIGHT_HEADER;
@@ -43,7 +86,7 @@ void main()
         vec3 reflected = vec3(0.0);
         vec2 seen = vec2(1.0);
 #ifdef LTSH_SHADOWED
-        seen = texelFetch(shares, ivec3(texel, i), 0).xy;
+        seen = ltsh_seen(near, i);
 #endif
 #ifdef LTSH_SPECULAR
         ltsh_light shining = ltsh_seen_light(header, point, weights.width);

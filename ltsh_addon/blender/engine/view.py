@@ -108,6 +108,7 @@ class EngineView:
         show(region, error, [*notes, *self.mirror.notes, *self._notes_of_shadows(size)], captions)
         if not error and self._renderer.samples < REFINEMENTS:
             _redraw_later(start, self._renderer.samples)
+        _drawn[0] = time.monotonic()
         if self._shadows.is_busy and not bpy.app.timers.is_registered(_look_for_shadows):
             bpy.app.timers.register(_look_for_shadows, first_interval=LOOK_SECONDS)
 
@@ -352,13 +353,17 @@ def _redraw_later(start: float, samples: int) -> None:
         bpy.app.timers.register(_redraw, first_interval=wait)
 
 
-# Shadows of all views.
+# When a view was drawn last, and the shadows of all views.
+_drawn = [0.0]
 _at_work: weakref.WeakSet = weakref.WeakSet()
 
 
 def _look_for_shadows() -> float | None:
     """Draw the views again for which there are new shadows; look again while any are on their way."""
     if any(shadows.has_news for shadows in _at_work):
+        # What moves is drawn soon in any case.
+        if time.monotonic() - _drawn[0] < REST_SECONDS:
+            return LOOK_SECONDS
         _tag_views()
         return None
     return LOOK_SECONDS if any(shadows.is_busy for shadows in _at_work) else None

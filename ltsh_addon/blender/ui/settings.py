@@ -150,6 +150,14 @@ MODES = (
 )
 
 
+def _redraw_views(settings, context) -> None:
+    """Show a changed setting at once: 3D views are not drawn again for properties of add-ons."""
+    for window in context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
 class LTSH_PG_scene(bpy.types.PropertyGroup):
     """What to shade, bake and look at in a scene."""
 
@@ -180,7 +188,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
-        default=True,
+        default=True, update=_redraw_views,
     )  # fmt: skip
     shadow_rays: IntProperty(
         name="Shadow Rays",

@@ -3,7 +3,8 @@
 The text stands in `glsl/`: core.h is what no table changes, which the viewport's shaders contain too, and table.h what
 every table adds. This chapter reads such files, and writes the lines that follow from a table's numbers and degree.
 
-The two textures of LTC have the layout of the shaders of Heitz et al. 2016 and of those made after them. Row j of N is theta_o with
+The two textures of LTC have the layout of the shaders of Heitz et al. 2016 and of those made after them. Row j of N is
+theta_o with
 sqrt(1 - cos(theta_o)) = j / (N - 1), column i is roughness i / (N - 1). The first holds m00, m20, m02 and m22 of M^-1,
 over m11. The second holds the integrals of the lobe for F = 1 and (1 - c)^5 over the whole sphere, zero, and by
 what the shader multiplies the form factor of a sphere that the horizon cuts.

@@ -280,7 +280,8 @@ class SurfaceSamples:
 
     The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
     ``f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6 + dielectric F_d(c, ior)``, c = cosine of the half angle, F_d the
-    exact unpolarized reflectance of a dielectric; negative terms may stand for a tint, the sum is never negative. A
+    exact unpolarized reflectance of a dielectric, with total reflection where `ior` is below 1; negative terms may
+    stand for a tint. Where the first three fall below 0 and there is no dielectric, they are 0. A
     surface with several lobes has one sample for each. `diffuse_albedo` already includes what the specular layer takes
     away. As in Cycles the specular lobe ends at the horizons of both the shading and the geometric normal, and a
     bump-mapped diffuse lobe at the horizon of the smooth normal; toward that it is shadowed by

@@ -67,21 +67,12 @@ def _albedo(normals, cosine, alpha, ior):
     """Albedo (C,) for views under `cosine` (C,)."""
     view = np.stack([np.sqrt(1.0 - cosine**2), np.zeros_like(cosine), cosine], axis=-1)
     towards = np.maximum((normals * view).sum(axis=-1), 0.0)
-    fresnel = internal_reflectance(towards, ior)
+    fresnel = dielectric_reflectance(towards, ior)
     refracted = np.sqrt(np.maximum(1.0 - (1.0 - towards**2) / ior**2, 0.0))
     up = 2.0 * towards * normals[..., 2] - cosine
     down = (refracted - towards / ior) * normals[..., 2] + cosine / ior
     reflected, transmitted = (_seen(height, cosine, alpha) for height in (up, down))
     return (fresnel * reflected + (1.0 - fresnel) * transmitted).mean(axis=0)
-
-
-def internal_reflectance(cosine, ior):
-    """Fresnel reflectance of a dielectric of any relative `ior`, with total reflection where it is below 1."""
-    square = 1.0 - (1.0 - cosine**2) / ior**2
-    refracted = np.sqrt(np.maximum(square, 0.0))
-    parallel = (refracted - ior * cosine) / np.maximum(refracted + ior * cosine, 1e-12)
-    perpendicular = (cosine - ior * refracted) / np.maximum(cosine + ior * refracted, 1e-12)
-    return np.where(square > 0.0, 0.5 * (parallel**2 + perpendicular**2), 1.0)
 
 
 def _seen(height, cosine, alpha):
@@ -262,19 +253,14 @@ def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) ->
     return np.clip(metal_average(f0, (schlick - low) * 7.0 / (6.0 / 7.0) ** 6), 0.0, 1.0)
 
 
-def dielectric_terms(f0: np.ndarray, ior: np.ndarray, cosine: np.ndarray):
-    """(f0, f90, dip, dielectric) (Q, 3) and ior (Q,) >= 1 of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
+def dielectric_terms(f0: np.ndarray, ior: np.ndarray):
+    """(f0, f90, dip, dielectric) (Q, 3) of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
 
     Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), f_d the value of F_d at normal incidence; that is linear in F_d.
-    Below an `ior` of 1 total reflection makes F_d nearly a step, which no curve of the lobes follows: its value for the
-    mirror direction of a view under `cosine` (Q,) stands in for it.
     """
     plain = f0_of_ior(ior)[:, None]
     constant, factor = (f0 - plain) / (1.0 - plain), (1.0 - f0) / (1.0 - plain)
-    below = (ior < 1.0)[:, None]
-    if below.any():
-        constant = constant + factor * np.where(below, internal_reflectance(cosine, np.minimum(ior, 1.0))[:, None], 0.0)
-    return constant, constant, np.zeros_like(constant), np.where(below, 0.0, factor), np.maximum(ior, 1.0)
+    return constant, constant, np.zeros_like(constant), factor
 
 
 def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:

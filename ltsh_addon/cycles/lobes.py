@@ -9,6 +9,7 @@ import numpy as np
 
 from ..scene import SurfaceSamples
 from ..shading import diffuse as rough_diffuse
+from ..shading.brdf import is_clipped
 from . import closures
 from .closures import sheen_albedo, sheen_lobe, velvet_albedo
 from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal
@@ -314,7 +315,21 @@ def _parts_of(slot: LobeSlot) -> list[_Part]:
     """The parts of one slot, its base first."""
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
-    return [part for part in (_base_part(slot, under), coat, transmitted) if part is not None]
+    base = _base_part(slot, under)
+    return [part for part in (base, coat, transmitted, _dark_metal(slot, under, base)) if part is not None]
+
+
+def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
+    """The metal of a slot, taken out of its `base`, where Cycles clips its reflectance at 0 and it is not alone."""
+    if not slot.metallic.any() or not (slot.value("tint") < 1.0).any():
+        return None
+    terms = _metal_terms(slot) * under
+    at = np.nonzero(is_clipped(*terms[:3]) & base.specular[3].any(axis=1))[0]
+    if not len(at):
+        return None
+    base.specular[:, at] -= terms[:, at]
+    normal = slot.specular_normal[at]
+    return _Part(slot.index[at], normal, normal, slot.roughness[at], np.ones(len(at)), terms[:, at])
 
 
 def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_Part]]) -> Hits:
@@ -421,8 +436,7 @@ def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
     if slot.has("multiple_scattering"):
         scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
         factor = np.where(scattered, closures.glass_scattering(through, ior, *view), 1.0)
-    *terms, ior = closures.dielectric_terms(f0, ior, view[1])
-    return np.stack(terms) * factor, ior
+    return np.stack(closures.dielectric_terms(f0, ior)) * factor, ior
 
 
 def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
@@ -508,5 +522,4 @@ def _dielectric_terms(slot: LobeSlot):
     scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
     albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
     left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
-    *terms, ior = closures.dielectric_terms(f0, ior, cosine)
-    return np.stack(terms) * factor, ior, left
+    return np.stack(closures.dielectric_terms(f0, ior)) * factor, ior, left

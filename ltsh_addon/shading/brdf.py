@@ -67,8 +67,24 @@ def schlick_curve(cosine):
     return squared * squared * complement
 
 
+def f82_reflectance(cosine, f0, f90, dip):
+    """f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6, which may be negative; broadcasts."""
+    return f0 + schlick_curve(cosine) * (f90 - f0 - dip * cosine * (1.0 - cosine))
+
+
+def is_clipped(f0, f90, dip):
+    """Where (P,) the reflectance of F82 metals, each (P, 3), falls below 0 at some angle."""
+    found = np.zeros(len(f0), bool)
+    at = np.nonzero((dip > 0.0).any(axis=-1))[0]
+    cosines = np.linspace(0.0, 1.0, 33)[:, None, None]
+    if len(at):
+        found[at] = f82_reflectance(cosines, f0[at], f90[at], dip[at]).min(axis=(0, 2)) < 0.0
+    return found
+
+
 def dielectric_reflectance(cosine, ior):
-    """Exact unpolarized Fresnel reflectance of a dielectric seen from outside; `ior` >= 1 is relative; broadcasts."""
+    """Exact unpolarized Fresnel reflectance of a dielectric of relative `ior`, with total reflection below 1;
+    broadcasts."""
     cosine = np.asarray(cosine)
     g = np.sqrt(np.maximum(ior * ior - 1.0 + cosine * cosine, 0.0))
     # At cosine 0 without refraction (ior 1) the quotient is 0 / 0; its limit along cosine -> 0 is 0.

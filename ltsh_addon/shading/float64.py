@@ -11,6 +11,7 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import diffuse, facing, light_cone
+from .brdf import dielectric_reflectance, ggx_brdf_cosine, half_angle_cosine
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
@@ -22,6 +23,8 @@ from .reference import reference_integrals
 from .spherical_harmonics import coefficient_index
 from .tails import SeenLight, TailLimits
 
+# How far toward the corners of a light a Fresnel curve with a step is looked up.
+POINTS_TO_CORNERS = (0.2, 0.5, 0.8)
 # Of the roughness by which the effort for a lobe is chosen.
 LEAST_ROUGHNESS = 1e-3
 # Coefficient of Y_10 that makes it z / pi
@@ -229,15 +232,53 @@ def shade_specular(samples, lights, table, radiance, error=None):
         for index, integrals in parts:
             if table != REFERENCE and table.family == "ltsh":
                 _limit(integrals, samples, index, light)
+            if table != REFERENCE:
+                _reflect_totally(integrals, samples, frame, light, corners, index)
             if table != REFERENCE and light.is_facing:
                 alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
                 own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
                 integrals *= _mean_emission(light, samples, index, own)
-            plain, schlick, dip, dielectric = integrals[..., None]
+            plain, schlick, dip, dielectric = integrals[:4, :, None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
             reflected -= samples.specular_dip[index] * dip
+            if len(integrals) > 4:
+                reflected += integrals[4:].T
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
+
+
+def reflects_totally(samples) -> np.ndarray:
+    """Mask (P,) of the dielectrics whose index of refraction is below 1."""
+    below = samples.ior < 1.0
+    return below & samples.dielectric.any(axis=1) if below.any() else below
+
+
+def _reflect_totally(integrals, samples, frame, light, corners, index):
+    """Total reflection makes the Fresnel curve nearly a step, which no curve of a table follows: put into integrals
+    (4, Q) its mean over points of the light, by the lobe there."""
+    chosen = np.nonzero(reflects_totally(samples)[index])[0]
+    if not len(chosen):
+        return
+    at = index[chosen]
+    center = light.center if light.center.ndim == 1 else light.center[at]
+    places = [center] if light.is_facing else [
+        center + fraction * ((corner if corner.ndim == 1 else corner[at]) - center)
+        for corner in corners for fraction in POINTS_TO_CORNERS
+    ]  # fmt: skip
+    origin, facing_side = light.origins(samples.position[at]), -_of(light.direction, at)
+    cosine = np.clip((samples.normal[at] * samples.view[at]).sum(axis=1), 0.0, 1.0)
+    alpha, total, lobe = np.maximum(samples.roughness[at] ** 2, MIN_ALPHA), 0.0, 1e-30
+    for place in places:
+        offset = np.broadcast_to(place, origin.shape) - origin
+        distance = np.linalg.norm(offset, axis=1)
+        direction = to_local(frame[:, :, at], (offset / distance[:, None]).T)
+        values = ggx_brdf_cosine(cosine, alpha, direction.T[:, None])[:, 0]
+        if not light.is_facing:
+            values = values * np.maximum((offset * facing_side).sum(axis=1), 0.0) / distance**3
+        half = half_angle_cosine(cosine, direction.T[:, None])[:, 0]
+        total = total + values * dielectric_reflectance(half, samples.ior[at])
+        lobe = lobe + values
+    integrals[3, chosen] = integrals[0, chosen] * total / lobe
 
 
 def _joined(parts, count):

@@ -188,14 +188,22 @@ class Cone:
 
 
 def lobe_integrals(
-    make_boundary, cos_theta_o, alpha, ior, *, tolerance=1e-4, cone: Cone | FacingEmission | None = None
+    make_boundary,
+    cos_theta_o,
+    alpha,
+    ior,
+    *,
+    tolerance=1e-4,
+    cone: Cone | FacingEmission | None = None,
+    metal=None,
 ):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
     `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
     cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
     `ior` (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6;
-    the estimate is the last difference. Lights must be convex. With a `cone` the integrand has its factor, too.
+    the estimate is the last difference. Lights must be convex. With a `cone` the integrand has its factor, too. With a
+    `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance falls below 0.
     """
     warp = limit_warp(cos_theta_o, alpha)
     boundary = make_boundary(warp)
@@ -203,7 +211,7 @@ def lobe_integrals(
     if cone is not None:
         apex = np.where(cone.at_foot, project_to_sphere(warp.to_original_domain(cone.axis)), apex)
     count = len(cos_theta_o)
-    result, error = np.zeros((4, count)), np.full(count, np.inf)
+    result, error = np.zeros((4 if metal is None else 7, count)), np.full(count, np.inf)
     open_points = np.arange(count)
     for level, order in enumerate(_ORDERS):
         batch = max(_BATCH // (boundary.pieces * order[0] * order[1]), 1)
@@ -211,7 +219,8 @@ def lobe_integrals(
             index = open_points[start : start + batch]
             setting = (warp.take(index), cos_theta_o[index], np.maximum(alpha[index], MIN_ALPHA), ior[index])
             its_cone = None if cone is None else cone.take(index)
-            value = _fixed_order(order, boundary.take(index), apex[:, index], *setting, its_cone)
+            its_metal = None if metal is None else [term[index] for term in metal]
+            value = _fixed_order(order, boundary.take(index), apex[:, index], setting, its_cone, its_metal)
             if level > 0:
                 error[index] = np.abs(value - result[:, index]).max(axis=0)
             result[:, index] = value
@@ -234,8 +243,9 @@ def _peak_or_mean(inside, unit):
     return np.where(inside, np.array([0.0, 0.0, 1.0])[:, None], mean)
 
 
-def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior, cone):
-    """Integrals (4, P) with fixed Gauss-Legendre orders."""
+def _fixed_order(order, boundary, apex, setting, cone, metal):
+    """Integrals (4, P), or (7, P), with fixed Gauss-Legendre orders."""
+    warp, cos_theta_o, alpha, ior = setting
     points, measure = boundary.nodes(order[0])
     wedge = dot(measure, apex[:, None])  # (B, P)
     wedge = wedge * np.sign(wedge.sum(axis=0))
@@ -253,8 +263,12 @@ def _fixed_order(order, boundary, apex, warp, cos_theta_o, alpha, ior, cone):
     schlick = values * brdf.schlick_curve(half)
     dip = (schlick * (half * (1.0 - half))).sum(axis=(0, 1))
     schlick = schlick.sum(axis=(0, 1))
-    dielectric = (values * brdf.dielectric_reflectance(half, np.maximum(ior, 1.0))).sum(axis=(0, 1))
-    return np.stack([values.sum(axis=(0, 1)), schlick, dip, dielectric])
+    dielectric = (values * brdf.dielectric_reflectance(half, ior)).sum(axis=(0, 1))
+    rows = [values.sum(axis=(0, 1)), schlick, dip, dielectric]
+    for channel in range(3) if metal is not None else ():
+        reflectance = brdf.f82_reflectance(half, *(term[:, channel] for term in metal))
+        rows.append((values * np.maximum(-reflectance, 0.0)).sum(axis=(0, 1)))
+    return np.stack(rows)
 
 
 def _unit_interval(count):
@@ -287,7 +301,12 @@ def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
 
 
 def reference_integrals(samples, cosine, frame, light, corners, candidates, error):
-    """Yield (index, integrals (4, Q)) by quadrature; integrals of the same point add up. Adds to error (P,)."""
+    """Yield (index, integrals (4, Q)) by quadrature; integrals of the same point add up. Adds to error (P,).
+
+    Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
+    """
+    terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
+    clipped = brdf.is_clipped(*terms) & ~samples.dielectric.any(axis=1)
     if light.is_round:
         corners = light.polygon(_ROUND_CORNERS)
     if light.is_focused:
@@ -305,7 +324,8 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
             cone = _whole_cone(samples, frame, light, index, profile)
         alpha = samples.roughness[index] ** 2
         setting = (cosine[index], alpha, samples.ior[index])
-        integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone)
+        metal = [term[index] * clipped[index, None] for term in terms] if clipped[index].any() else None
+        integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal)
         if light.is_facing:
             integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
         error[index] += estimate

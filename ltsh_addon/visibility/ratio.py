@@ -222,7 +222,7 @@ class Surface:
         terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
         self.f0, f90, self.dip, self.dielectric, self.albedo = terms
         self.rise = f90 - self.f0
-        self.ior = np.maximum(samples.ior.astype(np.float32), _ONE)
+        self.ior = samples.ior.astype(np.float32)
         diffuse, specular = has_lobe(samples)
         specular &= dot(self.normal, self.view) > 0.0
         self.lobes = {"specular": specular & ("specular" in passes), "diffuse": diffuse & ("diffuse" in passes)}

@@ -70,7 +70,9 @@ def ggx(directions, samples):
     f0, f90 = samples.specular_f0[:, None], samples.specular_f90[:, None]
     dip = samples.specular_dip[:, None] * (cos_d * (1.0 - cos_d) ** 6)[..., None]
     dielectric = samples.dielectric[:, None] * dielectric_fresnel(cos_d, samples.ior[:, None])[..., None]
-    return value[..., None] * (f0 + (f90 - f0) * schlick - dip + dielectric)
+    metal = f0 + (f90 - f0) * schlick - dip
+    alone = ~samples.dielectric.any(axis=1)[:, None, None]
+    return value[..., None] * (np.where(alone, np.maximum(metal, 0.0), metal) + dielectric)
 
 
 def dielectric_fresnel(cosine, ior):

@@ -34,6 +34,11 @@ SURFACES = {
         "specular_f0": (0.0, -0.01, -0.02), "specular_f90": (0.0, -0.01, -0.02),
         "dielectric": (1.0, 1.01, 1.02), "ior": 1.5,
     },
+    "black edge": {
+        "specular_f0": (0.1, 0.3, 0.6), "specular_f90": (1, 1, 1),
+        "specular_dip": f82_dip(np.array([0.1, 0.3, 0.6]), np.zeros(3)),
+    },
+    "IOR below 1": {"dielectric": (1.0, 0.5, 0.2), "ior": 0.7},
     "all": {**gold(), "dielectric": (0.1, 0.5, 0.9), "ior": 2.0},
 }  # fmt: skip
 
@@ -56,10 +61,13 @@ def test_the_reference_and_harmonics_have_every_term(kind, place):
     expected = np.concatenate([quadrature.radiance(sample, [light], quadrature.ggx, 300) for sample in samples])
     for sample, wanted in zip(samples, expected, strict=True):
         found = shading.shade(sample, [light], shading.REFERENCE, passes=["specular"]).specular[0, 0]
-        assert found == pytest.approx(wanted, rel=2e-4, abs=1e-7), kind
+        # Patches that the onset of total reflection crosses are half right.
+        tolerance = 2e-3 if kind == "IOR below 1" else 2e-4
+        # What is clipped is next to nothing beside the lobe without its reflectance, on which the quadrature goes by.
+        assert found == pytest.approx(wanted, rel=tolerance, abs=1e-6 if kind == "black edge" else 1e-7), kind
     for dtype in (np.float32, np.float64):
         found = [shading.shade(sample, [light], "ltsh4", dtype=dtype).specular[0, 0] for sample in samples]
-        assert np.abs(np.array(found) - expected).max() < (0.12 if kind == "F82" else 0.06) * expected.max()
+        assert np.abs(np.array(found) - expected).max() < (0.12 if kind in ("F82", "IOR below 1") else 0.06) * expected.max()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -8,11 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import bpy
-import numpy as np
 
-from ...cycles.closures import f82_dip
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS
-from ...shading.brdf import schlick_curve
 from .graph import PRINCIPLED, is_constant, is_socket, live_link, product, value_of
 
 EMISSION = "ShaderNodeEmission"
@@ -58,7 +55,7 @@ BSDFS = {
         not_shaded={
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
             "Anisotropic": AS_ZERO,
-            "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded, of back faces about"),
+            "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
             "Thin Wall": (0.0, "is shaded as off"),
             "Thin Film Thickness": AS_ZERO,
         },
@@ -69,7 +66,7 @@ BSDFS = {
     (GLASS, ""): Bsdf(
         "glass",
         {**COLOR, **ROUGHNESS, "ior": "IOR"},
-        "lets no light through, only its reflection is shaded, of back faces about",
+        "lets no light through, only its reflection is shaded",
         {"Thin Film Thickness": AS_ZERO},
     ),
     (METALLIC, "F82"): Bsdf("metal", {**ROUGHNESS, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
@@ -86,8 +83,6 @@ BSDFS = {
 }
 # Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
 NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
-# Metals that are darker than minus this are worth a warning.
-NEGLIGIBLE_REFLECTANCE = -1e-3
 
 
 def bsdf_of(node) -> Bsdf | None:
@@ -171,7 +166,6 @@ def notes_of(node) -> list[str]:
     for name, (neutral, done) in bsdf.not_shaded.items():
         if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
             notes.append(f"{name} of {node.name!r} {done}")
-    notes += _notes_of_reflectance(node)
     distribution = getattr(node, "distribution", "")
     if distribution in NEAREST_ALPHA:
         alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
@@ -182,34 +176,3 @@ def notes_of(node) -> list[str]:
 def has_alpha(node) -> bool:
     """True for a Principled BSDF that lets light pass."""
     return node.bl_idname == PRINCIPLED and not is_constant(value_of(node.inputs["Alpha"]), 1.0)
-
-
-def _notes_of_reflectance(node) -> list[str]:
-    """Names indices of refraction below 1, and metals whose reflectance Cycles clips."""
-    notes = []
-    if node.bl_idname in (PRINCIPLED, GLASS):
-        ior = value_of(node.inputs["IOR"])
-        if is_socket(ior):
-            notes.append(
-                f"IOR of {node.name!r} varies: where it is below 1, the reflectance is that for the mirror direction"
-            )
-        elif ior < 1.0:
-            notes.append(f"IOR of {node.name!r} is below 1, its reflectance is that for the mirror direction")
-    if node.bl_idname == PRINCIPLED:
-        tint = "" if is_constant(value_of(node.inputs["Metallic"]), 0.0) else "Specular Tint"
-    else:
-        tint = "Edge Tint" if node.bl_idname == METALLIC and node.fresnel_type == "F82" else ""
-    if tint and _may_be_negative(value_of(node.inputs["Base Color"]), value_of(node.inputs[tint])):
-        notes.append(f"{tint} of {node.name!r} is so dark that the reflectance of the metal, as shaded, falls below 0")
-    return notes
-
-
-def _may_be_negative(color, tint) -> bool:
-    """True if the F82 reflectance of a metal of these colors (of `graph.value_of`) may fall below 0."""
-    if is_constant(tint, (1.0, 1.0, 1.0)):
-        return False
-    # The darker both are, the lower is the curve.
-    f0, edge = (np.zeros(3) if is_socket(value) else np.clip(value[:3], 0.0, 1.0) for value in (color, tint))
-    c = np.linspace(0.0, 1.0, 101)[:, None]
-    curve = f0 + (1.0 - f0) * schlick_curve(c) - f82_dip(f0, edge) * c * (1.0 - c) ** 6
-    return bool(curve.min() < NEGLIGIBLE_REFLECTANCE)

@@ -301,6 +301,8 @@ class _Reader:
         rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
         if rough is None or rough[0][0] > 0.0:
             self.note("rough diffuse reflection is shown as smooth")
+        if "ior" in values and not (values["ior"].is_constant and values["ior"].offset[0] >= 1.0):
+            self.note("where its IOR is below 1, its reflectance is that for the mirror direction")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)

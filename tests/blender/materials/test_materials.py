@@ -10,7 +10,6 @@ from scene_parts import add_plane, bsdf_material, principled
 
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.aovs import inject_aovs
-from ltsh_addon.blender.materials.bsdfs import notes_of
 from ltsh_addon.cycles import horizons, lobes
 
 # Texture coordinates and colors pass through float32 a few times.
@@ -143,7 +142,6 @@ def test_every_unsupported_input_is_named_once(tmp_path):
         "Anisotropic": 0.3,
         "Transmission Weight": 0.1,
         "Thin Film Thickness": 100.0,
-        "IOR": 0.8,
     }
     material, node = principled("Rich")
     if "Thin Wall" in node.inputs:
@@ -164,20 +162,6 @@ def test_every_unsupported_input_is_named_once(tmp_path):
     assert not any("emission" in line for line in warnings)  # it is a light
 
 
-@pytest.mark.parametrize(
-    "edge, base, named", [(0.0, 0.5, True), (0.1, 0.5, False), (0.3, 0.02, True), (0.0, 0.95, False), (1.0, 0.0, False)]
-)
-def test_metals_that_cycles_clips_at_black_are_named(edge, base, named):
-    found = []
-    for kind, tint in (("ShaderNodeBsdfMetallic", "Edge_Tint"), ("ShaderNodeBsdfPrincipled", "Specular_Tint")):
-        _, node = bsdf_material(kind, Base_Color=(base, base, base, 1.0), **{tint: (edge, edge, edge, 1.0)})
-        if "Metallic" in node.inputs:
-            found += notes_of(node)  # no metal yet
-            node.inputs["Metallic"].default_value = 1.0
-        found += notes_of(node)
-    assert len(found) == (2 if named else 0) and all("Tint of '" in line for line in found)
-
-
 @pytest.mark.parametrize("kind", ["AmbientOcclusion", "Bevel"])
 def test_nodes_that_send_rays_are_named(kind):
     material, node = principled("Worn")
@@ -187,16 +171,6 @@ def test_nodes_that_send_rays_are_named(kind):
     warnings = inject_aovs([material])
     assert len(warnings) == 1 and repr(used.name) in warnings[0]
     assert warnings[0].startswith(f"material {material.name!r}: ") and unused.name != used.name
-
-
-def test_an_index_of_refraction_that_varies_is_named():
-    found = []
-    for kind in ("ShaderNodeBsdfGlass", "ShaderNodeBsdfPrincipled"):
-        material, node = bsdf_material(kind)
-        value = material.node_tree.nodes.new("ShaderNodeTexCoord").outputs["UV"]
-        material.node_tree.links.new(value, node.inputs["IOR"])
-        found += notes_of(node)
-    assert sum("IOR of '" in line and "varies" in line for line in found) == 2
 
 
 def test_materials_that_shine_into_the_scene_keep_their_emission():

@@ -72,6 +72,13 @@ def f82_reflectance(cosine, f0, f90, dip):
     return f0 + schlick_curve(cosine) * (f90 - f0 - dip * cosine * (1.0 - cosine))
 
 
+def clipped_metals(samples):
+    """Mask (P,) of the samples that are F82 metals alone, and clipped at 0 where their reflectance falls below."""
+    if not samples.specular_dip.any():
+        return np.zeros(len(samples), bool)
+    return is_clipped(samples.specular_f0, samples.specular_f90, samples.specular_dip) & ~samples.dielectric.any(axis=1)
+
+
 def is_clipped(f0, f90, dip):
     """Where (P,) the reflectance of F82 metals, each (P, 3), falls below 0 at some angle."""
     found = np.zeros(len(f0), bool)

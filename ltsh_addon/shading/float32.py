@@ -74,7 +74,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
     reflective = np.logical_or.reduce([_any_component(term) for term in terms])
     lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
-    sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.reflects_totally(samples))
+    sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import diffuse, facing, light_cone
-from .brdf import dielectric_reflectance, ggx_brdf_cosine, half_angle_cosine
+from .brdf import clipped_metals, dielectric_reflectance, f82_reflectance, ggx_brdf_cosine, half_angle_cosine
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
@@ -199,8 +199,9 @@ def shade_specular(samples, lights, table, radiance, error=None):
     frame = local_frames(samples.normal, samples.view)
     lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
     cosine = np.clip(cosine, 0.0, 1.0)
-    lobe = None
+    lobe, bent = None, np.zeros(len(samples), bool)
     if table != REFERENCE and len(lit):
+        bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
 
     def shade_own(part, own, target, index):
@@ -232,8 +233,6 @@ def shade_specular(samples, lights, table, radiance, error=None):
         for index, integrals in parts:
             if table != REFERENCE and table.family == "ltsh":
                 _limit(integrals, samples, index, light)
-            if table != REFERENCE:
-                _reflect_totally(integrals, samples, frame, light, corners, index)
             if table != REFERENCE and light.is_facing:
                 alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
                 own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
@@ -244,41 +243,45 @@ def shade_specular(samples, lights, table, radiance, error=None):
             reflected -= samples.specular_dip[index] * dip
             if len(integrals) > 4:
                 reflected += integrals[4:].T
+            if (chosen := bent[index]).any():
+                mean = _bent_reflectance(samples, frame, light, corners, index[chosen])
+                reflected[chosen] = plain[chosen] * mean
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
-def reflects_totally(samples) -> np.ndarray:
-    """Mask (P,) of the dielectrics whose index of refraction is below 1."""
+def has_bent_fresnel(samples) -> np.ndarray:
+    """Mask (P,) of the samples whose Fresnel factor no sum of the tables' curves follows: dielectrics with an index of
+    refraction below 1, where total reflection makes nearly a step of it, and metals that are clipped at black."""
     below = samples.ior < 1.0
-    return below & samples.dielectric.any(axis=1) if below.any() else below
+    if below.any():
+        below = below & samples.dielectric.any(axis=1)
+    return below | clipped_metals(samples)
 
 
-def _reflect_totally(integrals, samples, frame, light, corners, index):
-    """Total reflection makes the Fresnel curve nearly a step, which no curve of a table follows: put into integrals
-    (4, Q) its mean over points of the light, by the lobe there."""
-    chosen = np.nonzero(reflects_totally(samples)[index])[0]
-    if not len(chosen):
-        return
-    at = index[chosen]
+def _bent_reflectance(samples, frame, light, corners, at):
+    """Mean Fresnel factor (Q, 3) of the samples `at` (Q,) over points of the light, by the lobe there."""
     center = light.center if light.center.ndim == 1 else light.center[at]
     places = [center] if light.is_facing else [
         center + fraction * ((corner if corner.ndim == 1 else corner[at]) - center)
         for corner in corners for fraction in POINTS_TO_CORNERS
     ]  # fmt: skip
-    origin, facing_side = light.origins(samples.position[at]), -_of(light.direction, at)
-    cosine = np.clip((samples.normal[at] * samples.view[at]).sum(axis=1), 0.0, 1.0)
-    alpha, total, lobe = np.maximum(samples.roughness[at] ** 2, MIN_ALPHA), 0.0, 1e-30
+    samples, axes, direction = samples.take(at), frame[:, :, at], _of(light.direction, at)
+    origin, is_clipped = light.origins(samples.position), clipped_metals(samples)[:, None]
+    cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
+    alpha, total, lobe = np.maximum(samples.roughness**2, MIN_ALPHA), 0.0, 1e-30
     for place in places:
         offset = np.broadcast_to(place, origin.shape) - origin
         distance = np.linalg.norm(offset, axis=1)
-        direction = to_local(frame[:, :, at], (offset / distance[:, None]).T)
-        values = ggx_brdf_cosine(cosine, alpha, direction.T[:, None])[:, 0]
+        local = to_local(axes, (offset / distance[:, None]).T).T[:, None]
+        values = ggx_brdf_cosine(cosine, alpha, local)
         if not light.is_facing:
-            values = values * np.maximum((offset * facing_side).sum(axis=1), 0.0) / distance**3
-        half = half_angle_cosine(cosine, direction.T[:, None])[:, 0]
-        total = total + values * dielectric_reflectance(half, samples.ior[at])
-        lobe = lobe + values
-    integrals[3, chosen] = integrals[0, chosen] * total / lobe
+            values = values * np.maximum(-(offset * direction).sum(axis=1), 0.0)[:, None] / distance[:, None] ** 3
+        half = half_angle_cosine(cosine, local)
+        metal = f82_reflectance(half, samples.specular_f0, samples.specular_f90, samples.specular_dip)
+        metal = np.where(is_clipped, np.maximum(metal, 0.0), metal)
+        coat = samples.dielectric * dielectric_reflectance(half, samples.ior[:, None])
+        total, lobe = total + values * (metal + coat), lobe + values
+    return total / lobe
 
 
 def _joined(parts, count):

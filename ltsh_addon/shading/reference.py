@@ -306,7 +306,7 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
     Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
     """
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
-    clipped = brdf.is_clipped(*terms) & ~samples.dielectric.any(axis=1)
+    clipped = brdf.clipped_metals(samples)
     if light.is_round:
         corners = light.polygon(_ROUND_CORNERS)
     if light.is_focused:

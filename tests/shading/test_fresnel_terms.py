@@ -43,6 +43,11 @@ SURFACES = {
 }  # fmt: skip
 
 
+# Of the error of harmonics, of the brightest. A black edge, which the tables look up at points of the light, turns into
+# white within this one where it is seen at 6 degrees.
+LIMITS = {"F82": 0.12, "IOR below 1": 0.12, "black edge": 0.25}
+
+
 def samples_of(fields):
     """Views from steep to grazing, rough to fairly sharp."""
     for cosine, roughness in ((0.95, 0.25), (0.6, 0.5), (0.25, 0.8), (0.1, 0.4)):
@@ -67,7 +72,7 @@ def test_the_reference_and_harmonics_have_every_term(kind, place):
         assert found == pytest.approx(wanted, rel=tolerance, abs=1e-6 if kind == "black edge" else 1e-7), kind
     for dtype in (np.float32, np.float64):
         found = [shading.shade(sample, [light], "ltsh4", dtype=dtype).specular[0, 0] for sample in samples]
-        assert np.abs(np.array(found) - expected).max() < (0.12 if kind in ("F82", "IOR below 1") else 0.06) * expected.max()
+        assert np.abs(np.array(found) - expected).max() < LIMITS.get(kind, 0.06) * expected.max()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -248,8 +248,8 @@ def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
 
 def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
     """The Cycles reference without shadows: {"specular", "diffuse"} -> (2, H, W, 3)."""
-    scene, layer, inventory = prepared[:3]
-    scene.world = inventory.world
+    scene, layer, *others = prepared
+    scene.world = others[0].world if others else None
     pixels.remove_occlusion(scene)
     manifest = {
         "reference": pixels.render_reference(scene, layer, folder, cycles_samples, sub_samples, silent),

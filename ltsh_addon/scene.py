@@ -98,6 +98,23 @@ class SpotCone:
 
 
 @dataclass(frozen=True)
+class Pattern:
+    """By what the radiance of a place on a ball is multiplied, by its normal n: of v = axes n the angle from z selects
+    the row, from 0 to pi, and the angle around z, from x, the column. Rows and columns are equal angles."""
+
+    axes: np.ndarray  # (3, 3), of any length
+    values: np.ndarray  # (H, W)
+    by_ray: bool = False  # by the direction in which the light goes in the place of the normal
+
+    def __post_init__(self):
+        axes, values = np.asarray(self.axes, dtype=np.float64), np.asarray(self.values, dtype=np.float32)
+        if axes.shape != (3, 3) or values.ndim != 2 or not np.isfinite(axes).all() or not np.isfinite(values).all():
+            raise ValueError(f"pattern: axes {axes!r} and values of shape {values.shape}, expected 3 x 3 and (H, W)")
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "values", values)
+
+
+@dataclass(frozen=True)
 class AreaLight:
     """A one-sided, uniformly emitting, flat area light, or one that looks flat from every point.
 
@@ -108,7 +125,7 @@ class AreaLight:
     At the distance t from its points it is also multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
     Falloff node: 0 is quadratic, 1 linear, 2 constant.
     A BALL has |half_u| = |half_v| for its radius. Of a FACING_DISK with that radius every point sees the front.
-    Of both the half axes and the direction say no more; they may have a `cone`, and no spread.
+    Of both the half axes and the direction say no more; they may have a `cone` and a `pattern`, and no spread.
     A light that `is_distant` is infinitely far away: center, half_u, half_v and corners are directions to it, of any
     length, and every point is where it is seen from.
     """
@@ -131,6 +148,7 @@ class AreaLight:
     smooth: float = 0.0  # m^2
     is_distant: bool = False
     cone: SpotCone | None = None
+    pattern: Pattern | None = None  # of a disk by the direction in which it shines
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -157,8 +175,10 @@ class AreaLight:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape {self.shape}")
         if isinstance(self.cone, dict):
             object.__setattr__(self, "cone", SpotCone(**self.cone))
-        if not self.is_facing and self.cone is not None:
-            raise ValueError(f"light {self.name!r}: shape {self.shape} has a cone, expected one of {FACING_SHAPES}")
+        if isinstance(self.pattern, dict):
+            object.__setattr__(self, "pattern", Pattern(**self.pattern))
+        if not self.is_facing and (self.cone is not None or self.pattern is not None):
+            raise ValueError(f"light {self.name!r}: {self.shape} has a cone or pattern, expected {FACING_SHAPES}")
         if self.is_facing and (self.is_distant or self.detail):
             raise ValueError(f"light {self.name!r}: shape {self.shape} is expected nearby, and without detail")
         if self.falloff not in (0, 1, 2) or not 0.0 <= self.smooth < np.inf:
@@ -196,6 +216,9 @@ class AreaLight:
         record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
         if self.cone is not None:
             record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
+        if self.pattern is not None:
+            own = self.pattern
+            record["pattern"] = {**vars(own), "axes": own.axes.tolist(), "values": own.values.tolist()}
         return {**record, "detail": [part.record() for part in self.detail]}
 
     @property
@@ -216,6 +239,11 @@ class AreaLight:
     def is_facing(self) -> bool:
         """True for lights that face every point, see `shading.facing`."""
         return self.shape in FACING_SHAPES
+
+    @property
+    def is_even(self) -> bool:
+        """False for lights that face every point and are not equally bright all over."""
+        return self.cone is None and self.pattern is None and not self.has_falloff
 
     @property
     def is_focused(self) -> bool:

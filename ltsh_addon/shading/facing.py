@@ -170,7 +170,41 @@ def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | 
     if light.has_falloff:
         squared = np.square(ray_length(light, offset, directions))
         factor = factor * (squared / (squared + light.smooth)) * squared ** (0.5 * light.falloff)
+    if light.pattern is not None:
+        factor = factor * pattern_values(light.pattern, _normals(light, offset, directions))
     return factor
+
+
+def _normals(light, offset, directions):
+    """Normals (3, ...) of the places on the light that unit `directions` (3, ...) meet."""
+    if light.shape != "BALL" or light.pattern.by_ray:
+        return -directions
+    distance = np.sqrt(np.maximum(dot(offset, offset), np.finfo(offset.dtype).tiny))
+    axis = offset / distance
+    along = dot(directions, axis)
+    across = directions - along * axis
+    sine = np.sqrt(dot(across, across))
+    # By the law of sines: seen from the center, the place is so far from the point.
+    ratio = np.clip(sine * distance / light.radius, 0.0, 1.0)
+    root = np.sqrt(1.0 - ratio * ratio) * np.where(distance > light.radius, 1.0, -1.0)
+    cosine, beside = root * along + ratio * sine, ratio * along - root * sine
+    return across * (beside / np.maximum(sine, 1e-20)) - cosine * axis
+
+
+def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
+    """Values (...) of a pattern for normals (3, ...), between its own linearly."""
+    x, y, z = (dot(row, normals) for row in pattern.axes.astype(normals.dtype))
+    rows, columns = pattern.values.shape
+    row = np.arctan2(np.sqrt(x * x + y * y), z) * (rows / np.pi) - 0.5
+    column = np.arctan2(y, x) * (0.5 * columns / np.pi) - 0.5
+    first, left = np.floor(row), np.floor(column)
+    down, right = row - first, column - left
+    upper, lower = (np.clip(first + step, 0, rows - 1).astype(np.intp) for step in (0, 1))
+    here, there = ((left + step).astype(np.intp) % columns for step in (0, 1))
+    values = pattern.values
+    above = values[upper, here] * (1.0 - right) + values[upper, there] * right
+    below = values[lower, here] * (1.0 - right) + values[lower, there] * right
+    return (above * (1.0 - down) + below * down).astype(normals.dtype)
 
 
 def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np.ndarray | float:
@@ -178,7 +212,7 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
 
     Where it changes over the disk it is the mean over points of the disk, weighted by what the lobes make of them.
     """
-    if light.cone is None and not light.has_falloff:
+    if light.is_even:
         return 1.0
 
     def factors(places, part):

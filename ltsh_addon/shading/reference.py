@@ -318,7 +318,7 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
         batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
     profile = light_cone.Profile.of(light) if light.has_falloff else None
     for index, make_boundary, cone in batches:
-        if light.is_facing and (light.has_falloff or light.cone is not None):
+        if light.is_facing and not light.is_even:
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
         elif cone is None and light.has_falloff:
             cone = _whole_cone(samples, frame, light, index, profile)

@@ -8,7 +8,7 @@ import quadrature
 from surface_scenes import area_light, random_samples, unit
 
 from ltsh_addon import shading
-from ltsh_addon.scene import AreaLight, SpotCone
+from ltsh_addon.scene import AreaLight, Pattern, SpotCone
 
 CORNERS = np.array([(-1.0, -0.4, 0.0), (0.8, -0.6, 0.0), (1.0, 0.7, 0.0), (-0.6, 0.5, 0.0)])
 
@@ -174,3 +174,27 @@ def test_both_precisions_agree_about_lights_that_face_every_point(kind):
     assert np.abs(single - double).max() < (3e-3 if kind == "small" else 2e-4) * double.max()
     expected = shading.shade(samples, [light], "reference", passes=["specular"], workers=1).specular[0]
     assert np.linalg.norm(double - expected) < 0.015 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("by_ray", [False, True])
+def test_patterns_are_read_by_direction_and_survive_json(by_ray):
+    """A pattern 1 + v_x / 2: within a ball's outline the normals, or the rays, are what it goes by."""
+    polar, around = (np.arange(64) + 0.5)[:, None] * (np.pi / 64), (np.arange(128) + 0.5) * (2.0 * np.pi / 128)
+    axes = rotation_to((0.0, 0.0, 1.0), (0.2, 1.0, 0.4))
+    pattern = Pattern(axes, 1.0 + 0.5 * np.sin(polar) * np.cos(around), by_ray)
+    light = replace(KINDS["ball"], pattern=pattern)
+    record = AreaLight(**light.record()).pattern
+    assert np.array_equal(record.values, pattern.values) and record.by_ray == by_ray
+    samples = lit_samples(12, light)
+    found = shading.shade(samples, [light], "reference", passes=["specular"], workers=1).specular[0]
+
+    def weighted(directions, samples):
+        offset = (light.center - samples.position)[:, None]
+        squared = (offset**2).sum(axis=-1)
+        along = (directions * offset).sum(axis=-1)
+        length = along - np.sqrt(np.maximum(along**2 - squared + 0.16, 0.0))
+        normal = -directions if by_ray else unit(length[..., None] * directions - offset)
+        return quadrature.ggx(directions, samples) * (1.0 + 0.5 * normal @ axes[0])[..., None]
+
+    expected = oracle(samples, KINDS["ball"], weighted)
+    assert np.allclose(found, expected, rtol=5e-3, atol=2e-3 * expected.max())

@@ -297,14 +297,19 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLig
     emission = emission_of(light)
     if emission.plain:
         return None
-    if emission.directional:
+    is_point = light.type != "AREA"
+    if emission.directional and light.type in ("AREA", "SUN"):
         nodes = ", ".join(sorted(emission.directional))
         inventory.warn(
             f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
         )
     if emission.falloff is None:
         inventory.warn(f"light {ob.original.name!r}: {NO_FACTOR}")
-    return UnseenLight(light.original, matrix, emission.varies, emission.falloff or Falloff())
+    if light.type == "SUN" and emission.varies:
+        inventory.warn(f"light {ob.original.name!r}: its emission varies over the sun, shaded as in its middle")
+    by_ray = bool(emission.directional)
+    varies = emission.varies or (is_point and by_ray)
+    return UnseenLight(light.original, matrix, varies, emission.falloff or Falloff(), is_point, by_ray)
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:

@@ -251,9 +251,11 @@ class Studio:
         finally:
             bpy.data.objects.remove(ob)
 
-    def look(self, center, half_u, half_v, direction, pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray]:
+    def look(
+        self, center, half_u, half_v, direction, pixels: int = PIXELS, depth: float = CLIP
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Radiance (H, W, 3) that the rectangle center +- half_u +- half_v emits toward `direction`, and where (H, W)
-        anything was seen.
+        anything was seen: up to `depth` times its longer side from its plane.
 
         Columns run along half_u; row 0 is at +half_v if (half_u, half_v, direction) is right-handed, else at -half_v.
         """
@@ -266,10 +268,25 @@ class Studio:
         self.camera.matrix_world = Matrix(axes.tolist())
         lens = self.camera.data
         lens.ortho_scale = width
-        lens.clip_start, lens.clip_end = (1.0 - CLIP) * distance, (1.0 + CLIP) * distance
+        lens.clip_start, lens.clip_end = max(1.0 - depth, 1e-3) * distance, (1.0 + depth) * distance
         self._fit_pixels(width / height, pixels)
         light = self.picture()
         return light[..., :3], light[..., 3] > 0.5
+
+    def look_around(self, forward, right, pixels: int) -> np.ndarray:
+        """Radiance (pixels, pixels, 3) that arrives at the origin from the quarter turn around `forward`; columns run
+        along `right`, row 0 is at its cross product with `forward`."""
+        axes = np.eye(4)
+        axes[:3, 0], axes[:3, 1], axes[:3, 2] = right, np.cross(right, forward), -forward
+        self.camera.matrix_world = Matrix(axes.tolist())
+        lens, render = self.camera.data, self.scene.render
+        lens.type, lens.angle, lens.clip_start, lens.clip_end = "PERSP", 0.5 * np.pi, 1e-3, 10.0
+        render.resolution_x = render.resolution_y = pixels
+        render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+        try:
+            return self.picture()[..., :3]
+        finally:
+            lens.type = "ORTHO"
 
     def picture(self) -> np.ndarray:
         """What the camera sees (H, W, 4), row 0 on top."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import bpy
@@ -9,7 +10,7 @@ import numpy as np
 
 from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
-from ...scene import AreaLight
+from ...scene import AreaLight, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, Studio, falloff_left_out
 
@@ -27,6 +28,8 @@ class UnseenLight:
     matrix: np.ndarray  # (4, 4) in the world
     varies: bool  # over the light's surface, as far as its nodes tell
     falloff: Falloff
+    is_point: bool = False  # a point, spot or sun
+    by_ray: bool = False  # what it emits depends on where it shines
 
 
 def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
@@ -39,13 +42,19 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
         source = unseen[position]
         own = seen.setdefault(source.data.name_full, [])
         if not own or (source.varies and len(own) < MOST_LOOKS):
-            own.append(_factor(light, source, studio))
+            own.append(point_factor(light, source, studio) if source.is_point else _factor(light, source, studio))
             factor, covered = own[-1]
         else:
             factor, covered = own[0]
             if source.varies:
                 warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the texture of the first")
-        light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
+        if not light.is_distant:
+            light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
+        elif source.falloff != Falloff():
+            warn(f"light {light.name!r}: its Light Falloff has no distance, shaded as its Strength")
+        if light.is_facing or light.is_distant:
+            result.extend(with_pattern(light, factor, source, warn))
+            continue
         result.extend(_with_factor(light, factor, covered, warn))
     return result
 
@@ -80,6 +89,99 @@ def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.n
         x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
         covered = np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
     return factor, covered
+
+
+# Of the map of directions of a point or spot light: rows, and points along each side of the six views it is made of.
+PATTERN_ROWS, VIEW_PIXELS = 64, 192
+# Colors of a pattern that differ by more, as a share of the light, are said to be lost.
+PATTERN_COLORS = 0.05
+
+
+def point_factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
+    """What the node tree multiplies the radiance of a point, spot or sun by: (1, 1, 3), or where it varies (H, W, 3) by
+    direction in the frame of the light, as of a `Pattern`; all are covered."""
+    data = source.data.copy()
+    try:
+        if light.is_distant or not source.varies:
+            data = _white(data, "AREA", {"shape": "SQUARE", "size": 1.0, "spread": np.pi})
+            with _in_the_middle(data, studio):
+                image = studio.look(np.zeros(3), 0.5 * _AXES[0], 0.5 * _AXES[1], -_AXES[2], 8)[0]
+            factor = image.mean(axis=(0, 1), keepdims=True)
+        else:
+            data = _white(data, "POINT", {"shadow_soft_size": 1.0, "use_soft_falloff": False})
+            with _in_the_middle(data, studio):
+                factor = _seen_from_all_sides(studio, source.by_ray)
+    finally:
+        bpy.data.lights.remove(data)
+    factor = factor / (_WHITE["energy"] / np.pi)
+    return factor, np.ones(factor.shape[:2], bool)
+
+
+_AXES = np.eye(3)
+_WHITE = {"color": (1.0, 1.0, 1.0), "energy": 100.0, "exposure": 0.0, "normalize": False, "use_temperature": False}
+
+
+def _white(data, kind: str, settings: dict):
+    """The light `data` as one of another kind, white."""
+    name, data.type = data.name, kind
+    # Another type is another class.
+    data = bpy.data.lights[name]
+    for key, value in {**_WHITE, **settings}.items():
+        setattr(data, key, value)
+    return data
+
+
+@contextmanager
+def _in_the_middle(data, studio):
+    """Meanwhile the light stands at the origin, without its falloff."""
+    ob = bpy.data.objects.new("Look at a light", data)
+    ob.visible_camera = True
+    with falloff_left_out([data]), studio.show(ob, np.eye(4)):
+        yield
+
+
+def _seen_from_all_sides(studio, by_ray: bool) -> np.ndarray:
+    """The map (H, W, 3) of a ball of radius 1: from six sides, or from within, where rays go against its normals."""
+    rows, columns = PATTERN_ROWS, 2 * PATTERN_ROWS
+    polar = (np.arange(rows) + 0.5)[:, None] * (np.pi / rows)
+    around = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
+    x, y, z = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0.0 * around
+    normal = np.stack([x, y, z], axis=-1)
+    result, highest = np.zeros((rows, columns, 3)), np.full((rows, columns), -1.0)
+    for number in range(6):
+        out, right = _AXES[number // 2] * (-1.0) ** number, _AXES[(number // 2 + 1) % 3]
+        facing = normal @ out
+        better, depth = facing > highest, np.ones_like(facing)
+        if by_ray:
+            # Light that goes out along the normal is met by a ray that goes the other way.
+            image, up, depth = studio.look_around(-out, right, VIEW_PIXELS), np.cross(right, -out), -facing
+        else:
+            up = np.cross(out, right)
+            image = studio.look(np.zeros(3), right, up, out, VIEW_PIXELS, 1.0)[0]
+        depth = np.where(better & (depth != 0.0), depth, 1.0)
+        row, column = (
+            np.clip((normal @ axis / depth + 1.0) * 0.5 * VIEW_PIXELS, 0, VIEW_PIXELS - 1).astype(int)
+            for axis in (-up, right)
+        )
+        result[better], highest[better] = image[row, column][better], facing[better]
+    return result
+
+
+def with_pattern(light: AreaLight, factor: np.ndarray, source: UnseenLight, warn) -> list[AreaLight]:
+    """A point, spot or sun whose radiance its node tree multiplies by `factor`, as from `point_factor`."""
+    weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
+    mean = (factor * weights).sum(axis=(0, 1)) / (weights.sum() * factor.shape[1])
+    if not mean.any():
+        return []
+    light = replace(light, radiance=light.radiance * mean)
+    if factor.shape[0] == 1:
+        return [light]
+    values = factor.mean(axis=-1) / mean.mean()
+    apart = np.abs(factor - values[..., None] * mean).mean() / max(np.abs(mean).mean(), 1e-30)
+    if apart > PATTERN_COLORS:
+        warn(f"light {light.name!r}: the colors of its pattern are shaded as their mean, {100.0 * apart:.0f} % off")
+    axes = np.linalg.inv(source.matrix[:3, :3] / np.linalg.norm(source.matrix[:3, :3], axis=0))
+    return [replace(light, pattern=Pattern(axes, values, source.by_ray))]
 
 
 def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn) -> list[AreaLight]:

@@ -68,7 +68,7 @@ def _light(ob) -> Entry:
     unseen = unseen_light(ob, matrix, inventory)
     note_unsupported_light(ob, matrix, inventory)
     notes = [note.partition(": ")[2] for note in inventory.warnings]
-    if unseen is not None and unseen.varies:
+    if unseen is not None and unseen.varies and ob.data.type == "AREA":
         notes.append("its emission varies, shaded as patches of constant radiance")
     return Entry(ob.name, kind, APPROXIMATED if notes else EXACT, tuple(notes))
 

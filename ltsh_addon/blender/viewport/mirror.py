@@ -113,12 +113,14 @@ def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str
     if source is None or source.node is None:
         return []
     if source.node.bl_idname == "ShaderNodeEmission" and emission.falloff is not None:
-        light = replace(light, falloff=emission.falloff.power, smooth=emission.falloff.smooth)
+        if not light.is_distant:
+            light = replace(light, falloff=emission.falloff.power, smooth=emission.falloff.smooth)
         entries, _ = factors_of(source)
         factor = functools.reduce(product, [value_at(*entry) for entry in entries])
         if factor is not None and factor.is_constant:
             return [replace(light, radiance=light.radiance * factor.offset)]
-        patches = None if factor is None else textures.split(light, factor, notes)
+        is_area = not (light.is_facing or light.is_distant)
+        patches = textures.split(light, factor, notes) if factor is not None and is_area else None
         if patches is not None:
             return patches
     notes.append(f"{light.name}: its nodes are not resolved, it shines as without them")

@@ -113,7 +113,7 @@ def lamp_of_files(tree):
     rows = ["IESNA:LM-63-1995", "TILT=NONE", f"1 -1 1 {len(angles)} 1 1 2 0 0 0", "1 1 100"]
     rows += [" ".join(f"{angle:g}" for angle in angles), "0", " ".join(f"{one:g}" for one in power)]
     node.ies.write("\n".join(rows))
-    return node.outputs["Factor"]
+    return node.outputs[0]
 
 
 @pytest.mark.parametrize("kind", ["POINT", "SPOT", "SUN"])

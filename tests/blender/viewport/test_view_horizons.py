@@ -105,7 +105,8 @@ def low_poly_sphere():
 
 def samples_in(gbuffer, eye):
     """Samples and pixels of the surfaces in `gbuffer`."""
-    read_textures = {field.name: read(getattr(gbuffer, field.name)) for field in fields(gbuffer)}
+    names = [field.name for field in fields(gbuffer) if field.name != "shares"]
+    read_textures = {name: read(getattr(gbuffer, name)) for name in names}
     pixel = np.flatnonzero(read_textures["position"][:, 3] > 0.0)
     at = {name: values[pixel] for name, values in read_textures.items()}
     normals = ("geometric_normal", "diffuse_normal", "smooth_normal")

@@ -17,6 +17,7 @@ import numpy as np
 from . import float64, light_cone, moments32, small_lights
 from .facing import FacingDisk, Lobe, mean_emission
 from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach
+from .light_tree import FEWEST, LightTree, add_far_lights
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .lookup_table import MIN_ALPHA
 from .patch_tree import PatchTree
@@ -44,7 +45,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     To the list `leftovers`, if there is one, come pairs that are left to `shade_pairs`, fewer than FLOAT64_CHUNK: the
     samples (N,) and the positions (N,) of the lights among those that affect diffuse lobes.
     """
-    lights = [item for item in lights if item[0].affects_diffuse]
+    lights = Lights.of(lights, "diffuse")
     lit = np.nonzero(_any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
     if samples.diffuse_normal is not samples.smooth_normal:
@@ -69,7 +70,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
 
 def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     """As `shade_diffuse` for the specular lobes of `table`."""
-    lights = [item for item in lights if item[0].affects_specular]
+    lights = Lights.of(lights, "specular")
     ridges = moments32.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
     reflective = np.logical_or.reduce([_any_component(term) for term in terms])
@@ -77,22 +78,34 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
-    for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(lit & ~sharp)[0]):
-        for index in _chunks(members):
-            axes = _columns(samples.normal, index), _columns(samples.view, index)
-            rows, clip_rows, weights = _lobe_rows(samples, index, axes, ridges, vectors, scratch)
-            integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
-            limits = None
-            if table.family == "ltsh":
-                ior = None if isinstance(vectors[-1], int) else samples.ior[index]
-                second = rows[clip_rows[0]] if len(clip_rows) > 1 else None
-                limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
-            at_point = small_lights.LobeAtPoint(rows, weights, table.family == "ltc", limits)
-            sharpest = small_lights.SharpestLobes(*axes, width)
-            lobes = Lobes(index, rows, clip_rows, integrate, at_point, colors_of(index), width, limits, sharpest)
-            lighting.add(lobes)
+    if lights.trees and table.family == "ltsh":
+        far, sharp = sharp, np.zeros_like(sharp)
+    else:
+        far = sharp & False
+    for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
+        for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(chosen)[0]):
+            for index in _chunks(members):
+                lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
+                lighting.add(replace(lobes, only_tails=only_tails))
     lighting.add_in_float64(np.nonzero(sharp)[0])
     lighting.finish(leftovers)
+
+
+def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
+    """The specular lobes of the samples `index` (Q,) with colors (F, 3, Q); kind: a table, the same prepared, and the
+    Fresnel terms as `fresnel_kinds` has them."""
+    table, ridges, vectors = kind
+    axes = _columns(samples.normal, index), _columns(samples.view, index)
+    rows, clip_rows, weights = _lobe_rows(samples, index, axes, ridges, vectors, scratch)
+    integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
+    limits = None
+    if table.family == "ltsh":
+        ior = None if isinstance(vectors[-1], int) else samples.ior[index]
+        second = rows[clip_rows[0]] if len(clip_rows) > 1 else None
+        limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
+    at_point = small_lights.LobeAtPoint(rows, weights, table.family == "ltc", limits)
+    sharpest = small_lights.SharpestLobes(*axes, width)
+    return Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest)
 
 
 def specular_in_float64(table):
@@ -121,11 +134,34 @@ class Lobes:
     width: np.ndarray | float  # as for `light_levels`
     limits: TailLimits | None = None
     sharpest: small_lights.SharpestLobes | None = None  # of specular lobes
+    only_tails: bool = False  # elsewhere single precision does not suffice
 
     @cached_property
     def clip_lengths(self) -> list[np.ndarray]:
         """Lengths (Q,) of the rows that are clipped."""
         return [np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows]
+
+
+class Lights(list):
+    """Lights (light, group, corners) that affect one pass; trees of many of them are made once."""
+
+    @classmethod
+    def of(cls, lights, name) -> Lights:
+        """Those of `lights` that affect the pass `name`; of Lights for that pass they are the same ones."""
+        return (
+            lights if isinstance(lights, Lights) else cls(one for one in lights if getattr(one[0], f"affects_{name}"))
+        )
+
+    @cached_property
+    def trees(self) -> list[tuple[LightTree, list[int]]]:
+        """Trees, and the positions here of their lights."""
+        kinds: dict[tuple, list[int]] = {}
+        for number, (light, group, _) in enumerate(self):
+            is_plain = not (light.is_profiled or light.is_distant or light.is_facing or light.cone is not None)
+            if is_plain and (light.radiance >= 0.0).all():
+                kinds.setdefault((group, light.receivers), []).append(number)
+        many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
+        return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
 
 
 class _Lighting:
@@ -142,7 +178,11 @@ class _Lighting:
         samples, index, colors = self.samples, lobes.index, lobes.colors
         position = np.ascontiguousarray(samples.position[index].T)
         sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
-        for (light, group, corners), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
+        left = self._add_far(lobes, position, sums)
+        for number, (light, group, corners) in enumerate(self.lights):
+            columns, needs_float64 = left.get(number), self.needs_float64[number]
+            if columns is not None and len(columns) == 0:
+                continue
             allowed = light.receives(samples.receiver, index)
             if float64.has_patches(light):
                 self._add_patches(lobes, light, group, sums[group])
@@ -150,10 +190,13 @@ class _Lighting:
             if light.is_focused or light.cone is not None:
                 near = may_reach(light, position)
                 allowed = near if allowed is None else allowed & near
-            if light.is_profiled:
-                rest = None
-            else:
-                rest = self._add_small(lobes, light, position, allowed, sums[group])
+            if lobes.only_tails:
+                chosen = _both(allowed, columns)
+                needs_float64.append(index if chosen is None else index[chosen])
+                continue
+            rest = columns
+            if not light.is_profiled:
+                rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
                 if rest is not None and len(rest) == 0:
                     continue
             if light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners):
@@ -197,40 +240,56 @@ class _Lighting:
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[group, index] += reflected.T
 
-    def _add_small(self, lobes, light, position, allowed, total) -> np.ndarray | None:
-        """Add the light to total (F, 3, Q) where it is small; the columns (Q',) that are left, None for all."""
-        seen, left, count = small_lights.SmallLight.of(light), [], position.shape[1]
-        direction = seen.area_vector.astype(np.float32)
+    def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
+        """Add to the sums (F, 3, Q) by group the light of those of many lights that are far away; by number of the
+        light the columns (Q',) for which it is left to do. Lights without an entry are left for all."""
+        left = {}
+        for tree, numbers in self.lights.trees:
+            light, group, _ = self.lights[numbers[0]]
+            allowed = light.receives(self.samples.receiver, lobes.index)
+            chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
+            near = add_far_lights(tree, lobes, position, chosen, sums[group]) if len(chosen) else {}
+            left.update({number: near.get(place, chosen[:0]) for place, number in enumerate(numbers)})
+        return left
+
+    def _add_small(self, lobes, light, position, among, total) -> np.ndarray | None:
+        """Add the light to total (F, 3, Q) where it is small, `among` those columns (Q',), None for all, and those of
+        a mask (Q,), None for all; the columns that are left, None for all."""
+        columns, allowed = among
+        seen, left = small_lights.SmallLight.of(light), []
+        count = position.shape[1] if columns is None else len(columns)
+        area_vector = seen.area_vector.astype(np.float32)
         origins = light.origins(position)
-        for part in moments32.pieces(count, SMALL_CHUNK):
+        for piece in moments32.pieces(count, SMALL_CHUNK):
+            part = piece if columns is None else columns[piece]
             offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
-            rays = small_lights.Rays.along(offset, direction, np.float32(seen.diagonal))
+            rays = small_lights.Rays.along(offset, area_vector, np.float32(seen.diagonal))
             if light.is_facing:
                 rays = replace(rays, flux=np.float32(np.linalg.norm(light.area_vector)) * rays.distance)
             size = small_lights.seen_sizes(lobes, part, rays, seen.radius)
-            rays = replace(rays, slack=small_lights.VARIATION * size)
+            rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
             small, lit = small_lights.small_and_lit(lobes, part, rays, seen.radius, size)
             if not small.all():
-                left.append(part.start + np.nonzero(~small)[0])
+                left.append(_chosen(part, np.nonzero(~small)[0]))
             if allowed is not None:
                 lit &= allowed[part]
             share = np.count_nonzero(lit)
             if share == 0:
                 continue
-            if share == len(lit):
-                found, columns = lobes.at_point(part, rays), part
-            elif share > MOSTLY_WHOLE * len(lit):
-                found, columns = np.where(lit, lobes.at_point(part, rays), np.float32(0.0)), part
+            if share > MOSTLY_WHOLE * len(lit):
+                found = lobes.at_point(part, rays)
+                if share < len(lit):
+                    found = np.where(lit, found, np.float32(0.0))
             else:
                 chosen = np.nonzero(lit)[0]
-                columns = part.start + chosen
-                found = lobes.at_point(columns, rays.take(chosen))
+                part = _chosen(part, chosen)
+                found = lobes.at_point(part, rays.take(chosen))
             if light.is_facing:
-                found = found * self._seen(light, lobes.index[columns], position[:, columns])[1]
+                found = found * self._seen(light, lobes.index[part], position[:, part])[1]
             for channel in range(3):
-                total[:, channel, columns] += found * np.float32(light.radiance[channel])
+                total[:, channel, part] += found * np.float32(light.radiance[channel])
         left = np.concatenate(left) if left else np.empty(0, np.intp)
-        return None if len(left) == count else left
+        return None if columns is None and len(left) == count else left
 
     def _seen(self, light, index, position) -> tuple[FacingDisk, np.ndarray | float]:
         """A light that faces the samples `index` as they see it from position (3, Q), and its `mean_emission`."""
@@ -376,6 +435,11 @@ def _is_narrow(light, corners) -> bool:
 def _is_in_pieces(light, corners) -> bool:
     """True for lights that `light_levels` takes apart: what double precision does, it does for all pieces."""
     return light.is_profiled and light.shape == "POLYGON" and len(convex_pieces(corners)) > 1
+
+
+def _chosen(part, index):
+    """Those of the columns `part`, a slice or integers, at `index` (Q,)."""
+    return part.start + index if isinstance(part, slice) else part[index]
 
 
 def _both(allowed, rest):

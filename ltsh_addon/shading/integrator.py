@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -71,11 +72,9 @@ class Task:
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
-        plain = self._prepared(light for light in self.lights if not light.detail)
-        self._add(samples, plain, radiance, error, scratch, leftovers)
-        with_patches = [light for light in self.lights if float64.has_patches(light)]
-        if with_patches:
-            self._add(samples, self._prepared(with_patches), radiance, error, scratch, {})
+        self._add(samples, self._plain, radiance, error, scratch, leftovers)
+        if self._with_patches is not None:
+            self._add(samples, self._with_patches, radiance, error, scratch, {})
         for light in self.lights:
             if light.detail and not float64.has_patches(light):
                 for name in self.passes:
@@ -96,6 +95,22 @@ class Task:
             result[pairs] = found
         return result
 
+    @cached_property
+    def _plain(self) -> dict[str, float32.Lights]:
+        """The lights without a detail, by pass."""
+        return self._by_pass(light for light in self.lights if not light.detail)
+
+    @cached_property
+    def _with_patches(self) -> dict[str, float32.Lights] | None:
+        lights = [light for light in self.lights if float64.has_patches(light)]
+        return self._by_pass(lights) if lights else None
+
+    def _by_pass(self, lights):
+        lights = self._prepared(lights)
+        found = {name: float32.Lights.of(lights, name) for name in self.passes}
+        # Where all lights affect both passes their trees are the same.
+        return found if len({len(own) for own in found.values()}) > 1 else dict.fromkeys(found, found[self.passes[0]])
+
     def _prepared(self, lights):
         return [(light, self.groups.index(light.group), light.polygon()) for light in lights]
 
@@ -106,31 +121,31 @@ class Task:
             own_error = None if error is None else np.zeros(len(index))
             # Of the group of the whole light, whatever theirs are.
             group = self.groups.index(light.group)
-            prepared = [(patch, group, patch.polygon()) for patch in patches]
-            self._add(samples.take(index), prepared, own, own_error, scratch, {})
+            prepared = float32.Lights((patch, group, patch.polygon()) for patch in patches)
+            self._add(samples.take(index), {name: prepared}, own, own_error, scratch, {})
             radiance[:, index] += own[name]
             if error is not None:
                 error[index] += own_error
 
     def _add(self, samples, prepared, radiance, error, scratch, leftovers) -> None:
-        """Add the light of the `prepared` lights to the passes in `radiance`, but for `leftovers`."""
+        """Add the light of the `prepared` lights by pass to the passes in `radiance`, but for `leftovers`."""
         if self.single:
             if "diffuse" in radiance:
                 left = leftovers.get("diffuse")
-                float32.shade_diffuse(samples, prepared, radiance["diffuse"], scratch, left)
+                float32.shade_diffuse(samples, prepared["diffuse"], radiance["diffuse"], scratch, left)
             if "specular" in radiance:
-                left = leftovers.get("specular")
-                float32.shade_specular(samples, prepared, self.table, radiance["specular"], scratch, left)
+                left, lights = leftovers.get("specular"), prepared["specular"]
+                float32.shade_specular(samples, lights, self.table, radiance["specular"], scratch, left)
             return
         for start in range(0, len(samples), FLOAT64_CHUNK):
             chunk = slice(start, start + FLOAT64_CHUNK)
             part = samples.take(chunk)
             views = {name: values[:, chunk] for name, values in radiance.items()}
             if "diffuse" in views:
-                float64.shade_diffuse(part, prepared, views["diffuse"])
+                float64.shade_diffuse(part, prepared["diffuse"], views["diffuse"])
             if "specular" in views:
                 estimates = None if error is None else error[chunk]
-                float64.shade_specular(part, prepared, self.table, views["specular"], estimates)
+                float64.shade_specular(part, prepared["specular"], self.table, views["specular"], estimates)
 
 
 def _corners_integrated(light, is_reference):

@@ -31,6 +31,7 @@ class SmallLight:
     radius: float  # m, from there
     area_vector: np.ndarray  # (3,) m^2, toward where it shines
     diagonal: float  # m^2: the longer half diagonal of the parallelogram around it, squared
+    covariance: np.ndarray  # (3, 3) m^2, of its points
 
     @classmethod
     def of(cls, light) -> SmallLight:
@@ -38,15 +39,20 @@ class SmallLight:
         area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
         u, v = light.half_u, light.half_v
         diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())
+        covariance = (np.outer(u, u) + np.outer(v, v)) / (4.0 if light.is_round else 3.0)
         if light.is_round:
-            return cls(light.center, float(np.sqrt(max(u @ u, v @ v))), area, diagonal)
+            return cls(light.center, float(np.sqrt(max(u @ u, v @ v))), area, diagonal, covariance)
         if light.corners is None:
-            return cls(light.center, float(np.sqrt(diagonal)), area, diagonal)
-        offset = light.corners - light.corners[0]
-        weights = np.cross(offset, np.roll(offset, -1, axis=0)) @ (0.5 * light.area_vector)
-        thirds = (offset + np.roll(offset, -1, axis=0)) / 3.0
-        center = light.corners[0] + weights @ thirds / (light.area_vector @ light.area_vector)
-        return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal)
+            return cls(light.center, float(np.sqrt(diagonal)), area, diagonal, covariance)
+        # A fan of triangles: the mean of products over one is a twelfth of those of its corners and of their sum.
+        first = light.corners - light.corners[0]
+        second = np.roll(first, -1, axis=0)
+        shares = np.cross(first, second) @ (0.5 * light.area_vector) / (light.area_vector @ light.area_vector)
+        center = shares @ (first + second) / 3.0
+        products = sum((shares[:, None] * part).T @ part for part in (first, second, first + second)) / 12.0
+        covariance = products - np.outer(center, center)
+        center = light.corners[0] + center
+        return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal, covariance)
 
 
 @dataclass(frozen=True)
@@ -152,8 +158,8 @@ class LobeAtPoint:
     def __call__(self, part, rays: Rays):
         x, y, z = (dot(row[:, part], rays.offset) for row in self.rows[:3])
         inverse = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
-        angle = self.determinant[part] * rays.flux
-        angle *= inverse * inverse * inverse
+        angle = inverse * inverse * inverse
+        angle *= self.determinant[part] * rays.flux
         z *= inverse
         cosine = np.maximum(z, np.float32(0.0)) * angle
         cosine *= np.float32(1.0 / np.pi)

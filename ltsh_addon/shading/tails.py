@@ -18,6 +18,8 @@ from .polygon import dot
 
 # Of the sphere that the mirrored view ray must miss, in units of that around the light.
 NEAR_RADII = 2.0
+# Of the turn toward one of a light's corners: what lies along a direction, on average over directions.
+ALONG = 0.9
 
 
 @dataclass(frozen=True)
@@ -105,28 +107,56 @@ class TailLimits:
 
     def apply_at_centers(self, integrals, part, rays) -> None:
         """As `apply` for integrals (F, ...) over lights so small that their centers stand for all of them, at the ends
-        of `small_lights.Rays`."""
+        of `small_lights.Rays`; without their slack, those in the tail become true."""
         lobes = self.take(part)
         heights, views = dot(lobes.normal, rays.offset), dot(lobes.view, rays.offset)
         beyond = rays.squares - np.float32(NEAR_RADII**2) * rays.diagonal
         mirrored = np.float32(2.0) * lobes.cosine * heights - views
         tail = (mirrored * np.abs(mirrored) < beyond) & (beyond > 0.0)
+        value, cosine = lobes.true_values(heights, views, rays)
+        if rays.slack is None:
+            for integral, true in zip(integrals, lobes.curves(value, cosine, len(integrals)), strict=True):
+                np.copyto(integral, true, where=tail)
+        else:
+            margin = rays.slack * value
+            value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
+            np.copyto(integrals[0], value, where=tail & (integrals[0] > 0.0))
+            # Toward the corners half vectors turn by up to half their angle, which rarely lies along the turn.
+            sine = np.sqrt(np.maximum(np.float32(1.0) - cosine * cosine, np.float32(0.0)))
+            sine *= np.float32(0.5 * ALONG) * np.sqrt(rays.diagonal) / rays.distance
+            cosine = np.maximum(cosine - sine, np.float32(0.0))
+        cosine *= tail
+        lobes.limit_others(integrals, cosine)
+
+    def at_centers(self, part, rays, count) -> list:
+        """True integrals, `count` arrays (...), over small lights that are all in the tail."""
+        lobes = self.take(part)
+        value, cosine = lobes.true_values(dot(lobes.normal, rays.offset), dot(lobes.view, rays.offset), rays)
+        return lobes.curves(value, cosine, count)
+
+    def true_values(self, heights, views, rays):
+        """GGX's integrals (...) over small lights, F = 1, and cosines (...) of the half angles; `heights` change."""
         halves = views * rays.distance
         halves += rays.squares
         cosine = halves / rays.squares
         cosine *= np.float32(0.5)
         cosine = np.sqrt(np.minimum(np.maximum(cosine, np.float32(0.0)), np.float32(1.0)))
-        cosine *= tail
         squares, distances = rays.squares.copy(), rays.distance.copy()
-        value = _integrands(lobes.cosine, lobes.alpha_squared, (heights, halves, squares, distances))
-        value *= lobes.alpha_squared * rays.flux
+        value = _integrands(self.cosine, self.alpha_squared, (heights, halves, squares, distances))
+        value *= self.alpha_squared * rays.flux
         value *= np.float32(0.5 / np.pi)
-        tail &= integrals[0] > 0.0
-        if rays.slack is not None:
-            margin = rays.slack * value
-            value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
-        np.copyto(integrals[0], value, where=tail)
-        lobes.limit_others(integrals, cosine)
+        return np.maximum(value, np.float32(0.0)), cosine
+
+    def curves(self, value, cosine, count) -> list:
+        """The values (...) times the `count` Fresnel curves of the lobes at cosines (...) of the half angle."""
+        found = [value]
+        if self.schlick:
+            found.append(schlick_curve(cosine) * value)
+            if count > 2 + (self.ior is not None):
+                found.append(cosine * (np.float32(1.0) - cosine) * found[1])
+        if self.ior is not None:
+            found.append(dielectric_reflectance(cosine, self.ior) * value)
+        return found
 
     def limit_others(self, integrals, cosine) -> None:
         """Limit all but the first of integrals (F, ...) by that, where `cosine` (...) of the half angle is the least

@@ -1,0 +1,374 @@
+"""Many lights at once: what is far away, faces away or counts little is taken together.
+
+The lights of a group are the leaves of a tree. A tile of neighboring samples takes, of every branch, the coarsest node
+that is small, or whose error is at most ERROR of what the tile gets of the group: far fewer than there are lights. A
+node is then one point or four, which have the mean and the variances of its brightness; how its lights face is taken as
+uniform around their mean. The error is estimated as the light of the node times the fourth power of its size by the
+length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for the
+whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail of
+an "ltsh" lobe get its true value there, as `tails` has it. Lights that are leaves and yet too large go the way of all
+lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import small_lights
+from .polygon import dot
+from .tails import NEAR_RADII
+
+# Fewer lights of a group are shaded one by one.
+FEWEST = 64
+# Size of a node by the length over which the integrand changes: up to SMALL whatever its light is; up to LARGEST where
+# its error is at most ERROR of the light of a group that a tile gets.
+SMALL, LARGEST, ERROR = 0.25, 3.0, 6e-4
+# Size of the nodes that tell how much light that is.
+COARSE = 0.6
+# Smaller ones are one point, others four.
+POINT = 0.08
+# The error of a node's points, by its light and the fourth power of that size.
+FOURTH_ORDER = 1.0
+# Angle in rad from the peak of a sharp lobe beyond which single precision tells its tail to 2e-4.
+SHARP_TAIL = 0.05
+# Leaves whose error is larger are shaded as polygons.
+LEAF_ERROR = 1e-3
+# Samples of a tile, and pairs of a sample and a node that are shaded at a time.
+TILE, PAIRS = 192, 12288
+# Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
+# the swing of its lights where some may face away.
+CROSSED, SWUNG = 0.1, 0.02
+
+# Where the points of a node are along its axes: they have its variances. Those of a square are Gauss's.
+CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class LightTree:
+    """N nodes, the root first; the lights of a leaf are `number`, -1 in branches."""
+
+    center: np.ndarray  # (N, 3) m, of brightness
+    reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness from there; half the diagonal of a square
+    axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness, a standard deviation long; the first is the axis
+    axis: np.ndarray  # (N, 3) mean direction to which the lights shine
+    cone: np.ndarray  # (N,) rad: no direction is farther from that
+    vector: np.ndarray  # (3, N): mean radiance times area vectors
+    swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
+    color: np.ndarray  # (3, N) of the light, 1 on average
+    power: np.ndarray  # (N,) mean radiance times area
+    diagonal: np.ndarray  # (N,) as of `SmallLight`, mean
+    children: np.ndarray  # (N, 2) numbers of nodes
+    number: np.ndarray  # (N,) numbers of the lights as given
+
+    @classmethod
+    def of(cls, lights) -> LightTree:
+        """The tree of AreaLights whose radiance is positive."""
+        seen = [small_lights.SmallLight.of(light) for light in lights]
+        center, area = (np.array([getattr(one, name) for one in seen]) for name in ("center", "area_vector"))
+        radiance = np.array([light.radiance for light in lights])
+        covariance, diagonal = (np.array([getattr(one, name) for one in seen]) for name in ("covariance", "diagonal"))
+        brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
+        power, normal = brightness * size, area / size[:, None]
+        order, start, end, children = _ranges(center, normal)
+        sums = _Sums(order, start, end)
+        total = sums(power)
+        origin = center.mean(axis=0)
+        middle = sums(power[:, None] * (center - origin)) / total[:, None]
+        offset = center - origin
+        spread = power[:, None, None] * (covariance + offset[:, :, None] * offset[:, None, :])
+        spread = sums(spread) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
+        alone = end - start == 1
+        spread[alone] = covariance[order[start[alone]]]
+        variances, axes = np.linalg.eigh(spread)
+        variances = np.maximum(variances, 0.0)
+        axes = (np.sqrt(variances)[:, None] * axes).transpose(2, 1, 0)
+        axis = sums(power[:, None] * normal)
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
+        vector = sums(brightness[:, None] * area).T
+        color = sums(radiance * size[:, None]).T / total
+        # The cosines of directions that differ by so much are taken as uniform, sqrt(3) standard deviations either way.
+        turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
+        swing = total * np.sqrt(1.5 * turned)
+        cone = _cones(axis, normal[order], start, end)
+        number = np.where(end - start == 1, order[start], -1)
+        diagonal = sums(power * diagonal) / total
+        reach = np.sqrt(3.0 * variances.sum(axis=1))
+        return cls(middle + origin, reach, axes, axis, cone, vector, swing, color, total, diagonal, children, number)
+
+
+class _Sums:
+    """Sums over the lights of nodes, which are `order[start:end]`."""
+
+    def __init__(self, order, start, end):
+        self.order, self.start, self.end = order, start, end
+
+    def __call__(self, values):
+        """Sums (N, ...) of values (L, ...) of the lights."""
+        running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values[self.order], axis=0)])
+        found = running[self.end] - running[self.start]
+        alone = self.end - self.start == 1
+        found[alone] = values[self.order[self.start[alone]]]
+        return found
+
+
+def _ranges(center, normal):
+    """Lights in an order (L,) in which those of every node are start to end (N,), and the children (N, 2) of nodes:
+    halves along where the lights differ most, level by level."""
+    count = len(center)
+    order = np.arange(count)
+    starts, ends, children = [np.array([0])], [np.array([count])], []
+    first = 1
+    while True:
+        start, end = starts[-1], ends[-1]
+        inner = np.nonzero(end - start > 1)[0]
+        own = np.full((len(start), 2), -1)
+        own[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
+        children.append(own)
+        if len(inner) == 0:
+            return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
+        start, end = start[inner], end[inner]
+        first += 2 * len(inner)
+        size = end - start
+        member = np.repeat(np.arange(len(inner)), size)
+        places = np.repeat(start - np.concatenate([[0], np.cumsum(size)[:-1]]), size) + np.arange(size.sum())
+        bounds = np.concatenate([[0], np.cumsum(size)[:-1]])
+        values = np.concatenate([center[order[places]], normal[order[places]]], axis=1)
+        extent = np.maximum.reduceat(values, bounds) - np.minimum.reduceat(values, bounds)
+        # A turn by 1 rad counts as half as much as the whole width of a node.
+        extent[:, 3:] *= 0.5 * np.linalg.norm(extent[:, :3], axis=1, keepdims=True)
+        key = values[np.arange(len(values)), extent.argmax(axis=1)[member]]
+        order[places] = order[places][np.lexsort((key, member))]
+        middle = (start + end) // 2
+        starts.append(np.stack([start, middle], axis=1).ravel())
+        ends.append(np.stack([middle, end], axis=1).ravel())
+
+
+def _cones(axis, normals, start, end):
+    """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) from start to end."""
+    least, largest = np.ones(len(axis)), 1 << 16
+    size = end - start
+    for first in range(0, len(axis), largest):
+        chosen = np.arange(first, min(first + largest, len(axis)))
+        # A level at a time: all lights are in it at most once.
+        member = np.repeat(chosen, size[chosen])
+        offset = np.concatenate([[0], np.cumsum(size[chosen])[:-1]])
+        places = np.arange(len(member)) + np.repeat(start[chosen] - offset, size[chosen])
+        least[chosen] = np.minimum.reduceat((axis[member] * normals[places]).sum(axis=1), offset)
+    return np.arccos(np.clip(least, -1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """T tiles of samples, and what bounds the lobes in them."""
+
+    columns: list[np.ndarray]
+    center: np.ndarray  # (T, 3) m
+    half: np.ndarray  # (T, 3) m: half the box around the samples
+    horizons: list[tuple[np.ndarray, np.ndarray]]  # axes (T, 3) and angles (T,) of cones of normals
+    mirrored: tuple[np.ndarray, np.ndarray] | None  # the same of the mirrored views; None for diffuse lobes
+    width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
+    only_tails: bool  # nodes must be in the tails of the lobes, `SHARP_TAIL` from their peaks
+
+    @classmethod
+    def of(cls, lobes, position, chosen) -> Tiles:
+        """Those of the columns `chosen` (Q',) of samples with x, y, z in `position` (3, Q)."""
+        direction = lobes.rows[lobes.clip_rows[-1]] if lobes.sharpest is None else lobes.sharpest.mirrored
+        place = position[:, chosen]
+        extent = np.ptp(place, axis=1)
+        weight = 4.0 / max(np.sqrt(extent @ extent), 1e-30)
+        keys = np.concatenate([weight * (place - place.mean(axis=1, keepdims=True)), direction[:, chosen]])
+        columns = [chosen[part] for part in _halves(keys.astype(np.float32), np.arange(len(chosen)))]
+        low, high = (np.array([end(position[:, part], axis=1) for part in columns]) for end in (np.min, np.max))
+        horizons = [_cones_of(lobes.rows[row], columns) for row in lobes.clip_rows]
+        mirrored = width = None
+        if lobes.sharpest is not None:
+            mirrored = _cones_of(lobes.sharpest.mirrored, columns)
+            width = np.array([lobes.sharpest.width[part].min() for part in columns], dtype=float)
+        return cls(columns, 0.5 * (low + high), 0.5 * (high - low), horizons, mirrored, width, lobes.only_tails)
+
+
+def _halves(keys, part):
+    """Parts of about TILE columns each, neighbors in keys (D, Q)."""
+    if len(part) <= TILE:
+        return [part]
+    own = keys[:, part]
+    along = own[np.argmax(np.ptp(own, axis=1))]
+    order = np.argpartition(along, len(part) // 2)
+    return [*_halves(keys, part[order[: len(part) // 2]]), *_halves(keys, part[order[len(part) // 2 :]])]
+
+
+def _cones_of(vectors, columns):
+    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of every tile."""
+    axes, angles = [], []
+    for part in columns:
+        own = vectors[:, part].astype(np.float64)
+        own /= np.maximum(np.sqrt(dot(own, own)), 1e-30)
+        axis = own.sum(axis=1)
+        axis /= max(np.sqrt(axis @ axis), 1e-30)
+        axes.append(axis)
+        angles.append(np.arccos(np.clip((axis @ own).min(), -1.0, 1.0)))
+    return np.array(axes), np.array(angles)
+
+
+def _angles(offset, distance, axis):
+    """Angles (K,) between vectors (K, 3) of a length (K,) and unit vectors (K, 3)."""
+    return np.arccos(np.clip((offset * axis).sum(axis=1) / distance, -1.0, 1.0))
+
+
+class _Pairs:
+    """Pairs (K,) of a tile and a node: how much light that is at most, and how much of it may be wrong."""
+
+    def __init__(self, tree: LightTree, tiles: Tiles, tile, node):
+        offset = tree.center[node] - tiles.center[tile]
+        gap = np.maximum(np.abs(offset) - tiles.half[tile], 0.0)
+        reach = tree.reach[node]
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
+        nearest = np.maximum(np.linalg.norm(gap, axis=1), 1e-30)
+        size = reach / nearest
+        # By how much directions differ between points of the tile and of the node.
+        extent = np.linalg.norm(tiles.half[tile], axis=1) + reach
+        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.pi)
+        angle, cone = _angles(-offset, distance, tree.axis[node]), tree.cone[node]
+        shining = np.cos(np.clip(angle - cone - parallax, 0.0, 0.5 * np.pi))
+        self.light = tree.power[node] * shining / np.maximum(nearest, reach) ** 2
+        # What is crossed is near the horizon or the plane of the light: the share of it in the light.
+        rim = np.minimum(2.0 * size, 1.0)
+        swing = tree.swing[node] / tree.power[node]
+        plane = np.where(angle + cone + parallax > 0.5 * np.pi, np.minimum(SWUNG * swing + CROSSED * rim, 1.0), 0.0)
+        crossed = np.minimum(plane / np.maximum(shining, 1e-30), 1.0)
+        self.is_dark = angle - cone - parallax > 0.5 * np.pi
+        for number, (axes, cones) in enumerate(tiles.horizons):
+            angle = _angles(offset, distance, axes[tile])
+            steepest = np.clip(angle - cones[tile] - parallax, 0.0, 0.5 * np.pi)
+            self.is_dark |= angle - cones[tile] - parallax > 0.5 * np.pi
+            is_crossed = angle + cones[tile] + parallax > 0.5 * np.pi
+            if tiles.mirrored is None and number == len(tiles.horizons) - 1:
+                self.light *= np.cos(steepest)
+                is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), 1e-30), 1.0)
+            crossed += CROSSED * is_crossed
+        self.are_in_tail = np.zeros(len(node), bool)
+        self.is_wrong = False
+        if tiles.mirrored is not None:
+            axes, cones = tiles.mirrored
+            away = np.maximum(_angles(offset, distance, axes[tile]) - cones[tile] - parallax, 0.0)
+            width = tiles.width[tile]
+            # As `TailLimits` has it, for each of the lights.
+            self.are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * nearest > NEAR_RADII * np.sqrt(
+                tree.diagonal[node]
+            )
+            if tiles.only_tails:
+                self.are_in_tail &= away > SHARP_TAIL
+                self.is_wrong = ~self.are_in_tail
+            self.light *= (width**2 / (width**2 + away**2)) ** 2
+            size = size / np.minimum(width + away, 1.0)
+        self.size = size
+        self.are_points = size < POINT
+        self.light[self.is_dark] = 0.0
+        self.crossed = self.light * crossed
+        self.error = self.light * np.minimum(FOURTH_ORDER * size**4, 1.0) + self.crossed
+
+    def are_fine(self, most) -> np.ndarray:
+        """Mask (K,) of those whose error is at most so much (K,)."""
+        small = (self.size < SMALL) & (self.crossed <= most)
+        return (small | (self.size < LARGEST) & (self.error <= most)) & ~np.asarray(self.is_wrong)
+
+
+def _refined(tree, tiles, tile, node, is_fine):
+    """Pairs (tile, node), and `_Pairs` of them, of which is_fine(pairs, tile) holds or which are leaves, from those
+    given."""
+    fine = [(tile[:0], node[:0])]
+    while len(node):
+        pairs = _Pairs(tree, tiles, tile, node)
+        leaf = tree.number[node] >= 0
+        done = leaf | is_fine(pairs, tile)
+        keep = done & ~pairs.is_dark
+        fine.append((tile[keep], node[keep]))
+        children = tree.children[node[~done]]
+        tile, node = np.repeat(tile[~done], 2), children.ravel()
+    return tuple(np.concatenate(parts) for parts in zip(*fine, strict=True))
+
+
+def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int, np.ndarray]:
+    """Add to total (F, 3, Q) what the columns `chosen` (Q',) of `lobes`, at x, y, z in `position` (3, Q), get of the
+    lights of the tree; by number of the light the columns that need it whole."""
+    tiles = Tiles.of(lobes, position, chosen)
+    count = len(tiles.columns)
+    roots = np.arange(count), np.zeros(count, int)
+    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.size < COARSE)
+    light = np.bincount(tile, _Pairs(tree, tiles, tile, node).light, count)
+    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.are_fine(ERROR * light[tile]))
+    pairs = _Pairs(tree, tiles, tile, node)
+    near = (tree.number[node] >= 0) & ~pairs.are_fine(LEAF_ERROR * light[tile])
+    left: dict[int, list] = {}
+    for own, number in zip(tile[near], tree.number[node[near]], strict=True):
+        left.setdefault(int(number), []).append(tiles.columns[own])
+    order = np.argsort(tile, kind="stable")
+    order = order[~near[order]]
+    bounds = np.searchsorted(tile[order], np.arange(count + 1))
+    for own, columns in enumerate(tiles.columns):
+        mine = order[bounds[own] : bounds[own + 1]]
+        _add_points(
+            tree, lobes, position, (columns, node[mine], pairs.are_points[mine], pairs.are_in_tail[mine]), total
+        )
+    return {number: np.sort(np.concatenate(parts)) for number, parts in left.items()}
+
+
+def _add_points(tree, lobes, position, pairs, total):
+    """Add the light of nodes to total (F, 3, Q); pairs: columns (Q',), nodes (M,), and masks (M,) of those that are
+    one point and of those that are in the tail of all lobes."""
+    columns, nodes, single, tail = pairs
+    middle = position[:, columns].mean(axis=1)
+    place = (position[:, columns] - middle[:, None]).astype(np.float32)
+    clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
+    horizons = [lobes.rows[row][:, columns] for row in clipped]
+    sums = np.zeros((total.shape[0], 3, len(columns)), np.float32)
+    for is_tail in (True, False):
+        chosen = tail == is_tail
+        number, weight, center = _points(tree, nodes[chosen], single[chosen])
+        center = (center - middle[:, None]).astype(np.float32)
+        step = max(PAIRS // len(columns), 1)
+        for first in range(0, len(number), step):
+            part, point = number[first : first + step], center[:, first : first + step, None]
+            rays = _rays(tree, part, point - place[:, None, :], horizons)
+            exact = is_tail and lobes.limits is not None
+            values = lobes.limits.at_centers(columns, rays, len(sums)) if exact else lobes.at_point(columns, rays)
+            colors = (weight[first : first + step] * tree.color[:, part]).astype(np.float32)
+            for channel, color in enumerate(colors):
+                for own, value in zip(sums[:, channel], values, strict=True):
+                    own += (value * color[:, None]).sum(axis=0)
+    total[:, :, columns] += sums
+
+
+def _points(tree, nodes, single):
+    """Numbers (K,) of nodes, shares (K,) in their light and places (3, K) of their points: one of those of the `nodes`
+    (M,) that are `single` (M,), four of others."""
+    alone, others = nodes[single], nodes[~single]
+    corners = tree.center[others].T[:, None] + np.einsum("pk,kcn->cpn", CORNERS, tree.axes[:, :, others])
+    number = np.concatenate([alone, np.tile(others, len(CORNERS))])
+    weight = np.repeat([1.0, 1.0 / len(CORNERS)], [len(alone), len(corners[0]) * len(others)])
+    return number, weight, np.concatenate([tree.center[alone].T, corners.reshape(3, -1)], axis=1)
+
+
+def _rays(tree, part, offset, horizons) -> small_lights.Rays:
+    """Rays (K, Q) to points of the nodes `part` (K,) at offset (3, K, Q), dark below `horizons` (3, Q)."""
+    squares = dot(offset, offset)
+    distance = np.sqrt(squares)
+    vector = tree.vector[:, part].astype(np.float32)[..., None]
+    swing = np.maximum(tree.swing[part], 1e-6 * tree.power[part]).astype(np.float32)[:, None] * distance
+    flux = _mean_above_zero(-dot(vector, offset), swing)
+    for normal in horizons:
+        flux *= dot(normal, offset) > 0.0
+    return small_lights.Rays(offset, squares, distance, flux, tree.diagonal[part].astype(np.float32)[:, None])
+
+
+def _mean_above_zero(mean, swing):
+    """Means (...) of max(0, x) for x uniform between mean - swing and mean + swing."""
+    within = np.minimum(np.maximum(mean, -swing), swing)
+    within += swing
+    within *= within
+    within /= np.float32(4.0) * swing
+    within += np.maximum(mean - swing, np.float32(0.0))
+    return within

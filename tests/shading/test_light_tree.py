@@ -1,0 +1,148 @@
+"""Many lights at once, against all of them one by one in double precision and against the quadrature."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import test_workers
+from surface_scenes import area_light, random_samples, unit
+from test_workers import children_only, started  # noqa: F401
+
+from ltsh_addon import shading
+from ltsh_addon.shading import float32, integrator, light_tree, parallel
+from ltsh_addon.shading.light_tree import LightTree
+
+# What the lights of a tree may be off together; degree 4 is itself off by ten times as much.
+OFF = 3e-3
+BALL = np.array([0.0, 0.0, 4.0])
+
+
+def many_lights(count, seed=1, **options):
+    """Rectangles and disks of 0.2 to 0.6 m in all colors, 2 to 4 m over a floor of 20 m, most of them facing it."""
+    generator = np.random.default_rng(seed)
+    lights = []
+    for number in range(count):
+        direction = unit(np.array([0.0, 0.0, -1.0]) + 0.4 * generator.normal(size=3))
+        u = generator.uniform(0.1, 0.3) * unit(np.cross(direction, [0.3, 1.0, 0.0]))
+        place = np.append(generator.uniform(-10.0, 10.0, 2), generator.uniform(2.0, 4.0))
+        shape = "DISK" if number % 3 == 0 else "RECTANGLE"
+        color = generator.uniform(0.5, 1.0, 3)
+        lights.append(
+            area_light("Lamp", shape, place, u, np.cross(direction, u), direction=direction, radiance=color, **options)
+        )
+    return lights
+
+
+def floor_samples(count, lowest_roughness, seed=2):
+    """Random lobes on a floor of 20 m, bent by some tenths of a radian."""
+    generator = np.random.default_rng(seed)
+    samples = random_samples(count, seed, lowest_roughness)
+    normal = unit(np.array([0.0, 0.0, 1.0]) + 0.2 * generator.normal(size=(count, 3)))
+    position = np.append(generator.uniform(-10.0, 10.0, (count, 2)), np.zeros((count, 1)), axis=1)
+    view = unit(normal + unit(generator.normal(size=(count, 3))) * generator.uniform(0.2, 0.9, size=(count, 1)))
+    normals = dict.fromkeys(("normal", "diffuse_normal", "geometric_normal", "smooth_normal"), normal)
+    return replace(samples, position=position, view=view, **normals)
+
+
+def relative_error(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+def test_diffuse_light_of_many_is_that_of_each():
+    samples, lights = floor_samples(600, 0.3), many_lights(500)
+    found = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1).diffuse
+    expected = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1, dtype=np.float64).diffuse
+    assert relative_error(found, expected) < OFF
+
+
+@pytest.mark.parametrize("lowest_roughness", [0.02, 0.3])
+def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(lowest_roughness):
+    """The tails of lobes are true where lights are points. Some lobes are sharper than single precision can tell."""
+    samples, lights = floor_samples(40, lowest_roughness), many_lights(200)
+    truth = shading.shade(samples, lights, shading.REFERENCE, passes=["specular"], workers=1).specular
+    found = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1).specular
+    each = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1, dtype=np.float64).specular
+    assert relative_error(found, truth) < relative_error(each, truth) + OFF
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_a_ball_of_many_faces_shines_as_the_ball(name):
+    """Unit radiance; half of the faces look away. Diffuse: cos r^2 / d^2 of the whole ball above the horizon."""
+    ball, samples = _ball_of_faces(24), floor_samples(200, 0.3)
+    up = np.broadcast_to([0.0, 0.0, 1.0], (200, 3))
+    samples = replace(samples, diffuse_normal=up, smooth_normal=up, diffuse_albedo=np.ones((200, 3)))
+    found = shading.shade(samples, ball, name, passes=["diffuse"], workers=1).diffuse[0, :, 0]
+    offset = BALL - samples.position
+    distance = np.linalg.norm(offset, axis=1)
+    area = sum(np.linalg.norm(light.area_vector) for light in ball)
+    expected = offset[:, 2] / distance * area / (4.0 * np.pi * distance**2)
+    # The faces are flat: their silhouette differs from that of the ball of their area by less than 1 %.
+    assert relative_error(found, expected) < 0.01
+
+
+def _ball_of_faces(rings):
+    polar = np.linspace(0.0, np.pi, rings + 1)
+    around = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
+    corners = np.stack([
+        np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around),
+        np.cos(polar)[:, None] + 0.0 * around,
+    ], axis=-1)  # fmt: skip
+    lights = []
+    for row in range(rings):
+        for column in range(2 * rings):
+            quad = corners[[row, row + 1, row + 1, row], [column, column, column + 1, column + 1]]
+            quad = np.unique(quad.round(12), axis=0) if row in (0, rings - 1) else quad
+            if len(quad) == 3 or row not in (0, rings - 1):
+                direction = unit(quad.mean(axis=0))
+                u = 0.1 * unit(np.cross(direction, [0.3, 1.0, 0.2]))
+                flat = quad - ((quad - quad.mean(axis=0)) @ direction)[:, None] * direction + BALL
+                lights.append(
+                    area_light(
+                        "Ball", "POLYGON", flat.mean(axis=0), u, np.cross(direction, u), direction=direction,
+                        corners=flat, radiance=np.ones(3),
+                    )
+                )  # fmt: skip
+    return lights
+
+
+def test_groups_receivers_and_black_lights_are_kept_apart():
+    samples = replace(floor_samples(300, 0.3), receiver=np.arange(300) % 3)
+    lights = many_lights(100, 1, group="A") + many_lights(100, 2, group="B", receivers=(1,))
+    lights += [replace(light, radiance=-0.1 * light.radiance) for light in many_lights(5, 3, group="B")]
+    found = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1).diffuse
+    expected = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1, dtype=np.float64).diffuse
+    assert relative_error(found[0], expected[0]) < OFF and relative_error(found[1], expected[1]) < OFF
+    only = shading.shade(samples, lights[100:200], "ltsh4", workers=1).combined
+    assert only[samples.receiver == 1].any() and not only[samples.receiver != 1].any()
+
+
+def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(parallel, "SECONDS_WORTH_A_CHILD", 0.0)
+    monkeypatch.setattr(integrator, "BLOCK_LIMITS", (100, 100))
+    samples, lights = floor_samples(300, 0.02), many_lights(80)
+    one, two = (shading.shade(samples, lights, "ltsh4", workers=count) for count in (1, 2))
+    assert len(started) == 1 and test_workers.all_ended(started)
+    assert np.array_equal(one.specular, two.specular) and np.array_equal(one.diffuse, two.diffuse)
+
+
+def test_nodes_have_the_power_and_the_moments_of_their_lights():
+    lights = many_lights(37)
+    tree = LightTree.of(lights)
+    root = [np.array([getattr(light, name) for light in lights]) for name in ("center", "area_vector", "radiance")]
+    center, area, radiance = root
+    area *= np.copysign(1.0, (area * np.array([light.direction for light in lights])).sum(axis=1))[:, None]
+    power = radiance.mean(axis=1) * np.linalg.norm(area, axis=1)
+    assert np.isclose(tree.power[0], power.sum()) and sorted(tree.number[tree.number >= 0]) == list(range(37))
+    assert np.allclose(tree.center[0], power @ center / power.sum())
+    assert np.allclose(tree.vector[:, 0], radiance.mean(axis=1) @ area)
+    shift = center - tree.center[0]
+    own = sum(
+        share * (np.outer(light.half_u, light.half_u) + np.outer(light.half_v, light.half_v)) / (3 + light.is_round)
+        for share, light in zip(power, lights, strict=True)
+    )
+    moments = ((power[:, None] * shift).T @ shift + own) / power.sum()
+    axes = tree.axes[:, :, 0]
+    assert np.allclose(axes.T @ axes, moments)
+    points = light_tree.CORNERS @ axes
+    assert np.allclose(points.T @ points / len(points), moments) and np.allclose(points.sum(axis=0), 0.0)
+    assert len(lights) < float32.FEWEST  # so that few lights are shaded one by one

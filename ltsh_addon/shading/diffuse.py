@@ -54,7 +54,9 @@ def rebound(color: np.ndarray, cosine: np.ndarray, roughness: np.ndarray) -> np.
     a, b = rough_terms(roughness)
     color = np.clip(color, 0.0, 1.0)
     average = (np.pi * a + (2.0 * np.pi - 5.6) / 3.0 * b)[:, None]
-    scattered = color**2 / np.pi * average / (1.0 - average) / (1.0 - color * (1.0 - average))
+    # What a smooth surface reflects it does not catch again.
+    lost = np.maximum(1.0 - average, 1e-9)
+    scattered = color**2 / np.pi * average / lost / (1.0 - color * lost)
     return scattered * (1.0 - np.pi * a - b * albedo_slope(cosine))[:, None]
 
 

@@ -112,6 +112,11 @@ def test_a_white_rough_surface_reflects_all_light(roughness):
         assert total == pytest.approx(1.0, abs=2e-3)
 
 
+def test_smooth_surfaces_scatter_nothing_again():
+    smooth, rough = diffuse.rebound(np.ones((2, 3)), np.array([0.5, 0.5]), np.array([0.0, 1.0]))
+    assert np.abs(smooth).max() < 1e-5 and rough.min() > 1e-3
+
+
 @pytest.mark.parametrize("shape", [{"diffuse_roughness": 1e-7}, {"sheen_a": 1.0, "sheen_b": 0.0}])
 def test_without_roughness_both_are_lamberts(shape):
     sample, light = single_sample(), area_light()

@@ -41,7 +41,7 @@ EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 # stratified rays falls with their number to the power -0.8.
 WORTH_POWER = 0.75
 # Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
-TYPICAL_SHARE = 0.25
+TYPICAL_SHARE = 0.4
 LEVELS = (16, 32, 64, 128, 256, 512)
 # Samples that tell what is typical, and pairs of them and a light.
 TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20

@@ -15,7 +15,7 @@ import numpy as np
 
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import families, fit, grazing, optimum, validate
+from . import families, fit, optimum, validate
 from .brdfs import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -223,7 +223,7 @@ def _grazing(options) -> int:
         print("ltsh tables: --grazing needs a shipped table of spherical harmonics: ltsh2 or ltsh4", file=sys.stderr)
         return 2
     for name in names:
-        found = grazing.grazing_errors(load_table(name), min(options.count, len(grazing.ROUGHNESS)))
+        found = optimum.grazing_errors(load_table(name), min(options.count, len(optimum.ROUGHNESS)))
         print(f"| `{name}` roughness | n.v | shaded error | solved | ratio | L2 error | solved | ratio |")
         print("|---" * 8 + "|")
         for row in found:
@@ -233,7 +233,7 @@ def _grazing(options) -> int:
         table, solved = (np.sqrt(np.mean([getattr(row, key) ** 2 for row in found])) for key in ("table", "solved"))
         ratios = np.array([row.ratio for row in found])
         print(f"root mean square {table:.4f}, solved {solved:.4f}, ratio {table / solved:.2f}; "
-              f"ratio at most {ratios.max():.2f}, above {grazing.GOAL} at {np.count_nonzero(ratios > grazing.GOAL)} "
+              f"ratio at most {ratios.max():.2f}, above {optimum.GOAL} at {np.count_nonzero(ratios > optimum.GOAL)} "
               f"of {len(ratios)} points", flush=True)  # fmt: skip
     return 0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.shading import SHIPPED_TABLES, evaluate_lobe, integrate_polygon, load_table
-from tables import __main__, grazing
+from tables import __main__, optimum
 from tables.brdfs import GGX
 from tables.families import family_named
 from tables.fit import settings
@@ -111,13 +111,13 @@ def test_mirrors_have_the_known_limit(name):
 
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch):
-    monkeypatch.setattr(grazing, "ROUGHNESS", (0.2, 0.5))
-    monkeypatch.setattr(grazing, "COSINES", (0.05, 0.15))
+    monkeypatch.setattr(optimum, "ROUGHNESS", (0.2, 0.5))
+    monkeypatch.setattr(optimum, "COSINES", (0.05, 0.15))
 
 
 @pytest.mark.soak
 def test_no_table_beats_the_lobe_solved_at_the_point():
-    found = {name: grazing.grazing_errors(TABLES[name], 2) for name in ("ltsh2", "ltsh4")}
+    found = {name: optimum.grazing_errors(TABLES[name], 2) for name in ("ltsh2", "ltsh4")}
     points = [(0.2, 0.05), (0.2, 0.15), (0.5, 0.05), (0.5, 0.15)]
     assert [(row.roughness, row.cosine) for row in found["ltsh4"]] == points
     for rows in found.values():
@@ -131,7 +131,7 @@ def test_no_table_beats_the_lobe_solved_at_the_point():
 
 
 def test_the_error_of_the_table_is_that_of_validate():
-    for row in grazing.grazing_errors(TABLES["ltsh4"], 2):
+    for row in optimum.grazing_errors(TABLES["ltsh4"], 2):
         measured = _measure(TABLES["ltsh4"], row.cosine, row.roughness)
         assert np.isclose(row.table_lobe, measured[0], rtol=1e-12)
         # validate gives the squared integrals over disks relative to the albedo, and their squared errors.
@@ -140,9 +140,9 @@ def test_the_error_of_the_table_is_that_of_validate():
 
 @pytest.mark.soak
 def test_a_spoiled_table_stands_out_and_does_not_spoil_the_solved_lobe():
-    good = grazing.grazing_errors(TABLES["ltsh4"], 2)
+    good = optimum.grazing_errors(TABLES["ltsh4"], 2)
     table = TABLES["ltsh4"]
-    spoiled = grazing.grazing_errors(replace(table, coefficients=1.3 * table.coefficients), 2)
+    spoiled = optimum.grazing_errors(replace(table, coefficients=1.3 * table.coefficients), 2)
     for before, after in zip(good, spoiled, strict=True):
         assert after.ratio > 1.5 * before.ratio and np.isclose(after.solved_lobe, before.solved_lobe, rtol=1e-9)
 

@@ -20,6 +20,7 @@ PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
 SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
 # What patches differ by, on average, that is worth a warning.
 COARSE = 0.05
+MOST_RADIANCE = 1e15  # W m^-2 sr^-1
 NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1  # "NONE" and "AUTOMATIC" of a world's sampling method
 # What Light Path nodes say of the light that surfaces see, as where Cycles samples the world.
 LIGHT_PATH = "ShaderNodeLightPath"
@@ -160,7 +161,12 @@ def _observatory(scene, world, warn):
                 render = studio.scene.render
                 render.resolution_x = render.resolution_y = pixels
                 studio.scene.cycles.samples = samples
-                return SkyPicture(ahead, right, up, studio.picture()[..., :3])
+                radiance = studio.picture()[..., :3]
+                odd = ~(np.abs(radiance) < MOST_RADIANCE).all(axis=-1)
+                if odd.any():
+                    warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}; dark there")
+                    radiance[odd] = 0.0
+                return SkyPicture(ahead, right, up, radiance)
 
             yield look
     finally:

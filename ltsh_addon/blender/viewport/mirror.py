@@ -31,6 +31,7 @@ from ..lights.emission import emission_of, factors_of
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import ShownTextures
+from ..lights.world import may_shine
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
 from ..materials.values import product, value_at
@@ -306,7 +307,9 @@ class SceneMirror:
     def _read_world(self, scene) -> None:
         self.background, whole = world_radiance(scene.world)
         world = scene.world
-        self._world_note = () if whole else (f"{world.name}: its nodes are not resolved, its viewport color is shown",)
+        self._world_note = (f"{world.name}: its light is not shown",) if may_shine(world) else ()
+        if not whole:
+            self._world_note += (f"{world.name}: its nodes are not resolved, its viewport color is shown",)
 
 
 def _shown_look(material) -> ShownLook:

@@ -157,6 +157,15 @@ def test_a_world_that_rays_of_some_kind_see_otherwise_is_named():
     assert any("world 'Sky'" in line and "Is Glossy Ray" in line for line in warnings), warnings
 
 
+def test_a_world_beyond_all_measure_is_named():
+    start()
+    scene_parts.add_world("Sky", Color=(1e20, 1e20, 1e20, 1.0), Strength=1e15)
+    scene_parts.add_area_light("Key")
+    _, _, inventory, warnings = scene_parts.prepare()
+    assert [light.name for light in inventory.lights] == ["Key"]
+    assert any("world 'Sky'" in line and "not finite" in line for line in warnings), warnings
+
+
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])
 def test_what_blocks_a_world_blocks_it_as_in_cycles(tmp_path, kind):
     """Beyond the noise of both sides, of which 256 rays a light and pixel leave some 2 %."""

@@ -5,6 +5,9 @@ directions are spread evenly over the solid angle of the light, as diffuse lobes
 evenly over the light after the warp that flattens the peak of GGX (`shading.lookup_table`), as specular lobes need
 them: none misses the light, however sharp the lobe. The balance heuristic (Veach and Guibas 1995) joins both.
 
+The sides of a sky, which surround all samples, are one light: half of the directions that are not by the specular lobe
+are by its picture, half by the cosine.
+
 All is in single precision, arrays are (S, Q): S directions from each of Q points, or (Q,). Vectors are lists of three.
 """
 
@@ -30,6 +33,9 @@ _LEAST_SOLID_ANGLE = np.float32(1e-20)
 MOST_POINTS = 1024
 # Cells along each side of the picture of a light with a texture.
 _PICTURE = 128
+# Cells along each side of a side of the sky; and how far from a sample the light is that stands for the sky, a plane,
+# by half its side.
+CELLS, NEXT_TO = 64, 1e-3
 # Corners of an ellipse to aim at
 _ROUND_CORNERS = 16
 
@@ -110,7 +116,7 @@ class Emitter:
         self.center, self.axes = _parallelogram(light) if self.corners is None else (None, None)
         self._picture = self._edge = None
         if self.corners is None and light.detail:
-            self._picture = _picture(light, self._places)
+            self._picture = picture_of(light, self._places)
         elif self.corners is None and light.shape == "POLYGON":
             self._edge = self._places(light.corners - light.center).astype(np.float32)
 
@@ -197,7 +203,7 @@ def _cells(place):
     return np.clip((0.5 * _PICTURE) * (place + _ONE), 0, _PICTURE - 1).astype(np.intp)
 
 
-def _picture(light, places_of):
+def picture_of(light, places_of):
     """Brightness (_PICTURE, _PICTURE) of a textured light by the places of its patches, as a share of its mean."""
     grid = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
     picture = np.zeros((_PICTURE, _PICTURE), np.float32)
@@ -208,6 +214,146 @@ def _picture(light, places_of):
         part = picture[rows, columns]
         part[_inside(outline, *np.meshgrid(grid[columns], grid[rows]))] = np.abs(patch.radiance).mean() / mean
     return picture
+
+
+def emitters_of(lights: Sequence[AreaLight]) -> tuple[tuple[Emitter, ...], tuple[tuple[int, ...], ...]]:
+    """Emitters, and which of the `lights` each stands for: the squares of a sky have one together."""
+    skies: dict[str, list[int]] = {}
+    for number, light in enumerate(lights):
+        if _is_side(light):
+            skies.setdefault(light.name, []).append(number)
+    emitters, numbers = [], []
+    for number, light in enumerate(lights):
+        own = skies.get(light.name, []) if _is_side(light) else [number]
+        if own[0] == number:
+            emitters.append(Sky([lights[each] for each in own]) if _is_side(light) else Emitter(light))
+            numbers.append(tuple(own))
+    return tuple(emitters), tuple(numbers)
+
+
+def _is_side(light: AreaLight) -> bool:
+    """True for a side of the cube around all samples."""
+    axes = np.stack([light.center, light.half_u, light.half_v])
+    is_side = light.is_distant and light.shape == "RECTANGLE"
+    return is_side and bool(
+        np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3))
+    )
+
+
+class Sky(Emitter):
+    """The sides of a cube as one emitter; its `light` has their mean radiance and next to nothing else of them."""
+
+    def __init__(self, sides: Sequence[AreaLight]):
+        self.ahead = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
+        self.ahead[1::2] *= -1.0
+        self.right, self.up = np.roll(self.ahead, 1, axis=1), np.roll(self.ahead, 2, axis=1)
+        values, radiance = np.zeros((6, CELLS, CELLS)), np.zeros(3)
+        for side in sides:
+            axis = int(np.argmax(np.abs(side.center)))
+            slot = 2 * axis + int(side.center[axis] < 0.0)
+            self.right[slot], self.up[slot] = side.half_u, side.half_v
+            values[slot] = np.abs(side.radiance).mean() * _cells_of(side)
+            radiance += side.radiance / 6.0
+        place = (np.arange(CELLS) + 0.5) * (2.0 / CELLS) - 1.0
+        angles = (4.0 / CELLS**2) * (1.0 + place[:, None] ** 2 + place**2) ** -1.5
+        power = (values * angles).ravel()
+        self.chances = (power / power.sum()).astype(np.float32)
+        self.ends = np.cumsum(power / power.sum()).astype(np.float32)
+        self.values = (values / max(np.abs(radiance).mean(), 1e-30)).astype(np.float32).ravel()
+        like = sides[0]
+        super().__init__(
+            AreaLight(
+                like.name,
+                "RECTANGLE",
+                center=np.array([0.0, 0.0, NEXT_TO]),
+                half_u=np.array([1.0, 0.0, 0.0]),
+                half_v=np.array([0.0, 1.0, 0.0]),
+                direction=np.array([0.0, 0.0, -1.0]),
+                radiance=radiance,
+                affects_diffuse=like.affects_diffuse,
+                affects_specular=like.affects_specular,
+                receivers=like.receivers,
+                is_distant=True,
+            )
+        )
+
+    def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1): half of them by their brightness, of which those below
+        the horizon of `normal` (3, Q) are mirrored, half of them by their cosine."""
+        by_picture = x < np.float32(0.5)
+        x = np.where(by_picture, np.float32(2.0) * x, np.float32(2.0) * x - _ONE)
+        return np.where(by_picture, self._by_picture(x, y, normal), _by_cosine(x, y, normal))
+
+    def _by_picture(self, x, y, normal):
+        cell = np.minimum(np.searchsorted(self.ends, x.ravel()).reshape(x.shape), len(self.ends) - 1)
+        share = (x - (self.ends[cell] - self.chances[cell])) / np.maximum(self.chances[cell], np.float32(1e-30))
+        slot, place = np.divmod(cell, CELLS * CELLS)
+        row, column = np.divmod(place, CELLS)
+        step = np.float32(2.0 / CELLS)
+        s = (column.astype(np.float32) + np.clip(share, _ZERO, _ONE)) * step - _ONE
+        t = (row.astype(np.float32) + y) * step - _ONE
+        found = np.stack([self.ahead[slot, k] + s * self.right[slot, k] + t * self.up[slot, k] for k in range(3)])
+        found /= np.sqrt(dot(found, found))
+        below = np.minimum(dot(found, normal[:, None]), _ZERO)
+        below *= np.float32(-2.0)
+        found += below * normal[:, None]
+        return found
+
+    def density(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Of `directions` per sr, for unit directions (3, S, Q) above the horizon of `normal`."""
+        height = dot(directions, normal[:, None])
+        mirrored = directions - np.float32(2.0) * height * normal[:, None]
+        found = self._plain_density(directions) + self._plain_density(mirrored)
+        found += np.maximum(height, _ZERO) * np.float32(1.0 / np.pi)
+        found *= np.float32(0.5)
+        return found
+
+    def _plain_density(self, directions):
+        cell, along = self._cells(directions)
+        return self.chances[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along)
+
+    def brightness_along(self, directions: np.ndarray) -> np.ndarray:
+        """Factors (S, Q) of the mean radiance along unit directions (3, S, Q)."""
+        return self.values[self._cells(directions)[0]]
+
+    def _cells(self, directions):
+        """Number (S, Q) of the cell, and the largest component, of unit directions (3, S, Q)."""
+        sizes = np.abs(directions)
+        axis = np.argmax(sizes, axis=0)
+        along = np.take_along_axis(sizes, axis[None], axis=0)[0]
+        slot = 2 * axis + (np.take_along_axis(directions, axis[None], axis=0)[0] < 0.0)
+        column, row = (
+            np.clip(
+                (sum(axes[slot, k] * directions[k] for k in range(3)) / along + _ONE) * np.float32(CELLS / 2.0),
+                0,
+                CELLS - 1,
+            ).astype(np.intp)
+            for axes in (self.right, self.up)
+        )
+        return (slot * CELLS + row) * CELLS + column, along
+
+
+def _by_cosine(x, y, normal):
+    """Unit vectors (3, S, Q) around normals (3, Q), by the cosine."""
+    sign = np.copysign(_ONE, normal[2])
+    a = -_ONE / (sign + normal[2])
+    b = normal[0] * normal[1] * a
+    tangent = np.stack([_ONE + sign * normal[0] * normal[0] * a, sign * b, -sign * normal[0]])[:, None]
+    bitangent = np.stack([b, sign + normal[1] * normal[1] * a, -normal[1]])[:, None]
+    radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
+    found = radius * np.cos(angle) * tangent + radius * np.sin(angle) * bitangent
+    found += np.sqrt(_ONE - x) * normal[:, None]
+    return found
+
+
+def _cells_of(side: AreaLight) -> np.ndarray:
+    """Brightness (CELLS, CELLS) by the mean, rows along half_v, columns along half_u."""
+    if not side.detail:
+        return np.ones((CELLS, CELLS))
+    axes = np.linalg.pinv(np.stack([side.half_u, side.half_v]))
+    picture = picture_of(side, lambda offset: offset @ axes)
+    step = len(picture) // CELLS
+    return picture.reshape(CELLS, step, CELLS, step).mean(axis=(1, 3))
 
 
 class SphericalQuads:

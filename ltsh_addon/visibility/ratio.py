@@ -23,7 +23,7 @@ from ..shading.diffuse import diffuse_factor
 from ..shading.facing import FacingDisk, emission, ray_length
 from ..shading.light_polygons import has_lobe, may_reach
 from . import crew
-from .directions import Choices, Emitter, SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .directions import Choices, Emitter, Sky, SphericalQuads, Warps, dot, emitters_of, frames, seeds_of, unit_points
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -105,13 +105,14 @@ def visible_shares(
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    emitters, passes = tuple(Emitter(light) for light in lights), tuple(passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), is_baked)
+    (emitters, numbers), passes = emitters_of(lights), tuple(passes)
+    typical = dict.fromkeys(passes, 1.0)
+    task = ShadowTask(tuple(lights), emitters, numbers, passes, rays // PROBES * PROBES, typical, is_baked)
     start = time.thread_time()
     typical, looked_at = typical_radiance(samples, task, tracer)
     seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
     task = replace(task, typical=typical)
-    shape = len(emitters), len(samples)
+    shape = len(lights), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
@@ -132,7 +133,9 @@ def visible_shares(
 class ShadowTask:
     """What to do with every block of samples."""
 
+    lights: tuple[AreaLight, ...]
     emitters: tuple[Emitter, ...]
+    numbers: tuple[tuple[int, ...], ...]  # of the lights that each emitter stands for
     passes: tuple[str, ...]
     rays: int
     typical: dict[str, float]
@@ -140,22 +143,22 @@ class ShadowTask:
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
-        shape = len(self.emitters), len(samples)
+        shape = len(self.lights), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
-        choices = Choices(samples, [emitter.light for emitter in self.emitters], self.is_baked)
-        for number, emitter in enumerate(self.emitters):
-            pairs = Pairs(surface, emitter, number, choices)
+        choices = Choices(samples, self.lights, self.is_baked)
+        for numbers, emitter in zip(self.numbers, self.emitters, strict=True):
+            pairs = Pairs(surface, emitter, numbers[0], choices)
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
-            mixed[number, index] = pairs.visible & pairs.blocked
+            mixed[np.ix_(numbers, index)] = pairs.visible & pairs.blocked
             for name in self.passes:
                 share, noise = pairs.found(name)
                 unshadowed = pairs.unshadowed(name)
-                shares[name][number, index] = share
+                shares[name][np.ix_(numbers, index)] = share
                 radiance[name][index] += unshadowed * share
                 variance[name][index] += np.square(unshadowed * noise)
         deviation = {name: np.sqrt(values) for name, values in variance.items()}
@@ -314,7 +317,9 @@ class Pairs:
         """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = np.maximum(worth["specular"], worth["diffuse"])
-        wanted = rays * TYPICAL_SHARE * most**WORTH_POWER
+        # The sky is there for all that it is made of.
+        share = 1.0 if isinstance(self.emitter, Sky) else TYPICAL_SHARE
+        wanted = rays * share * most**WORTH_POWER
         levels = [level for level in LEVELS if level < rays] + [rays]
         number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
@@ -446,7 +451,7 @@ class Pairs:
         if len(differ) == 0:
             return None
         chosen, found = chosen[differ], found[differ]
-        angle = view.quads.solid_angle[column[chosen]]
+        angle = view.solid_angle[column[chosen]]
         return _ChosenBySurface(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
@@ -527,7 +532,10 @@ class View:
         else:
             corners = emitter.corners_from(self.offset, self.height)
         self.quads = SphericalQuads(corners)
-        self.is_seen = self.quads.is_seen
+        self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
+        if isinstance(emitter, Sky):
+            # Of one of the sides, of which `Choices` knows one.
+            self.solid_angle = np.full(len(index), 4.0 * np.pi / 6.0, np.float32)
         self.seeds = surface.seeds[index]
         if "diffuse" in lobes:
             self.horizons = [np.take(normal, index, axis=1) for normal in surface.horizons("diffuse")]
@@ -550,6 +558,8 @@ class View:
 
     def rays(self, rays: Rays):
         """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
+        if isinstance(self.emitter, Sky):
+            return self._rays_to_sky(rays)
         evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
         shape = (evenly + by_lobe, len(self.index))
         directions = np.empty((3, *shape), np.float32)
@@ -583,6 +593,9 @@ class View:
             factor *= brightness
         if light.is_distant:
             distance[:] = _FARTHEST
+        return directions, distance, self._weights(directions, local if by_lobe else None, factor)
+
+    def _weights(self, directions, local, factor):
         weights = {}
         if "specular" in self.lobes:
             weights["specular"] = self._specular(directions, local)
@@ -590,7 +603,35 @@ class View:
         if "diffuse" in self.lobes:
             weights["diffuse"] = self._diffuse(directions)
             weights["diffuse"] *= factor
-        return directions, distance, weights
+        return weights
+
+    def _rays_to_sky(self, rays: Rays):
+        """As `rays`: by the picture of the sky, and evenly over the cosine after the warp."""
+        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
+        shape, local = (evenly + by_lobe, len(self.index)), None
+        normal = self.horizons[0] if "diffuse" in self.lobes else self.geometric_normal
+        directions = np.empty((3, *shape), np.float32)
+        if evenly:
+            directions[:, :evenly] = self.emitter.directions(*unit_points(self.seeds, 0, *rays.evenly), normal)
+        if by_lobe:
+            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
+            x, y = unit_points(self.seeds, 1, *rays.by_lobe)
+            radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
+            chosen = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(_ONE - x))
+            local[:, evenly:] = chosen
+            length[evenly:] = self.warps.unwarped(local[:, evenly:])
+            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
+            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
+            length[:evenly] = self.warps.lengths(local[:, :evenly])
+            np.clip(length, *_LENGTHS, out=length)
+        density = np.float32(evenly / shape[0]) * self.emitter.density(directions, normal)
+        if by_lobe:
+            cosine = np.maximum(self.warps.zz * local[2] / length, _ZERO)
+            scale = np.float32(by_lobe / shape[0] / np.pi) * self.warps.determinant
+            density += scale * cosine / (length * length * length)
+        factor = self.emitter.brightness_along(directions) / np.maximum(density, _TINY)
+        distance = np.full(shape, _FARTHEST, np.float32)
+        return directions, distance, self._weights(directions, local, factor)
 
     def _axis(self):
         """Unit vectors (3, 1, Q) to the light."""

@@ -152,6 +152,8 @@ def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take
         raise SceneError(error_line(error)) from error
+    except SceneError as error:  # rays
+        raise SceneError(f"{error}; --shadows off draws the view without") from error
     finally:
         canvas.free()
     return {

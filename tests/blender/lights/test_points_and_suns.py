@@ -136,3 +136,55 @@ def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
             values = getattr(found, lobe)[0].astype(np.float64)
             assert quadrature.relative_l2(values, halves[lobe]) < limit, (technique, lobe)
             assert abs(quadrature.bias(values, halves[lobe])) < limit, (technique, lobe)
+
+
+def random_scene(seed):
+    """A plane and a ball under one to five lights of all kinds."""
+    random = np.random.default_rng(seed)
+    plane_scene(roughness=random.uniform(0.3, 0.7))
+    ball = scene_parts.principled("Ball", Roughness=random.uniform(0.3, 0.7), Metallic=random.uniform())[0]
+    scene_parts.add_sphere(ball, radius=0.5, location=(*random.uniform(-0.8, 0.8, 2), 0.5), segments=48)
+    for number in range(random.integers(1, 6)):
+        kind = ("POINT", "SPOT", "SUN", "AREA")[random.integers(4)]
+        location = (*random.uniform(-1.5, 1.5, 2), random.uniform(1.3, 2.5))
+        # About toward the scene.
+        rotation = (*random.normal(0.0, 0.4, 2), random.uniform(0.0, 6.0))
+        size = random.choice([0.0, 0.05, 0.3])
+        if kind == "AREA":
+            light = scene_parts.add_area_light(
+                f"Light {number}", location, rotation, energy=random.uniform(20.0, 100.0)
+            )
+            light.data.size, light.data.shape = 0.1 + size, str(random.choice(["SQUARE", "DISK"]))
+        elif kind == "SUN":
+            add_light(kind, location, rotation, energy=random.uniform(1.0, 5.0), angle=size)
+        else:
+            settings = {"spot_size": random.uniform(0.6, 2.5), "spot_blend": random.uniform()} if kind == "SPOT" else {}
+            light = add_light(kind, location, rotation, shadow_soft_size=size, **settings)
+            light.data.energy, light.data.use_soft_falloff = random.uniform(20.0, 100.0), bool(random.integers(2))
+        bpy.context.scene.objects[-1].data.color = random.uniform(0.3, 1.0, 3)
+
+
+def check_random_scene(folder, seed):
+    random_scene(seed)
+    lights, _, surface, halves = rendered(folder, 512)
+    steep = (surface.normal * surface.view).sum(axis=1) >= 0.2
+    # Twice what single lights are held to.
+    found = shading.shade(surface, lights, "reference", workers=1)
+    for lobe in ("diffuse", "specular"):
+        distance = quadrature.relative_l2(getattr(found, lobe).sum(axis=0, dtype=np.float64), halves[lobe])
+        assert distance < 6e-3, (seed, lobe, distance, [light.name for light in lights])
+    # Both lobes together: where no light is near a highlight the specular one is next to nothing, all of it tails.
+    found = shading.shade(surface, lights, "ltsh4", workers=1).combined.astype(np.float64)
+    distance = quadrature.relative_l2(found[steep], sum(halves.values())[:, steep])
+    assert distance < 3e-2, (seed, distance, [light.name for light in lights])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_scenes_with_all_kinds_of_lights_are_those_of_cycles(tmp_path, seed):
+    check_random_scene(tmp_path, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(8, 200))
+def test_many_random_scenes_are_those_of_cycles(tmp_path, seed):
+    check_random_scene(tmp_path, seed)

@@ -20,7 +20,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 import bake_cost  # noqa: E402
 import measure  # noqa: E402
-from bench_scenes import floor_scene, random_polygons  # noqa: E402
+from bench_scenes import ceiling, floor_scene, random_polygons, wide_floor  # noqa: E402
 from independent import independent_processes  # noqa: E402
 from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
@@ -124,6 +124,19 @@ def light_kinds(options):
             for name, its in kinds.items()
         }
         compared(cases, f"rectangle, {part}", 3, 4 * count)
+
+
+def many_lights(options):
+    """Lights by the thousand on a floor of 60 m, 480 x 270 samples, beside four: processor time of one process."""
+    heading("many lights: ltsh4, both passes; target: at most 20 times the time of 4")
+    samples, four = wide_floor(480, 270), ceiling(4)
+    base = None
+    for count in (4, 100, 1000, *([] if options.quick else [10_000])):
+        start = time.process_time()
+        shading.shade(samples, ceiling(count) if count > 4 else four, "ltsh4", workers=1)
+        seconds = time.process_time() - start
+        base = base or seconds
+        row(f"{count} lights", seconds / len(samples) * 1e9, note=f"{seconds:.1f} s, {seconds / base:.1f} x")
 
 
 def specular(samples, lights, table, **options):
@@ -310,6 +323,7 @@ SECTIONS = {
     "polygons": polygons,
     "shade": shade,
     "lights": light_kinds,
+    "many": many_lights,
     "bounds": bounds,
     "growth": growth,
     "processes": processes,

@@ -320,6 +320,9 @@ class Pairs:
         # The sky is there for all that it is made of.
         share = 1.0 if isinstance(self.emitter, Sky) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
+        if isinstance(self.emitter, Sky):
+            # What only the sky lights is dark beside what a sun in it does.
+            wanted = np.maximum(wanted, 0.25 * rays)
         levels = [level for level in LEVELS if level < rays] + [rays]
         number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)

@@ -16,7 +16,7 @@ import numpy as np
 
 from . import float64, light_cone, moments32, small_lights
 from .facing import FacingDisk, Lobe, mean_emission
-from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach
+from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach, off_plane
 from .light_tree import FEWEST, LightTree, add_far_lights
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .lookup_table import MIN_ALPHA
@@ -204,7 +204,8 @@ class _Lighting:
                 needs_float64.append(index if chosen is None else index[chosen])
                 continue
             for part, outline, effort in _batches(light, corners, position, lobes.width, rest):
-                offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
+                origins = light.origins(position[:, part])
+                offset = (light.center[:, None] - origins).astype(np.float32)
                 seen, factor = light, 1.0
                 if light.is_facing:
                     seen, factor = self._seen(light, index[part], position[:, part])
@@ -212,7 +213,7 @@ class _Lighting:
                     offset, facing = seen.offset, np.ones(offset.shape[1], bool)
                 else:
                     toward = dot(offset, light.direction.astype(np.float32))
-                    facing = toward < 0.0
+                    facing = toward < -off_plane(light.center, origins)
                 if allowed is not None:
                     facing &= allowed[part]
                 axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)

@@ -23,6 +23,9 @@ MOSTLY_WHOLE = 0.6
 ROUND_CORNERS = (32, 64, 128, 256)
 ROUND_LIMITS = (8.0, 40.0, 300.0)
 FOCUSED_ROUND_CORNERS = (32, 64)
+# By coordinates, how far rounding takes points from the plane that they are in, some of them in front of it: a flat
+# surface that shines must not light itself.
+ROUNDING = 4e-7
 # The product of the contrast of a patch (see `_largest_size`) and the square of its size by that length is at most
 # this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
 # sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
@@ -178,11 +181,17 @@ def in_front(samples, light, candidates):
     position = samples.position[candidates]
     ahead = np.ones(len(candidates), bool)
     if not light.is_facing:
-        ahead = ((light.origins(position) - center) * direction).sum(axis=1) > 0.0
+        origins = light.origins(position)
+        ahead = ((origins - center) * direction).sum(axis=1) > off_plane(center.T, origins.T)
     if light.is_facing or light.is_focused:
         ahead &= may_reach(light, position.T)
     allowed = light.receives(samples.receiver, candidates)
     return candidates[ahead if allowed is None else ahead & allowed]
+
+
+def off_plane(center, position) -> np.ndarray:
+    """How far in front of a light, in m, points (3, Q) are that surely see it; its center is (3,) or (3, Q)."""
+    return ROUNDING * (np.abs(center).sum(axis=0) + np.abs(position).sum(axis=0))
 
 
 def may_reach(light, position) -> np.ndarray:

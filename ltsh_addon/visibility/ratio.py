@@ -21,7 +21,7 @@ from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples,
 from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.diffuse import diffuse_factor
 from ..shading.facing import FacingDisk, emission, ray_length
-from ..shading.light_polygons import has_lobe, may_reach
+from ..shading.light_polygons import has_lobe, may_reach, off_plane
 from . import crew
 from .directions import Choices, Emitter, Sky, SphericalQuads, Warps, dot, emitters_of, frames, seeds_of, unit_points
 
@@ -270,10 +270,11 @@ class Pairs:
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
-        offset = (light.center[:, None] - light.origins(surface.position)).astype(np.float32)
+        origins = light.origins(surface.position)
+        offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
         if not light.is_facing:
-            ahead = dot(light.direction.astype(np.float32), offset) < 0.0
+            ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(light.center, origins)
         if light.is_focused or light.is_facing:
             ahead &= may_reach(light, surface.position)
         if light.receivers is not None:

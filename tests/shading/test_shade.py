@@ -90,6 +90,28 @@ def test_lights_and_surfaces_have_one_side(technique):
     assert not shaded.specular.any() and shaded.diffuse.min() > 0.0
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("away", [0.0, 40.0])
+def test_a_flat_surface_does_not_light_itself(away, dtype):
+    """Of a sheet that shines to both sides, single precision puts points before it and behind it."""
+    surfaces = random_samples(500, seed=6)
+    axes = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    place = np.random.default_rng(3).uniform(-1.0, 1.0, size=(500, 2))
+    center = np.array([0.7, -0.6, 0.4]) + away
+    position = (center + place @ axes[:2]).astype(np.float32).astype(np.float64)
+    sides = [area_light(center=center, half_u=way * axes[0], half_v=axes[1]) for way in (1.0, -1.0)]
+    normal = np.broadcast_to(sides[0].direction, (500, 3))
+    view = unit(normal + 0.8 * axes[0])
+    surfaces = replace(
+        surfaces,
+        position=position,
+        view=np.broadcast_to(view, (500, 3)),
+        **dict.fromkeys(("normal", "diffuse_normal", "geometric_normal", "smooth_normal"), normal),
+    )
+    assert ((position - center) @ sides[0].direction > 0.0).mean() > 0.2
+    assert np.abs(shading.shade(surfaces, sides, dtype=dtype).combined).max() < 1e-5
+
+
 @pytest.mark.parametrize("technique", shading.SHIPPED_TABLES)
 def test_specular_light_is_the_clamped_integral_of_the_lobe(technique):
     """White metals and small lights all around: where a lobe rings below zero, a fiftieth of the clamped cosine under

@@ -234,9 +234,12 @@ def run(
     """
     queue = _Queue(blocks, result)
     with helpers(queue) as children:
-        for _ in range(_children_wanted(task, len(samples), blocks, workers)):
+        wanted = _children_wanted(task, len(samples), blocks, workers)
+        # By this thread: it will keep more in the task while it shades.
+        packed = worker.packed(task) if wanted else b""
+        for _ in range(wanted):
             most = max(2 * FLOAT64_CHUNK if task.single else 0, *map(_size, blocks))
-            children.append(_Shader(task, samples, queue, most))
+            children.append(_Shader(packed, ParentSide(task, samples, most), queue))
         _work(task, samples, queue, progress)
 
 
@@ -392,8 +395,8 @@ class Child:
         """Leave the work that the child has not done to others."""
         raise NotImplementedError
 
-    def begin(self, task, *arguments) -> None:
-        """Send the task; `arguments` are what the class at `side` takes beside it."""
+    def begin(self, task: bytes, *arguments) -> None:
+        """Send the task, `worker.packed`; `arguments` are what the class at `side` takes beside it."""
         first = {"path": sys.path, "package": _PACKAGE, "side": self.side, "arguments": arguments}
         worker.send(self._process.stdin, first)
         self.ask(task)
@@ -424,9 +427,8 @@ class _Shader(Child):
 
     side = "shading.parallel.ChildSide"
 
-    def __init__(self, task, samples, queue, block_size):
-        self._side = ParentSide(task, samples, block_size)
-        self._task, self._queue, self._work = task, queue, None
+    def __init__(self, task: bytes, side: ParentSide, queue):
+        self._task, self._side, self._queue, self._work = task, side, queue, None
         super().__init__(self._side.memory.inherited)
 
     def _feed(self):

@@ -20,9 +20,14 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 _LENGTH = struct.Struct("<Q")
 
 
+def packed(message) -> bytes:
+    """What `send` takes in the place of the message: for what may change until then."""
+    return pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+
+
 def send(stream, message) -> None:
     """Write one message."""
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    data = message if isinstance(message, bytes) else packed(message)
     stream.write(_LENGTH.pack(len(data)))
     stream.write(data)
     stream.flush()

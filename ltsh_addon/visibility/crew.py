@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from ..scene import Cancelled, Progress
-from ..shading import parallel
+from ..shading import parallel, worker
 from .occluders import Occluders
 from .rays import open_tracer
 
@@ -50,8 +50,10 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
         wanted = 0
     queue = _Queue(blocks)
     with parallel.helpers(queue) as children:
+        # By this thread: it will keep more in the task while it traces.
+        errand = worker.packed(Errand(task, tracer.occluders, tracer.library)) if wanted > 0 else b""
         for _ in range(wanted):
-            children.append(_Tracing(Errand(task, tracer.occluders, tracer.library), queue))
+            children.append(_Tracing(errand, queue))
         yielded = 0
         while yielded < len(blocks):
             if progress is not None and progress(_STAGE, yielded / len(blocks)) is False:
@@ -107,7 +109,7 @@ class _Tracing(parallel.Child):
 
     side = "visibility.crew.ChildSide"
 
-    def __init__(self, errand: Errand, queue: _Queue):
+    def __init__(self, errand: bytes, queue: _Queue):
         self._errand, self._queue, self._number = errand, queue, None
         super().__init__()
 

@@ -119,6 +119,19 @@ def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started
         assert np.abs(found - getattr(at_once, name)).max() < 1e-6 * expected.max()
 
 
+def test_tasks_are_packed_by_the_thread_that_changes_them(started, children_only, monkeypatch):
+    """It keeps more in them while it shades: a child's thread that packs one meanwhile may find it changed."""
+    threads = []
+
+    def state(task):
+        threads.append(threading.current_thread())
+        return vars(task)
+
+    monkeypatch.setattr(integrator.Task, "__getstate__", state, raising=False)
+    shading.shade(random_samples(90, seed=6), four_lights(), "ltc", workers=3)
+    assert len(started) == 2 and threads == [threading.main_thread()]
+
+
 def test_progress_is_reported_from_this_thread_and_reaches_one(started):
     seen, threads = [], set()
 

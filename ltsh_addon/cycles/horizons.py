@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from ..scene import AreaLight, SurfaceSamples
+from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
 from ..shading import brdf, polygon
-from .light_tree import light_chances
+from .light_tree import light_chances, light_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
 # Reflected rays stay at least this far above the true surface, or this share of the view's own elevation.
@@ -67,6 +68,8 @@ SMALLEST_ANGLE = 1e-4
 # Of what lies between the horizons. A sample is split where more than this comes from below either.
 SMALLEST_SHARE = 5e-3
 BLOCK = 2048
+# Pairs of samples and lights that are looked at at once, roughly and closely.
+MOST_PAIRS, PAIRS = 2**21, 2**14
 
 
 def end_at_horizons_of_cycles(
@@ -89,9 +92,7 @@ def end_at_horizons_of_cycles(
         return samples, index
     chances = lobe_chances(samples, index if hit is None else hit, is_baked)
     by_smooth = np.zeros(len(samples))
-    for start in range(0, len(differ), BLOCK):
-        block = differ[start : start + BLOCK]
-        by_smooth[block] = smooth_share(*horizon_excess(samples.take(block), lights, chances[:, block]))
+    by_smooth[differ] = smooth_share(*horizon_excess(samples.take(differ), lights, chances[:, differ]))
     by_smooth = np.where(by_smooth < SMALLEST_SHARE, 0.0, np.where(by_smooth > 1.0 - SMALLEST_SHARE, 1.0, by_smooth))
     split = np.flatnonzero((by_smooth > 0.0) & (by_smooth < 1.0))
     index = np.concatenate([index, split])
@@ -133,58 +134,172 @@ def _reflectance(samples, cosine) -> np.ndarray:
 
 
 def horizon_excess(
-    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=light_chances
+    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=None
 ) -> tuple[np.ndarray, np.ndarray]:
     """What only one of the horizons lets through (P,), of directions that a lobe chose and of those that the light
     chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
 
-    `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, see `light_tree.light_chances`. Where
-    both horizons make no difference the first is 1 and the second 0.
+    `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, left out: `light_tree.light_chances`.
+    Where both horizons make no difference the first is 1 and the second 0.
     """
-    crossed = np.stack([_crosses(samples, light) for light in lights])
-    index = np.flatnonzero(crossed.any(axis=0))
+    shapes = [_Shapes.of(lights, numbers) for numbers in _alike(lights)]
+    if choose is None:
+        choose = partial(light_chances, lights=lights, rows=light_rows(lights))
+    step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
+    found = np.empty((2, len(samples)))
+    for start in range(0, len(samples), step):
+        block = slice(start, start + step)
+        found[:, block] = _excess(samples.take(block), shapes, chances[:, block], choose)
+    return found[0], found[1]
+
+
+def _excess(samples, shapes, chances, choose):
+    """As `horizon_excess` of a few samples, with lights of these shapes, of which `choose(position, normal)` tells the
+    chances."""
+    crossings = [shape.crossings(samples) for shape in shapes]
+    index = np.unique(np.concatenate([sample for _, sample in crossings]))
     by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
     if len(index) == 0:
         return by_lobe, by_light
-    samples, crossed, chances = samples.take(index), crossed[:, index], chances[:, index]
-    chance = choose(samples.position, samples.smooth_normal, lights)
-    towards, width = _directions(samples)
-    lobe = _lobe_density(samples, towards)
-    half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("phni,pi->phn", towards, samples.view), 0.0))
-    reflected = lobe * _seen_by_light(samples, towards) * _reflectance(samples, half)
-    diffuse = np.maximum(np.einsum("phni,pi->phn", towards, samples.diffuse_normal), 0.0) / np.pi
-    chosen2 = np.square(chances[0][:, None, None] * lobe + chances[1][:, None, None] * diffuse)
     by_lobe[index] = 0.0
-    for number, light in enumerate(lights):
-        rows = np.flatnonzero(crossed[number])
-        excess = np.abs(light.radiance).sum() * reflected[rows] * width[rows]
-        excess *= _hits(light, samples.position[rows], towards[rows])
-        density = chance[number, rows] / np.maximum(_solid_angle(samples.position[rows], light), 1e-12)
-        light2 = np.square(density)[:, None, None]
-        weight = light2 / np.maximum(light2 + chosen2[rows], 1e-30)
-        by_light[index[rows]] += (excess * weight).sum(axis=(1, 2))
-        by_lobe[index[rows]] += (excess * (1.0 - weight)).sum(axis=(1, 2))
+    samples, chances = samples.take(index), chances[:, index]
+    directions = _Directions.of(samples)
+    hits = [
+        shape.hits(number, np.searchsorted(index, sample), samples.position, directions)
+        for shape, (number, sample) in zip(shapes, crossings, strict=True)
+    ]
+    number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
+    met, row = np.unique(row, return_inverse=True)
+    samples, chances, towards = samples.take(met), chances[:, met], directions.towards[met]
+    chance = choose(samples.position, samples.smooth_normal)
+    lobe = _lobe_density(samples, towards)
+    half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, samples.view), 0.0))
+    reflected = lobe * _seen_by_light(samples, towards) * _reflectance(samples, half) * directions.width[met]
+    diffuse = np.maximum(np.einsum("pni,pi->pn", towards, samples.diffuse_normal), 0.0) / np.pi
+    chosen2 = np.square(chances[0][:, None] * lobe + chances[1][:, None] * diffuse)
+    excess = brightness * reflected[row, ray]
+    light2 = np.square(chance[number, row].astype(float) / np.maximum(solid_angle, 1e-12))
+    weight = light2 / np.maximum(light2 + chosen2[row, ray], 1e-30)
+    by_light[index[met]] = np.bincount(row, excess * weight, len(met))
+    by_lobe[index[met]] = np.bincount(row, excess * (1.0 - weight), len(met))
     return by_lobe, by_light
 
 
-def _solid_angle(position, light) -> np.ndarray:
-    """Solid angle (P,) of the light in sr, 0 from behind it."""
-    if light.is_facing:
-        cosine = _facing_cone(light, position)[1]
-        return 2.0 * np.pi * (1.0 - cosine)
-    axes = np.concatenate([_plane_axes(light), -light.direction[None]])
-    corners = np.einsum("ak,pvk->avp", axes, light.polygon() - light.origins(position)[:, None])
-    whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
-    return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
+def _alike(lights) -> list[np.ndarray]:
+    """The numbers of the lights that have as many corners, and are near or distant, face points or not."""
+    kinds = {}
+    for number, light in enumerate(lights):
+        kinds.setdefault((light.is_distant, light.is_facing and light.shape, len(light.polygon())), []).append(number)
+    return [np.array(numbers) for numbers in kinds.values()]
 
 
-def _facing_cone(light, position):
-    """Unit vectors (P, 3) to the center of a light that faces every point, and the cosine (P,) of half its width."""
-    offset = light.center - position
-    distance = np.linalg.norm(offset, axis=1)
-    ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
-    cosine = np.sqrt(1.0 - ratio**2) if light.shape == "BALL" else 1.0 / np.sqrt(1.0 + ratio**2)
-    return offset / np.maximum(distance, 1e-30)[:, None], cosine
+@dataclass(frozen=True)
+class _Shapes:
+    """Lights of one kind: where they are seen from points."""
+
+    number: np.ndarray  # (L,)
+    kind: str  # "BALL", "FACING_DISK" or that of the first flat one
+    is_distant: bool
+    brightness: np.ndarray  # (L,)
+    center: np.ndarray  # (L, 3)
+    corners: np.ndarray  # (L, V, 3)
+    radius: np.ndarray  # (L,) of a ball that they are in
+    axes: np.ndarray  # (L, 3, 3) two in the plane, and back from where they shine
+
+    @classmethod
+    def of(cls, lights, number) -> _Shapes:
+        """Those of the numbers, which are alike."""
+        own = [lights[n] for n in number]
+        center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
+        radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
+        if own[0].is_facing:
+            radius = np.array([light.radius for light in own])
+        axes = np.array([[*_plane_axes(light), -light.direction] for light in own])
+        brightness = np.array([np.abs(light.radiance).sum() for light in own])
+        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, radius, axes)
+
+    @property
+    def is_facing(self) -> bool:
+        """True for lights that face every point."""
+        return self.kind in FACING_SHAPES
+
+    def crossings(self, samples) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of lights, numbers among these, and samples from where a light is not wholly on one side of both
+        horizons."""
+        position = 0.0 * samples.position if self.is_distant else samples.position
+        normals = samples.smooth_normal, samples.geometric_normal
+        starts = [(normal * position).sum(axis=1) for normal in normals]
+        found, step = [np.zeros((2, 0), int)], max(PAIRS // len(position), 1)
+        for start in range(0, len(self.center), step):
+            center, radius = self.center[start : start + step], self.radius[start : start + step, None]
+            smooth, true = (center @ normal.T - at for normal, at in zip(normals, starts, strict=True))
+            # A little more, as the sums are rounded.
+            reach = radius if self.is_facing else radius + 1e-9 * (np.abs(smooth) + np.abs(true))
+            between = (np.minimum(smooth, true) <= reach) & (np.maximum(smooth, true) > -reach)
+            if not self.is_facing:
+                back = self.axes[start : start + step, 2]
+                between &= (center * back).sum(axis=1)[:, None] > back @ position.T
+            light, sample = np.nonzero(between)
+            light += start
+            if not self.is_facing:
+                some, every = np.zeros(len(light), bool), np.ones(len(light), bool)
+                for normal, at in zip(normals, starts, strict=True):
+                    above = np.einsum("rvi,ri->rv", self.corners[light], normal[sample]) > at[sample, None]
+                    some |= above.any(axis=1)
+                    every &= above.all(axis=1)
+                light, sample = light[some & ~every], sample[some & ~every]
+            found.append(np.stack([light, sample]))
+        return tuple(np.concatenate(found, axis=1))
+
+    def hits(self, light, sample, position, directions) -> tuple[np.ndarray, ...]:
+        """Of the pairs (R,) of lights and samples that cross: number of the light, sample, number of the direction,
+        brightness and solid angle of the whole light, for each direction that meets a light."""
+        found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
+        for start in range(0, len(light), PAIRS):
+            own, point = light[start : start + PAIRS], sample[start : start + PAIRS]
+            offset = self.center[own] - (0.0 if self.is_distant else position[point])
+            pair, ray = directions.near(point, offset, self.radius[own])
+            towards = directions.towards[point[pair], ray]
+            is_hit = self._meets(own, offset, pair, towards)
+            pair, ray = pair[is_hit], ray[is_hit]
+            met, of_met = np.unique(pair, return_inverse=True)
+            angle = self._solid_angle(own[met], offset[met])[of_met]
+            found.append((self.number[own[pair]], point[pair], ray, self.brightness[own[pair]], angle))
+        return tuple(np.concatenate(values) for values in zip(*found, strict=True))
+
+    def _cosine(self, light, distance) -> np.ndarray:
+        """Cosine (R,) of half the width of lights that face every point."""
+        ratio = np.minimum(self.radius[light] / np.maximum(distance, 1e-30), 1.0)
+        return np.sqrt(1.0 - ratio**2) if self.kind == "BALL" else 1.0 / np.sqrt(1.0 + ratio**2)
+
+    def _meets(self, light, offset, pair, towards) -> np.ndarray:
+        """Mask (K,): which rays along `towards` (K, 3), of the pairs (K,) among (R,), meet their light, whose center is
+        `offset` (R, 3) away."""
+        if self.is_facing:
+            distance = np.linalg.norm(offset, axis=1)
+            along = (towards * offset[pair]).sum(axis=1)
+            return along > (self._cosine(light, distance) * distance)[pair]
+        axes = self.axes[light]
+        x, y, steepness = np.einsum("kai,ki->ak", axes[pair], towards)
+        x0, y0, height = np.einsum("rai,ri->ar", axes, offset)
+        distance = height[pair] / np.where(steepness > 0.0, steepness, 1e-30)
+        x, y = distance * x - x0[pair], distance * y - y0[pair]
+        outline = np.einsum("rvi,rai->var", self.corners[light] - self.center[light, None], axes[:, :2])
+        inside = np.zeros(len(x), bool)
+        for start, end in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+            (x0, y0), (x1, y1) = start[:, pair], end[:, pair]
+            slope = np.divide(x1 - x0, y1 - y0, out=np.zeros_like(x0), where=y0 != y1)
+            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * slope)
+        return inside & (steepness > 0.0)
+
+    def _solid_angle(self, light, offset) -> np.ndarray:
+        """Solid angle (R,) of lights in sr whose center is `offset` (R, 3) away, 0 from behind."""
+        if self.is_facing:
+            return 2.0 * np.pi * (1.0 - self._cosine(light, np.linalg.norm(offset, axis=1)))
+        corners = self.corners[light] - self.center[light, None] + offset[:, None]
+        corners = np.einsum("rai,rvi->avr", self.axes[light], corners)
+        whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
+        return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
 
 
 def _plane_axes(light) -> np.ndarray:
@@ -194,79 +309,70 @@ def _plane_axes(light) -> np.ndarray:
     return np.stack([first, np.cross(light.direction, first)])
 
 
-def _crosses(samples, light) -> np.ndarray:
-    """Mask (P,): from where the light is not wholly on one side of both horizons."""
-    corners, above, position = light.polygon(), [], light.origins(samples.position)
-    for normal in (samples.smooth_normal, samples.geometric_normal):
-        above.append(normal @ corners.T > (normal * position).sum(axis=1, keepdims=True))
-    if light.is_facing:
-        offset = light.center - position
-        heights = [(normal * offset).sum(axis=1) for normal in (samples.smooth_normal, samples.geometric_normal)]
-        above = [np.stack([height > -light.radius, height > light.radius], axis=1) for height in heights]
-    above = np.concatenate(above, axis=1)
-    return (
-        above.any(axis=1) & ~above.all(axis=1)
-        if light.is_facing
-        else above.any(axis=1) & ~above.all(axis=1) & ((light.center - position) @ light.direction < 0.0)
-    )
-
-
 def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, H, N) per sr that the lobe chooses the directions."""
-    half = towards + samples.view[:, None, None]
-    vertical = np.square(np.maximum(np.einsum("phni,pi->phn", half, samples.normal), 0.0))
-    horizontal = np.maximum(np.square(half).sum(axis=3) - vertical, 0.0)
-    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
-    cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
+    """Probability (P, N) per sr that the lobe chooses the directions."""
+    half = towards + samples.view[:, None]
+    vertical = np.square(np.maximum(np.einsum("pni,pi->pn", half, samples.normal), 0.0))
+    horizontal = np.maximum(np.square(half).sum(axis=2) - vertical, 0.0)
+    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
+    cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None]
     return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)
 
 
 def _seen_by_light(samples, towards) -> np.ndarray:
-    """Share (P, H, N) of the microfacets seen by the eye, in the middle of the directions, that these reach: 0 below
+    """Share (P, N) of the microfacets seen by the eye, in the middle of the directions, that these reach: 0 below
     the horizon of the lobe."""
-    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None, None]
-    to_eye = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None, None]
-    to_light = np.maximum(np.einsum("phni,pi->phn", towards, samples.normal), 0.0)
+    alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
+    to_eye = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None]
+    to_light = np.maximum(np.einsum("pni,pi->pn", towards, samples.normal), 0.0)
     slopes = [np.sqrt(cosine * cosine + alpha2 * (1.0 - cosine * cosine)) for cosine in (to_eye, to_light)]
     return to_light * (to_eye + slopes[0]) / np.maximum(to_eye * slopes[1] + to_light * slopes[0], 1e-30)
 
 
-def _directions(samples):
-    """Unit directions (P, H, N, 3) between the horizons and the solid angle (P, H, N) of each, negative where the
-    horizon of the mesh is the lower one."""
-    mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
-    flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
-    flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-    across = np.cross(samples.smooth_normal, flat)
-    step = (np.arange(AROUND) + 0.5) / AROUND * 2.0 - 1.0
-    angle = np.pi * np.sinh(CONCENTRATION * step) / np.sinh(CONCENTRATION)
-    span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
-    around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
-    # How high above the smooth horizon that of the mesh lies there.
-    rise = -np.arctan2(
-        np.einsum("pni,pi->pn", around, samples.geometric_normal),
-        np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
-    )
-    elevation = rise[:, None] * np.array(HEIGHTS)[:, None]
-    towards = np.cos(elevation)[..., None] * around[:, None]
-    towards += np.sin(elevation)[..., None] * samples.smooth_normal[:, None, None]
-    return towards, rise[:, None] * span * np.cos(elevation) / len(HEIGHTS)
+@dataclass(frozen=True)
+class _Directions:
+    """Unit directions (P, N, 3) between the horizons, AROUND for each of HEIGHTS, and the solid angle (P, N) of each,
+    negative where the horizon of the mesh is the lower one."""
 
+    towards: np.ndarray
+    width: np.ndarray
+    flat: np.ndarray  # (P, 2, 3) axes in the plane of the smooth horizon
+    angle: np.ndarray  # (AROUND,) from the first of these to the second
 
-def _hits(light, position, towards) -> np.ndarray:
-    """Mask (P, H, N): which rays from `position` (P, 3) meet the light's polygon."""
-    if light.is_facing:
-        axis, cosine = _facing_cone(light, position)
-        return np.einsum("phni,pi->phn", towards, axis) > cosine[:, None, None]
-    axes, position = _plane_axes(light), light.origins(position)
-    outline = (light.polygon() - light.center) @ axes.T
-    steepness = towards @ light.direction
-    height = ((light.center - position) @ light.direction)[:, None, None]
-    distance = height / np.where(steepness < 0.0, steepness, -1e-30)
-    point = distance[..., None] * towards + (position - light.center)[:, None, None]
-    x, y = (point @ axis for axis in axes)
-    inside = np.zeros(x.shape, bool)
-    for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        if y0 != y1:
-            inside ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
-    return inside & (steepness < 0.0)
+    @classmethod
+    def of(cls, samples) -> _Directions:
+        """Those of samples."""
+        mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
+        flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
+        across = np.cross(samples.smooth_normal, flat)
+        step = (np.arange(AROUND) + 0.5) / AROUND * 2.0 - 1.0
+        angle = np.pi * np.sinh(CONCENTRATION * step) / np.sinh(CONCENTRATION)
+        span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
+        around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
+        # How high above the smooth horizon that of the mesh lies there.
+        rise = -np.arctan2(
+            np.einsum("pni,pi->pn", around, samples.geometric_normal),
+            np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
+        )
+        elevation = rise[:, None] * np.array(HEIGHTS)[:, None]
+        towards = np.cos(elevation)[..., None] * around[:, None]
+        towards += np.sin(elevation)[..., None] * samples.smooth_normal[:, None, None]
+        width = rise[:, None] * span * np.cos(elevation) / len(HEIGHTS)
+        count = len(samples)
+        return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
+
+    def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (K,) of pairs and of the directions that may meet a ball of the `radius` (R,), `offset` (R, 3) away
+        from the samples (R,): at no other angles around the smooth normal does it stand."""
+        x, y = np.einsum("rai,ri->ar", self.flat[sample], offset)
+        ratio = np.minimum(radius / np.maximum(np.hypot(x, y), 1e-30), 1.0)
+        reach = np.where(ratio < 1.0, np.arcsin(ratio), np.pi) + 1e-6
+        turns = (self.angle + 2.0 * np.pi * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
+        middle = np.arctan2(y, x)
+        first = np.searchsorted(turns, middle - reach)
+        count = np.minimum(np.searchsorted(turns, middle + reach) - first, AROUND)
+        pair = np.repeat(np.arange(len(sample)), count)
+        place = np.arange(len(pair)) + np.repeat(first - np.cumsum(count) + count, count)
+        heights = np.arange(len(HEIGHTS)) * AROUND
+        return np.repeat(pair, len(HEIGHTS)), ((place % AROUND)[:, None] + heights).ravel()

@@ -19,6 +19,8 @@ LIGHTS_OF_LEAF = 8
 BUCKETS = 12
 # More are all taken for one leaf: none of them matters much.
 MOST_LIGHTS = 64
+# Pairs of points and lights that are looked at at once.
+PAIRS = 2**14
 
 
 @dataclass(frozen=True)
@@ -98,12 +100,14 @@ def _cosine_of_sum(first, second, sign):
     return first * second - sign * np.sqrt(np.maximum(1.0 - first**2, 0.0) * np.maximum(1.0 - second**2, 0.0))
 
 
-def light_chances(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...]) -> np.ndarray:
+def light_chances(
+    position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray | None = None
+) -> np.ndarray:
     """How likely each of the lights (L, P) is chosen for points (P, 3) with smooth normals: by the most and by the
-    least that a half of the lights may send, each half of the time, down to the leaves."""
-    own = np.empty((len(lights), 2, len(position)), np.float32 if len(lights) > MOST_LIGHTS else np.float64)
-    for number, light in enumerate(lights):
-        own[number] = light_bounds(light, position, normal)
+    least that a half of the lights may send, each half of the time, down to the leaves. `rows` are their
+    `light_rows`."""
+    rows = light_rows(lights) if rows is None else rows
+    own = own_bounds(position, normal, lights, rows)
     if len(lights) > MOST_LIGHTS:
         return chances_of(own)
     distant = np.array([light.is_distant for light in lights], dtype=bool)
@@ -113,11 +117,13 @@ def light_chances(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLi
         # Next to the tree of the others, as one of the halves of the whole.
         near, chances = np.flatnonzero(~distant), np.zeros((len(lights), len(position)))
         shares = chances_of(np.stack([own[near].sum(axis=0), own[distant].sum(axis=0)]))
-        chances[near] = shares[0] * light_chances(position, normal, tuple(lights[number] for number in near))
+        chances[near] = shares[0] * light_chances(
+            position, normal, tuple(lights[number] for number in near), rows[near]
+        )
         chances[distant] = shares[1] * chances_of(own[distant])
         return chances
     chances = np.zeros((len(lights), len(position)))
-    clusters = [(_tree(np.array([_row(light) for light in lights]).tobytes(), len(lights)), np.ones(len(position)))]
+    clusters = [(_tree(rows.tobytes(), len(lights)), np.ones(len(position)))]
     while clusters:
         cluster, chance = clusters.pop()
         if cluster.halves is None:
@@ -139,30 +145,62 @@ def chances_of(bounds: np.ndarray) -> np.ndarray:
     return sum(0.5 * part / np.maximum(part.sum(axis=0), 1e-30) for part in (most, least))
 
 
-def light_bounds(light: AreaLight, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The most and the least (2, P) that points (P, 3) with normals may get from one light, by its rectangle."""
-    offset = light.center - light.origins(position)
+def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray) -> np.ndarray:
+    """The most and the least (L, 2, P) that points (P, 3) with normals may get from each light, from a flat one by its
+    rectangle; in single precision where there are more than MOST_LIGHTS."""
+    kind = np.float32 if len(lights) > MOST_LIGHTS else np.float64
+    own = np.empty((len(lights), 2, len(position)), kind)
+    distant, facing = (np.array([getattr(light, name) for light in lights]) for name in ("is_distant", "is_facing"))
+    for number in np.flatnonzero(facing):
+        own[number] = _facing_bounds(lights[number], position, normal)
+    # Large numbers are subtracted before they lose digits.
+    middle = position.mean(axis=0) if len(position) else np.zeros(3)
+    step = max(PAIRS // max(len(position), 1), 1)
+    for flat, points, origin in ((~distant, position - middle, middle), (distant, 0.0 * position, 0.0)):
+        numbers = np.flatnonzero(flat & ~facing)
+        for start in range(0, len(numbers), step):
+            part = numbers[start : start + step]
+            shifted = np.concatenate([rows[part, :3] - origin, rows[part, 3:]], axis=1)
+            own[part] = _flat_bounds(shifted.astype(kind), points.astype(kind).T, normal.astype(kind).T)
+    return own
+
+
+def _flat_bounds(rows, position, normal):
+    """As `own_bounds` (N, 2, P) of flat lights from their `_row`s (N, 16), for points (3, P) with normals."""
+    center, half_u, half_v, direction = (rows[:, start : start + 3].T[..., None] for start in (0, 3, 6, 9))
+    reach, power = np.maximum(np.cos(rows[:, 12, None]), 0.0), rows[:, 13, None]
+    x, y, z = center - position[:, None]
+
+    def along(vectors):
+        return x * vectors[0] + y * vectors[1] + z * vectors[2]
+
+    square, u, v = x * x + y * y + z * z, along(half_u), along(half_v)
+    shorten = 1.0 / np.maximum(np.sqrt(square), 1e-30)
+    here, there = along(normal) * shorten, -along(direction) * shorten
+    farthest, width = square, np.ones_like(square)
+    for of_u, of_v in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+        offset = of_u * u + of_v * v
+        corner = ((of_u * half_u + of_v * half_v) ** 2).sum(axis=0)
+        length = np.maximum(square + 2.0 * offset + corner, 1e-30)
+        farthest = np.maximum(farthest, length)
+        width = np.minimum(width, (square + offset) * shorten / np.sqrt(length))
+    width = np.maximum(width, -1.0)
+    most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
+    least_here = np.maximum(_cosine_of_sum(here, width, 1.0), 0.0)
+    most_there = np.where(there >= width, 1.0, _cosine_of_sum(there, width, -1.0))
+    least_there = _cosine_of_sum(there, width, 1.0)
+    is_seen = (there > 0.0) & (most_here >= 0.0) & (most_there >= reach)
+    is_whole = is_seen & (width >= 0.0) & (least_there >= reach)
+    most = is_seen * power * most_here * most_there * shorten**2
+    least = is_whole * power * least_here * least_there / farthest
+    return np.stack([most, least], axis=1)
+
+
+def _facing_bounds(light, position, normal):
+    """As `own_bounds` (2, P) of one point or spot light."""
+    offset = light.center - position
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
-    if light.is_facing:
-        return _facing_bounds(light, axis, distance, normal)
-    corners = [offset + u * light.half_u + v * light.half_v for u in (-1.0, 1.0) for v in (-1.0, 1.0)]
-    reach = np.array([np.linalg.norm(corner, axis=1) for corner in corners])
-    along = np.array([(corner * axis).sum(axis=1) for corner in corners])
-    width = np.clip((along / np.maximum(reach, 1e-30)).min(axis=0), -1.0, 1.0)
-    bounds = _bounds(
-        _cluster_of(np.array(_row(light)), 0),
-        offset,
-        normal,
-        width,
-        distance,
-        np.maximum(reach.max(axis=0), distance),
-    )
-    return bounds * (offset @ light.direction < 0.0)
-
-
-def _facing_bounds(light, axis, distance, normal):
-    """As `light_bounds` of a point or spot light along unit vectors (P, 3) at a distance (P,)."""
     if light.shape == "BALL":
         ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
         width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
@@ -180,6 +218,11 @@ def _facing_bounds(light, axis, distance, normal):
     between = np.arccos(np.clip(-(axis @ cluster.axis), -1.0, 1.0)) - np.arccos(np.clip(width, -1.0, 1.0))
     share = np.clip((np.cos(np.maximum(between, 0.0)) - np.cos(cluster.reach)) * light.cone.sharpness, 0.0, 1.0)
     return _bounds(cluster, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
+
+
+def light_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
+    """What the tree knows of lights (L, 16)."""
+    return np.array([_row(light) for light in lights])
 
 
 def _row(light) -> list[float]:

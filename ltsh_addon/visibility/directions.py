@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..cycles.horizons import SMALLEST_ALPHA, lobe_chances
-from ..cycles.light_tree import light_chances
+from ..cycles.light_tree import light_chances, light_rows
 from ..scene import AreaLight, SurfaceSamples
 from ..shading import brdf, light_cone
 from ..shading.lookup_table import WARP_REGULARIZATION
@@ -533,6 +533,7 @@ class Choices:
         self._first = np.cumsum(self._count) - self._count
         self._lobes = lobe_chances(samples, self._hit, is_baked=False)
         self._chances = np.full((len(self._lights), len(samples)), np.nan, np.float32)
+        self._rows = light_rows(self._lights)
 
     def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
         """Share (R,) of the light of light `number`, which has the `solid_angle` (R,), that a pass gets because the
@@ -547,7 +548,7 @@ class Choices:
         unknown = np.unique(index[np.isnan(self._chances[number, index])])
         if len(unknown):
             position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
-            self._chances[:, unknown] = light_chances(position, normal, self._lights)
+            self._chances[:, unknown] = light_chances(position, normal, self._lights, self._rows)
         return self._chances[number, index]
 
     def _density(self, name, index, directions):

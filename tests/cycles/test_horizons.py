@@ -8,7 +8,7 @@ import pytest
 from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
-from ltsh_addon.cycles.light_tree import light_chances
+from ltsh_addon.cycles.light_tree import light_chances, light_rows, own_bounds
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
@@ -101,6 +101,77 @@ def test_chances_of_lights_add_up(count, loses):
     sums = light_chances(np.zeros((50, 3)), normal, lights).sum(axis=0)
     assert sums.max() < 1.0 + 1e-5 and (sums > 0.0).mean() > 0.4
     assert (sums[sums > 0.0].min() > 1.0 - 1e-5) != loses
+
+
+def lights_around(generator, count, **fields):
+    """Square lights of 0.2 to 2 m, any way around, from 3 to 10 m away from the origin."""
+    axes = np.linalg.qr(generator.normal(size=(count, 3, 3)))[0]
+    center = horizons.unit(generator.normal(size=(count, 3))) * generator.uniform(3.0, 10.0, size=(count, 1))
+    halves = generator.uniform(0.1, 1.0, size=count)
+    return tuple(
+        replace(light_at(1.0, 1.0), center=c, half_u=h * u, half_v=h * v, direction=n, radiance=(h, h, h), **fields)
+        for c, h, (u, v, n) in zip(center, halves, axes, strict=True)
+    )
+
+
+def samples_around(generator, count):
+    """Points near the origin that are seen from anywhere, smooth and true normals up to some 30 degrees apart."""
+    samples = samples_near_the_horizon(0.4, count=count)
+    smooth = horizons.unit(generator.normal(size=(count, 3)))
+    true = horizons.unit(smooth + 0.3 * generator.normal(size=(count, 3)))
+    view = horizons.unit(generator.normal(size=(count, 3)) + 1.5 * smooth)
+    fields = {"smooth_normal": smooth, "geometric_normal": true, "normal": smooth, "diffuse_normal": smooth}
+    return replace(samples, position=0.3 * generator.normal(size=(count, 3)), view=view, **fields)
+
+
+@pytest.mark.parametrize("kind", ["square", "distant", "ball", "disk"])
+def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
+    """As a test of each direction with each light finds, one by one."""
+    generator = np.random.default_rng(3)
+    samples, lights = samples_around(generator, 12), lights_around(generator, 200)
+    if kind == "distant":
+        lights = tuple(replace(light, is_distant=True) for light in lights)
+    if kind in ("ball", "disk"):
+        lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
+    shape = horizons._Shapes.of(lights, np.arange(len(lights)))
+    directions = horizons._Directions.of(samples)
+    number, sample, ray, *_ = shape.hits(*shape.crossings(samples), samples.position, directions)
+    found = set(zip(number.tolist(), sample.tolist(), ray.tolist(), strict=True))
+    expected = set()
+    for index, light in enumerate(lights):
+        offset = (light.center - light.origins(samples.position))[:, None]
+        towards = directions.towards
+        if light.is_facing:
+            # How far from the ball's center, or from that of the disk that is turned to the point, rays pass.
+            distance, along = np.linalg.norm(offset, axis=2), (towards * offset).sum(axis=2)
+            aside = np.linalg.norm(np.cross(towards, offset), axis=2)
+            meets = (aside < light.radius) if kind == "ball" else (aside * distance < light.radius * along)
+            meets &= along > 0.0
+        else:
+            steepness = towards @ light.direction
+            place = (offset @ light.direction / steepness)[..., None] * towards - offset
+            u, v = (np.abs(place @ half) / (half @ half) for half in (light.half_u, light.half_v))
+            meets = (u < 1.0) & (v < 1.0) & (steepness < 0.0) & (offset @ light.direction < 0.0)
+        expected |= {(index, *pair) for pair in zip(*(part.tolist() for part in np.nonzero(meets)), strict=True)}
+    assert found == expected and len(found) > 300
+
+
+def test_bounds_of_thousands_of_lights_are_those_of_a_few():
+    """Those are in double precision; squared distances and the sines of widths lose digits in single precision."""
+    generator = np.random.default_rng(5)
+    samples, lights = samples_around(generator, 30), lights_around(generator, 1000)
+    far = np.array([3e3, -2e3, 1e3])
+    position, lights = samples.position + far, tuple(light.moved(far) for light in lights)
+    rows = light_rows(lights)
+    found = own_bounds(position, samples.smooth_normal, lights, rows)
+    few = [slice(start, start + 50) for start in range(0, 1000, 50)]
+    expected = [own_bounds(position, samples.smooth_normal, lights[part], rows[part]) for part in few]
+    expected = np.concatenate(expected)
+    assert found.dtype == np.float32 and expected.dtype == np.float64
+    assert (expected[:, 0] >= expected[:, 1] * (1.0 - 1e-12)).all() and (expected[:, 1] > 0.0).any()
+    apart = np.abs(found - expected) > 1e-3 * expected.max(axis=(0, 1))
+    # The least jumps to 0 where a light turns its face away from a part of the point's horizon.
+    assert apart.mean() < 1e-3
 
 
 def test_without_lights_or_differences_nothing_changes():

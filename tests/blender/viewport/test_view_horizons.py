@@ -1,6 +1,7 @@
 """Where specular lobes end in the viewport: at the horizon that numpy takes, as Cycles does."""
 
 from dataclasses import fields, replace
+from functools import partial
 
 import bpy
 import numpy as np
@@ -17,7 +18,7 @@ from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.surfaces import View
 from ltsh_addon.blender.viewport.textures import upload_lights, upload_samples
 from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_chances, smooth_share
-from ltsh_addon.cycles.light_tree import chances_of, light_bounds
+from ltsh_addon.cycles.light_tree import chances_of, light_rows, own_bounds
 from ltsh_addon.scene import SurfaceSamples
 
 WIDTH, HEIGHT = 32, 16
@@ -36,14 +37,14 @@ def read(texture):
 
 def chances_in_one_leaf(position, normal, lights):
     """Those of lights, which the card takes for one leaf of the tree."""
-    return chances_of(np.stack([light_bounds(light, position, normal) for light in lights]))
+    return chances_of(own_bounds(position, normal, lights, light_rows(lights)))
 
 
 def shares(samples, lights):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
     turn the choice nor no light is between the horizons."""
     of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
-    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, chances_in_one_leaf)
+    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, partial(chances_in_one_leaf, lights=lights))
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
     share = smooth_share(by_lobe, by_light)

@@ -10,6 +10,7 @@ import json
 import time
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, fields, replace
@@ -21,6 +22,7 @@ import numpy as np
 from .. import shading, visibility
 from ..files import replacing, temporary_folder
 from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
+from ..shading.light_tree import FEWEST
 
 # Of the files of `keep_picture`.
 KEPT_SUFFIX = ".samples.npz"
@@ -128,8 +130,13 @@ def shade_lights(
     """Radiance of `samples` (P) under `lights` (L), one for each of `seen`: shares (L, P) by pass of the lights that
     the samples see; None: everything.
 
-    Light by light, so that a sample that sees all of its lights gets the same bits as without shadows.
+    Light by light, so that a sample that sees all of its lights gets the same bits as without shadows; but many lights
+    without shadows all at once, of which `shade` takes those together that a sample cannot tell apart.
     """
+    if lights and all(shares is None for shares in seen):
+        if max(Counter(light.group for light in lights).values()) >= FEWEST:
+            found = shading.shade(samples, lights, table, passes=tuple(passes), workers=workers, progress=progress)
+            return [found] * len(seen)
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     shape = len(groups), len(samples), 3
     sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]

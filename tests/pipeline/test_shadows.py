@@ -7,8 +7,11 @@ import fake_scene
 import numpy as np
 import pytest
 from fake_scene import run, wall
+from surface_scenes import four_lights, random_samples
 
+from ltsh_addon import shading
 from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.pipeline import lighting
 
 ARGUMENTS = ("--techniques", "ltsh4,reference", "--quiet")
 
@@ -37,6 +40,21 @@ def test_samples_that_see_all_of_their_lights_get_the_same_bits(capsys, monkeypa
     assert set(shadowed) == set(without) | set(visibility) | set(parts(shadowed, "ltsh4_unsh")) | set(
         parts(shadowed, "reference_unsh")
     )
+
+
+@pytest.mark.parametrize("count, is_one_call", [(63, False), (64, True)])
+def test_many_lights_without_shadows_are_shaded_all_at_once(count, is_one_call):
+    """One by one `shade` could not take those together that a sample cannot tell apart."""
+    samples, four = random_samples(40, seed=1), four_lights()
+    lights = [replace(four[n % 4].moved(np.array([0.2 * n, 0.0, 1.0])), group=f"{n % 2}") for n in range(2 * count)]
+    (found,) = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), workers=1)
+    expected = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1)
+    assert found.groups == expected.groups and np.allclose(found.diffuse, expected.diffuse, rtol=1e-2, atol=1e-4)
+    seen = {"diffuse": np.ones((len(lights), len(samples)))}
+    shadowed, unshadowed = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), (seen, None), workers=1)
+    assert np.array_equal(shadowed.diffuse, unshadowed.diffuse)
+    assert np.array_equal(found.diffuse, shadowed.diffuse) != is_one_call
+    assert not is_one_call or np.array_equal(found.diffuse, expected.diffuse)
 
 
 def test_behind_a_wall_is_exactly_nothing(capsys, monkeypatch, room, out):

@@ -95,8 +95,11 @@ def shade(scene, output, *options):
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
     processor = after.children_user + after.children_system - before.children_user - before.children_system
+    found = {"seconds": time.perf_counter() - start, "processor": processor, "peak MiB": peak}
     seconds = json.loads((output / "timing.json").read_text())["seconds"]
-    return {"seconds": time.perf_counter() - start, "processor": processor, "peak MiB": peak, **seconds}
+    for technique, passes in seconds.pop("techniques").items():
+        seconds |= {f"{technique} {name}": value for name, value in passes.items()}
+    return found | seconds
 
 
 def main():

@@ -279,7 +279,7 @@ class ObjectBaker:
 
         receiver = self.record["receiver"]
         samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
-        layers, shares = {}, None
+        layers, shadows = {}, None
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -289,9 +289,9 @@ class ObjectBaker:
             workers = 1 if self._threads() > 1 else None
             rows = min(block_rows(options), options.size[1] - first)
             film = Film(options.size[0], rows, texels.index[texel])
-            shares = self.tracer.trace(samples, sorted(passes), rays, film=film, workers=workers).shares
+            shadows = self.tracer.trace(samples, sorted(passes), rays, film=film, workers=workers)
         for name, table in self.tables.items():
-            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shares).items():
+            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
                 if len(self.groups) > 1:
                     for group, part in zip(lighting.group_names(self.groups), radiance, strict=True):
@@ -317,18 +317,18 @@ class ObjectBaker:
             halves["combined"] = halves["specular"] + halves["diffuse"]
         return {name: halves[name] for name in self.compared}
 
-    def _passes(self, samples: SurfaceSamples, texel, count, table, shares) -> dict[str, np.ndarray]:
+    def _passes(self, samples: SurfaceSamples, texel, count, table, shadows) -> dict[str, np.ndarray]:
         """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
         found = {}
         wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
         workers = 1 if self._threads() > 1 else None
         if wanted:
-            shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shares,), workers=workers)[0]
+            shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shadows,), workers=workers)[0]
             found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
         if "diffuse_light" in self.options.passes:
             first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
             white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
-            seen = None if shares is None else {"diffuse": shares["diffuse"][:, first]}
+            seen = None if shadows is None else shadows.take(first)
             lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), (seen,), workers=workers)[0]
             found["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
         if "combined" in self.options.passes:

@@ -36,16 +36,17 @@ FEWEST_RAYS = 8
 class Shadows:
     """The shares of the lights that samples see, and how they were found."""
 
-    shares: dict[str, np.ndarray]  # (L, P) by pass, in [0, 1]
+    shares: dict[str, np.ndarray]  # (E, P) by pass, in [0, 1]
+    numbers: tuple[tuple[int, ...], ...]  # of the lights that share each of them
     noise: dict[str, float]  # estimated, relative to the pass
     rays: int
     tracer: str  # what traced them
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
 
-    def shares_of(self, index: np.ndarray | None) -> dict[str, np.ndarray]:
-        """Those (L, Q) of the samples at `index` (Q,); None: of all."""
-        return self.shares if index is None else {name: values[:, index] for name, values in self.shares.items()}
+    def take(self, index: np.ndarray) -> Shadows:
+        """Those of the samples at `index` (Q,)."""
+        return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
 
     def report(self) -> dict:
         """For report.json."""
@@ -107,7 +108,7 @@ class ShadowTracer:
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        return Shadows(shares, noise, found.rays, tracer, seconds, tuple(self.warnings))
+        return Shadows(shares, found.numbers, noise, found.rays, tracer, seconds, tuple(self.warnings))
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
@@ -122,16 +123,17 @@ def shade_lights(
     lights: Sequence[AreaLight],
     table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
-    seen: Sequence[dict[str, np.ndarray] | None] = (None,),
+    seen: Sequence[Shadows | None] = (None,),
     *,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
-    """Radiance of `samples` (P) under `lights` (L), one for each of `seen`: shares (L, P) by pass of the lights that
-    the samples see; None: everything.
+    """Radiance of `samples` (P) under `lights` (L), one for each of `seen`: the shares of the lights that the samples
+    see, all of the same lights together; None: everything.
 
-    Light by light, so that a sample that sees all of its lights gets the same bits as without shadows; but many lights
-    without shadows all at once, of which `shade` takes those together that a sample cannot tell apart.
+    Those that share their rays first, so that a sample that sees all of its lights gets the same bits as without
+    shadows; but many lights without shadows all at once, of which `shade` takes those together that a sample cannot
+    tell apart.
     """
     if lights and all(shares is None for shares in seen):
         if max(Counter(light.group for light in lights).values()) >= FEWEST:
@@ -140,25 +142,28 @@ def shade_lights(
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     shape = len(groups), len(samples), 3
     sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]
+    numbers = next((shadows.numbers for shadows in seen if shadows is not None), None)
+    numbers = visibility.shared_numbers(lights) if numbers is None else numbers
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
-    for first in range(0, len(lights), most):
-        part = lights[first : first + most]
-        start, share = first / len(lights), len(part) / len(lights)
+    for first in range(0, len(numbers), most):
+        part = numbers[first : first + most]
+        start, share = first / len(numbers), len(part) / len(numbers)
 
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = tuple(replace(light, group=str(number)) for number, light in enumerate(part))
+        own = [replace(lights[light], group=str(number)) for number, one in enumerate(part) for light in one]
         found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
         if found.quadrature_error is not None:
             error = found.quadrature_error if error is None else error + found.quadrature_error
-        for number, light in enumerate(part):
-            group = groups.index(light.group)
+        for number, one in enumerate(part):
+            group = groups.index(lights[one[0]].group)
             for name in passes:
                 radiance = getattr(found, name)[number]
-                for whole, shares in zip(sums, seen, strict=True):
-                    is_all = shares is None
-                    whole[name][group] += radiance if is_all else shares[name][first + number][:, None] * radiance
+                for whole, shadows in zip(sums, seen, strict=True):
+                    is_all = shadows is None
+                    share = 1.0 if is_all else shadows.shares[name][first + number][:, None]
+                    whole[name][group] += radiance if is_all else share * radiance
     return [shading.Shading(groups, whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
 
 
@@ -221,7 +226,8 @@ class KeptPicture:
         shadows = document["shadows"]
         if shadows is not None:
             shares = {name: arrays[f"shares.{name}"] for name in shadows["noise"]}
-            shadows = Shadows(shares, shadows["noise"], shadows["rays"], shadows["tracer"])
+            numbers = tuple(map(tuple, shadows["numbers"]))
+            shadows = Shadows(shares, numbers, shadows["noise"], shadows["rays"], shadows["tracer"])
         options = document["options"]
         options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
         return cls(extraction, shadows, {**options, "scene": Path(options["scene"])}, document["had_cycles"])
@@ -245,7 +251,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> No
             "border": None if extraction.border is None else vars(extraction.border),
             "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
-        "shadows": None if shadows is None else shadows.report(),
+        "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
         "had_cycles": extraction.reference is not None,
     }

@@ -205,9 +205,7 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
     if name == REFERENCE and len(samples) > options.reference_samples:
         subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
         samples = samples.take(subset)
-    shares = None if shadows is None else shadows.shares_of(subset)
-
-    wanted = (None,) if shadows is None else (shares, None)
+    wanted = (None,) if shadows is None else (shadows if subset is None else shadows.take(subset), None)
     lit, seconds = [{} for _ in wanted], {}
     for index, pass_name in enumerate(options.passes):
 
@@ -454,10 +452,12 @@ class Comparison:
         return layers
 
     def _visibility_layers(self) -> dict[str, imaging.Layer]:
-        """The share of each light that is seen, 1 where no surface is; none where there are very many lights."""
-        shadows, lights, found = self.shadows, self.extraction.lights, {}
-        if shadows is None or len(lights) > MOST_VISIBILITY_LAYERS:
+        """The share of each light that is seen, 1 where no surface is; none where there are very many. Lights that
+        share their rays have one layer, with the name of the first."""
+        shadows, found = self.shadows, {}
+        if shadows is None or len(shadows.numbers) > MOST_VISIBILITY_LAYERS:
             return found
+        lights = [self.extraction.lights[own[0]] for own in shadows.numbers]
         nothing = 1.0 - self.film.coverage()
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)

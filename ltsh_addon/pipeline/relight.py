@@ -50,6 +50,8 @@ def _relit(path: Path, place: Path, changes, output: Path, progress) -> dict:
     """The report of the picture that kept its samples in `path`; its files are at the same `place` below `output`."""
     kept = KeptPicture.load(path)
     lights = changed_lights(kept.extraction.lights, changes)
+    if kept.shadows is not None:
+        _check_shared(kept, lights)
     name = place.as_posix().removesuffix(KEPT_SUFFIX)
     options = PictureOptions(output=output, name=name, **kept.options)
     tables = picture.prepare(options)
@@ -71,6 +73,21 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
         for name in ("position", "normal", "smooth_normal", "geometric_normal")
     ]
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
+
+
+def _check_shared(kept: KeptPicture, lights: Sequence[AreaLight]) -> None:
+    """Raise ValueError where lights that share their shadow rays are changed differently."""
+    before = kept.extraction.lights
+    for own in kept.shadows.numbers:
+        first = own[0]
+        for number in own[1:] if not before[first].is_distant else ():
+            expected = before[number].radiance.sum() * lights[first].radiance
+            if not np.allclose(lights[number].radiance * before[first].radiance.sum(), expected, rtol=1e-2):
+                names = " and ".join(repr(before[each].name) for each in (first, number))
+                raise ValueError(
+                    f"lights {names} are two of {len(own)} that share their shadow rays, expected the same change for "
+                    "all of them: change them in Blender and run the picture again, or give them light groups first"
+                )
 
 
 def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:

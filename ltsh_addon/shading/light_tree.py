@@ -71,7 +71,7 @@ class LightTree:
         covariance, diagonal = (np.array([getattr(one, name) for one in seen]) for name in ("covariance", "diagonal"))
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
-        order, start, end, children = _ranges(center, normal)
+        order, start, end, children = ranges(center, normal)
         sums = _Sums(order, start, end)
         total = sums(power)
         origin = center.mean(axis=0)
@@ -92,7 +92,7 @@ class LightTree:
         # The cosines of directions that differ by so much are taken as uniform, sqrt(3) standard deviations either way.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = total * np.sqrt(1.5 * turned)
-        cone = _cones(axis, normal[order], start, end)
+        cone = cones(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
         diagonal = sums(power * diagonal) / total
         reach = np.sqrt(3.0 * variances.sum(axis=1))
@@ -114,7 +114,7 @@ class _Sums:
         return found
 
 
-def _ranges(center, normal):
+def ranges(center, normal):
     """Lights in an order (L,) in which those of every node are start to end (N,), and the children (N, 2) of nodes:
     halves along where the lights differ most, level by level."""
     count = len(center)
@@ -146,7 +146,7 @@ def _ranges(center, normal):
         ends.append(np.stack([middle, end], axis=1).ravel())
 
 
-def _cones(axis, normals, start, end):
+def cones(axis, normals, start, end):
     """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) from start to end."""
     least, largest = np.ones(len(axis)), 1 << 16
     size = end - start

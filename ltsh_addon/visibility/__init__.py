@@ -6,6 +6,7 @@ they go, `ratio` makes shares of what they meet (`visible_shares`), and `crew` d
 
 from __future__ import annotations
 
+from .directions import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import Visibility, visible_shares
 from .rays import Tracer, open_tracer
@@ -20,5 +21,6 @@ __all__ = [
     "Transparency",
     "Visibility",
     "open_tracer",
+    "shared_numbers",
     "visible_shares",
 ]

@@ -6,21 +6,23 @@ evenly over the light after the warp that flattens the peak of GGX (`shading.loo
 them: none misses the light, however sharp the lobe. The balance heuristic (Veach and Guibas 1995) joins both.
 
 The sides of a sky, which surround all samples, are one light: half of the directions that are not by the specular lobe
-are by its picture, half by the cosine.
+are by its picture, half by the cosine. Many plain lights of one color are one light too (`Cluster`).
 
 All is in single precision, arrays are (S, Q): S directions from each of Q points, or (Q,). Vectors are lists of three.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..cycles.horizons import SMALLEST_ALPHA, lobe_chances
 from ..cycles.light_tree import light_chances, light_rows
 from ..scene import AreaLight, SurfaceSamples
-from ..shading import brdf, light_cone
+from ..shading import brdf, light_cone, light_tree
 from ..shading.lookup_table import WARP_REGULARIZATION
 from ..shading.polygon import convex_pieces
 
@@ -36,6 +38,8 @@ _PICTURE = 128
 # Cells along each side of a side of the sky; and how far from a sample the light is that stands for the sky, a plane,
 # by half its side.
 CELLS, NEXT_TO = 64, 1e-3
+# Of the color of lights that are taken together, by its largest channel: 0.05 % of what they give may have another.
+COLOR_DIGITS = 3
 # Corners of an ellipse to aim at
 _ROUND_CORNERS = 16
 
@@ -109,7 +113,7 @@ class Emitter:
     """
 
     def __init__(self, light: AreaLight):
-        self.light = light
+        self.light, self.chosen_as = light, (light,)
         self.outline = light.polygon(_ROUND_CORNERS) - light.center
         self.profile = light_cone.Profile.of(light) if light.is_profiled else None
         self.corners = self._own_corners()
@@ -216,26 +220,56 @@ def picture_of(light, places_of):
     return picture
 
 
-def emitters_of(lights: Sequence[AreaLight]) -> tuple[tuple[Emitter, ...], tuple[tuple[int, ...], ...]]:
-    """Emitters, and which of the `lights` each stands for: the squares of a sky have one together."""
-    skies: dict[str, list[int]] = {}
+def shared_numbers(lights: Sequence[AreaLight], tracer=None) -> tuple[tuple[int, ...], ...]:
+    """Which of the `lights` share their rays, and so the share of them that is seen: the squares of a sky, and lights
+    of one color, group and pass that light and are blocked by the same things, where there are FEWEST of them.
+
+    Without a tracer everything is blocked by the same things.
+    """
+    shared: dict[tuple, list[int]] = {}
+    masks: dict[str, tuple] = {}
     for number, light in enumerate(lights):
-        if _is_side(light):
-            skies.setdefault(light.name, []).append(number)
-    emitters, numbers = [], []
-    for number, light in enumerate(lights):
-        own = skies.get(light.name, []) if _is_side(light) else [number]
-        if own[0] == number:
-            emitters.append(Sky([lights[each] for each in own]) if _is_side(light) else Emitter(light))
-            numbers.append(tuple(own))
-    return tuple(emitters), tuple(numbers)
+        if tracer is not None and light.name not in masks:
+            ways = (tracer.mask_of, tracer.surface_mask_of, tracer.chosen_by)
+            masks[light.name] = tuple(way(light.name) for way in ways)
+        shared.setdefault(_kind(light, number, masks.get(light.name)), []).append(number)
+    found = []
+    for kind, own in shared.items():
+        is_one = kind[0] == "sky" or len(own) >= light_tree.FEWEST
+        found.extend([tuple(own)] if is_one else [(number,) for number in own])
+    return tuple(sorted(found))
+
+
+def _kind(light, number, masks) -> tuple:
+    """What lights that share their rays have in common."""
+    if _is_side(light):
+        return "sky", light.name
+    is_even = light.is_even and not (light.is_distant or light.is_facing or light.is_profiled or light.detail)
+    brightest = light.radiance.max()
+    if not is_even or light.radiance.min() < 0.0 or brightest == 0.0 or not light.area_vector.any():
+        return "one", number
+    color = tuple(np.round(light.radiance / brightest, COLOR_DIGITS).tolist())
+    return "many", light.group, light.receivers, light.affects_diffuse, light.affects_specular, color, masks
+
+
+def emitters_of(
+    lights: Sequence[AreaLight], tracer=None
+) -> tuple[tuple[Emitter | Cluster, ...], tuple[tuple[int, ...], ...]]:
+    """Emitters, and which of the `lights` each stands for."""
+    numbers, emitters = shared_numbers(lights, tracer), []
+    for own in numbers:
+        members = [lights[number] for number in own]
+        is_sky = _is_side(members[0])
+        emitters.append(Sky(members) if is_sky else Cluster(members) if len(own) > 1 else Emitter(members[0]))
+    return tuple(emitters), numbers
 
 
 def _is_side(light: AreaLight) -> bool:
     """True for a side of the cube around all samples."""
+    if not light.is_distant or light.shape != "RECTANGLE":
+        return False
     axes = np.stack([light.center, light.half_u, light.half_v])
-    is_side = light.is_distant and light.shape == "RECTANGLE"
-    return is_side and bool(
+    return bool(
         np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3))
     )
 
@@ -276,6 +310,7 @@ class Sky(Emitter):
                 is_distant=True,
             )
         )
+        self.chosen_as = tuple(sides)
 
     def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1): half of them by their brightness, of which those below
@@ -356,6 +391,160 @@ def _cells_of(side: AreaLight) -> np.ndarray:
     return picture.reshape(CELLS, step, CELLS, step).mean(axis=(1, 3))
 
 
+class Cluster:
+    """Many plain lights of one color as one emitter: a ray goes to one of them, chosen by what it may give the sample.
+
+    The lights, cut into quadrilaterals, are the leaves of a tree. Down from its root a ray takes either half of a node
+    as likely as the bounds on distance, on cosines and on the lobe say that it is bright: 0 only where nothing arrives
+    (Conty Estevez and Kulla 2018, "Importance sampling of many lights with adaptive tree splitting",
+    doi:10.1145/3233305). `light` stands for all of them: it has their mean power, and reaches as far.
+    """
+
+    def __init__(self, lights: Sequence[AreaLight]):
+        pieces = [(piece, light) for light in lights for piece in _quads_of(light)]
+        corners = np.array([piece for piece, _ in pieces])
+        owners = [light for _, light in pieces]
+        normal = np.array([light.direction for light in owners])
+        radiance = np.array([light.radiance for light in owners])
+        is_round = np.array([light.is_round for light in owners])
+        across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+        area = 0.5 * np.linalg.norm(across, axis=1) * np.where(is_round, 0.25 * np.pi, 1.0)
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        center, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
+        power = (radiance * area[:, None]).sum(axis=0)
+        axes, like = radius * np.sqrt(0.5) * np.eye(3), lights[0]
+        self.light = AreaLight(
+            like.name,
+            "RECTANGLE",
+            center=center,
+            half_u=axes[0],
+            half_v=axes[1],
+            direction=np.array([0.0, 0.0, -1.0]),
+            radiance=power / (2.0 * radius * radius),
+            affects_diffuse=like.affects_diffuse,
+            affects_specular=like.affects_specular,
+            receivers=like.receivers,
+        )
+        ball = {"half_u": radius * np.eye(3)[0], "half_v": radius * np.eye(3)[1]}
+        self.chosen_as = (replace(self.light, shape="BALL", radiance=power / (4.0 * np.pi * radius**2), **ball),)
+        corners = corners - center
+        values = radiance.mean(axis=1)
+        self.brightness = (values / max(self.light.radiance.mean(), 1e-30)).astype(np.float32)
+        self.corners = np.ascontiguousarray(corners.transpose(2, 1, 0), dtype=np.float32)
+        self.normal = np.ascontiguousarray(normal.T, dtype=np.float32)
+        self.is_round = is_round if is_round.any() else None
+        self._build(corners, normal, values * area)
+
+    def _build(self, corners, normal, power):
+        """The nodes, the root first."""
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        order, start, end, self.children = light_tree.ranges(0.5 * (low + high), normal)
+        alone = end - start == 1
+        own = order[start]
+        self.leaf = np.where(alone, own, -1)
+        low, high, sums, vector = low[own], high[own], power[own], power[own, None] * normal[own]
+        for first, last in reversed(_levels(self.children)):
+            inner = first + np.flatnonzero(self.children[first:last, 0] >= 0)
+            one, other = self.children[inner].T
+            low[inner], high[inner] = np.minimum(low[one], low[other]), np.maximum(high[one], high[other])
+            sums[inner], vector[inner] = sums[one] + sums[other], vector[one] + vector[other]
+        length = np.linalg.norm(vector, axis=1, keepdims=True)
+        axis = np.where(length > 1e-9 * sums[:, None], vector / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+        self.center = np.ascontiguousarray(0.5 * (low + high).T, dtype=np.float32)
+        self.radius = (0.5 * np.linalg.norm(high - low, axis=1)).astype(np.float32)
+        self.axis = np.ascontiguousarray(axis.T, dtype=np.float32)
+        self.cone = light_tree.cones(axis, normal[order], start, end).astype(np.float32)
+        self.power = (sums / sums[0]).astype(np.float32)
+
+    def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], own: np.ndarray):
+        """Leaves (R,), by lobe how likely (R,) each is taken, and what is left of the numbers x (R,) in [0, 1), for
+        rays that go by the lobe `own` (R,)."""
+        node, chances = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
+        while True:
+            inner = np.flatnonzero(self.leaf[node] < 0)
+            if len(inner) == 0:
+                return self.leaf[node], chances, x
+            one, other = self.children[node[inner]].T
+            bounds = (self._bounds(one, lobes, inner), self._bounds(other, lobes, inner))
+            both = bounds[0] + bounds[1]
+            share = np.divide(bounds[0], both, out=np.zeros_like(both), where=both > 0.0)
+            mine = share[own[inner], np.arange(len(inner))]
+            is_first = x[inner] < mine
+            size = np.where(is_first, mine, _ONE - mine)
+            rest = (x[inner] - np.where(is_first, _ZERO, mine)) / np.maximum(size, _TINY)
+            x[inner] = np.clip(rest, _ZERO, np.float32(1.0 - 2.0**-24))
+            chances[:, inner] *= np.where(both > 0.0, np.where(is_first, share, _ONE - share), _ZERO)
+            node[inner] = np.where(is_first, one, other)
+
+    def _bounds(self, node, lobes, rays):
+        """By lobe, about how much light (R,) of a node, at most, the `rays` (R,) get."""
+        offset = self.center[:, node] + lobes[0].offset[:, rays]
+        squares = np.maximum(dot(offset, offset), _TINY)
+        distance, radius = np.sqrt(squares), self.radius[node]
+        spread = np.where(radius < distance, np.arcsin(np.minimum(radius / distance, _ONE)), np.float32(np.pi))
+        spread += _SLACK
+        offset /= distance
+        light = self.power[node] / np.maximum(squares, radius * radius)
+        light *= _cosine_at_most(-dot(offset, self.axis[:, node]), self.cone[node] + spread)
+        return np.stack([light * lobe.at_most(offset, spread, rays) for lobe in lobes])
+
+
+# In rad, for what single precision leaves of angles.
+_SLACK = np.float32(2e-3)
+
+
+@dataclass(frozen=True)
+class ClusterLobe:
+    """What bounds a lobe of rays: vectors (3, R) and values (R,)."""
+
+    offset: np.ndarray  # m, to the center of the cluster
+    normal: np.ndarray
+    mirrored: np.ndarray | None = None  # the mirrored view, of specular lobes
+    width: np.ndarray | None = None  # in rad
+
+    def at_most(self, directions, spread, rays):
+        """Of the lobe (R,) in cones of an angle `spread` (R,) around `directions` (3, R)."""
+        cosine = _cosine_at_most(dot(directions, self.normal[:, rays]), spread)
+        if self.mirrored is None:
+            return cosine
+        toward = np.clip(dot(directions, self.mirrored[:, rays]), -_ONE, _ONE)
+        away = np.maximum(np.arccos(toward) - spread, _ZERO)
+        squared = np.square(self.width[rays])
+        return np.square(squared / (squared + away * away)) * (cosine > 0.0)
+
+
+def _cosine_at_most(cosine, spread):
+    """The largest cosine (R,), not below 0, of angles that differ by at most `spread` (R,) from those of `cosine`."""
+    angle = np.maximum(np.arccos(np.clip(cosine, -_ONE, _ONE)) - spread, _ZERO)
+    return np.where(angle < np.float32(0.5 * np.pi), np.maximum(np.cos(angle), _ZERO), _ZERO)
+
+
+def _levels(children):
+    """First and last number of the nodes of each level."""
+    levels = [(0, 1)]
+    while True:
+        first, last = levels[-1]
+        more = 2 * int(np.count_nonzero(children[first:last, 0] >= 0))
+        if more == 0:
+            return levels
+        levels.append((last, last + more))
+
+
+def _quads_of(light: AreaLight) -> list[np.ndarray]:
+    """Convex quadrilaterals (4, 3), of which triangles repeat the last corner, that a light consists of; the
+    parallelogram around a round one."""
+    if light.shape != "POLYGON":
+        u, v = light.half_u, light.half_v
+        return [light.center + np.stack([-u - v, u - v, u + v, v - u])]
+    if len(light.corners) == 3:
+        return [light.corners[[0, 1, 2, 2]]]
+    found = []
+    for piece in convex_pieces(light.corners):
+        for first in range(1, len(piece) - 1, 2):
+            found.append(piece[[0, first, first + 1, min(first + 2, len(piece) - 1)]])
+    return found
+
+
 class SphericalQuads:
     """Quadrilaterals (3, 4, Q) as points see them, for directions spread evenly over their solid angles (Q,).
 
@@ -379,6 +568,17 @@ class SphericalQuads:
         self.first, self.solid_angle = angles[0], angles[0] + angles[1]
         self.is_seen = self.solid_angle > _LEAST_SOLID_ANGLE
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
+
+    def part(self, rows: slice) -> SphericalQuads:
+        """The `rows` of quadrilaterals (3, 4, S, Q), of which each sample has several."""
+        found = copy.copy(self)
+        for name in ("apex", "both"):
+            setattr(found, name, getattr(self, name)[:, rows])
+        found.near = [near[:, rows] for near in self.near]
+        found.terms = [tuple(term[rows] for term in terms) for terms in self.terms]
+        for name in ("gap", "first", "solid_angle", "is_seen"):
+            setattr(found, name, getattr(self, name)[rows])
+        return found
 
     def directions(self, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Unit vectors `out` (3, S, Q) for numbers (S, Q) in [0, 1), which are lost."""

@@ -21,9 +21,22 @@ from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples,
 from ..shading.brdf import dielectric_reflectance, schlick_curve
 from ..shading.diffuse import diffuse_factor
 from ..shading.facing import FacingDisk, emission, ray_length
-from ..shading.light_polygons import has_lobe, may_reach, off_plane
+from ..shading.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
 from . import crew
-from .directions import Choices, Emitter, Sky, SphericalQuads, Warps, dot, emitters_of, frames, seeds_of, unit_points
+from .directions import (
+    Choices,
+    Cluster,
+    ClusterLobe,
+    Emitter,
+    Sky,
+    SphericalQuads,
+    Warps,
+    dot,
+    emitters_of,
+    frames,
+    seeds_of,
+    unit_points,
+)
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -61,18 +74,29 @@ _LENGTHS = np.float32(1e-11), np.float32(4.0)
 
 @dataclass(frozen=True)
 class Visibility:
-    """Shares of L lights that P samples see by pass, in [0, 1]; None for a pass that was not asked for.
+    """Shares of E emitters that P samples see by pass, in [0, 1]; None for a pass that was not asked for.
+
+    An emitter is one light, or several that share their rays: those of its `numbers`.
 
     Exactly 1 where nothing is in the way, and where no light arrives anyway; exactly 0 where all is blocked.
     """
 
-    specular: np.ndarray | None  # (L, P) float32
+    specular: np.ndarray | None  # (E, P) float32
     diffuse: np.ndarray | None
     # By pass, for the light of all lights that each sample reflects, about: (P,) radiance, and its standard deviation
     radiance: dict[str, np.ndarray]
     deviation: dict[str, np.ndarray]
     rays: int  # that were traced
-    mixed: np.ndarray  # (L, P) bool: pairs of which some rays arrived and some did not
+    mixed: np.ndarray  # (E, P) bool: pairs of which some rays arrived and some did not
+    numbers: tuple[tuple[int, ...], ...] = ()  # of the lights of each emitter
+
+    def of_lights(self, name: str) -> np.ndarray:
+        """The shares (L, P) of a pass."""
+        shares = getattr(self, name)
+        found = np.empty((sum(map(len, self.numbers)), shares.shape[1]), np.float32)
+        for own, share in zip(self.numbers, shares, strict=True):
+            found[list(own)] = share
+        return found
 
     def noise(self, name: str, film: Film | None = None) -> float:
         """Estimated relative L2 error of a pass, by the two halves of the rays: of samples, or of pixels of a film."""
@@ -105,14 +129,14 @@ def visible_shares(
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    (emitters, numbers), passes = emitters_of(lights), tuple(passes)
+    (emitters, numbers), passes = emitters_of(lights, tracer), tuple(passes)
     typical = dict.fromkeys(passes, 1.0)
-    task = ShadowTask(tuple(lights), emitters, numbers, passes, rays // PROBES * PROBES, typical, is_baked)
+    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical, is_baked)
     start = time.thread_time()
     typical, looked_at = typical_radiance(samples, task, tracer)
     seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
     task = replace(task, typical=typical)
-    shape = len(lights), len(samples)
+    shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
@@ -126,16 +150,14 @@ def visible_shares(
             radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
         mixed[:, block] = found.mixed
         traced += found.rays
-    return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+    return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed, numbers)
 
 
 @dataclass(frozen=True)
 class ShadowTask:
     """What to do with every block of samples."""
 
-    lights: tuple[AreaLight, ...]
-    emitters: tuple[Emitter, ...]
-    numbers: tuple[tuple[int, ...], ...]  # of the lights that each emitter stands for
+    emitters: tuple[Emitter | Cluster, ...]
     passes: tuple[str, ...]
     rays: int
     typical: dict[str, float]
@@ -143,22 +165,23 @@ class ShadowTask:
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
-        shape = len(self.lights), len(samples)
+        shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
-        choices = Choices(samples, self.lights, self.is_baked)
-        for numbers, emitter in zip(self.numbers, self.emitters, strict=True):
-            pairs = Pairs(surface, emitter, numbers[0], choices)
+        choices, first = Choices(samples, [one for each in self.emitters for one in each.chosen_as], self.is_baked), 0
+        for number, emitter in enumerate(self.emitters):
+            pairs = Pairs(surface, emitter, first, choices)
+            first += len(emitter.chosen_as)
             pairs.trace(self.rays, neighbors, self.typical)
             traced += pairs.traced
             index = pairs.index
-            mixed[np.ix_(numbers, index)] = pairs.visible & pairs.blocked
+            mixed[number, index] = pairs.visible & pairs.blocked
             for name in self.passes:
                 share, noise = pairs.found(name)
                 unshadowed = pairs.unshadowed(name)
-                shares[name][np.ix_(numbers, index)] = share
+                shares[name][number, index] = share
                 radiance[name][index] += unshadowed * share
                 variance[name][index] += np.square(unshadowed * noise)
         deviation = {name: np.sqrt(values) for name, values in variance.items()}
@@ -262,9 +285,9 @@ class _ChosenBySurface:
 
 
 class Pairs:
-    """The samples that a light, `number` of all, may reach, and what their rays have found so far."""
+    """The samples that an emitter may reach, and what their rays have found so far; `choices` knows it by `number`."""
 
-    def __init__(self, surface: Surface, emitter: Emitter, number: int, choices: Choices):
+    def __init__(self, surface: Surface, emitter: Emitter | Cluster, number: int, choices: Choices):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
@@ -273,7 +296,7 @@ class Pairs:
         origins = light.origins(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
-        if not light.is_facing:
+        if not light.is_facing and not isinstance(emitter, Cluster):
             ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(light.center, origins)
         if light.is_focused or light.is_facing:
             ahead &= may_reach(light, surface.position)
@@ -318,8 +341,8 @@ class Pairs:
         """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = np.maximum(worth["specular"], worth["diffuse"])
-        # The sky is there for all that it is made of.
-        share = 1.0 if isinstance(self.emitter, Sky) else TYPICAL_SHARE
+        # They are there for all that they are made of.
+        share = 1.0 if isinstance(self.emitter, Sky | Cluster) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
         if isinstance(self.emitter, Sky):
             # What only the sky lights is dark beside what a sun in it does.
@@ -340,6 +363,8 @@ class Pairs:
     def _corner_heights(self, name, members):
         """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
         surface, index = self.surface, self.index[members]
+        if isinstance(self.emitter, Cluster):
+            return View(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
         center = self.light.center[:, None] - self.light.origins(surface.position[:, index])
         if self.light.is_facing:
             normal = surface.horizons(name)[0][:, index]
@@ -455,7 +480,7 @@ class Pairs:
         if len(differ) == 0:
             return None
         chosen, found = chosen[differ], found[differ]
-        angle = view.solid_angle[column[chosen]]
+        angle = view.solid_angles(flat[chosen])
         return _ChosenBySurface(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
@@ -522,21 +547,22 @@ class Rays:
 class View:
     """A light seen from a block of samples: arrays (Q,) and (3, Q)."""
 
-    def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter, lobes: tuple[str, ...]):
+    def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter | Cluster, lobes: tuple[str, ...]):
         self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
         offset = light.center[:, None] - light.origins(np.take(surface.position, index, axis=1))
         self.height = (-dot(light.direction, offset)).astype(np.float32)
         self.offset = offset.astype(np.float32)
-        self.disk = None
+        self.disk, is_quad = None, not isinstance(emitter, Cluster)
         if light.is_facing:
             normal = surface.normal if "specular" in lobes else surface.diffuse_normal
             self.disk = FacingDisk.of(light, self.offset, np.take(normal, index, axis=1))
             corners = self.disk.corners(SQUARE)
-        else:
+        elif is_quad:
             corners = emitter.corners_from(self.offset, self.height)
-        self.quads = SphericalQuads(corners)
-        self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
+        if is_quad:
+            self.quads = SphericalQuads(corners)
+            self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
         if isinstance(emitter, Sky):
             # Of one of the sides, of which `Choices` knows one.
             self.solid_angle = np.full(len(index), 4.0 * np.pi / 6.0, np.float32)
@@ -553,10 +579,12 @@ class View:
             self.geometric_normal = np.take(surface.geometric_normal, index, axis=1)
             self.has_own_horizon = surface.geometric_normal is not surface.normal
             self.cosine, self.sine, rows = frames(normal, view)
+            self.view = view
             self.alpha = surface.alpha[index]
             self.warps = Warps(rows, self.cosine, self.sine, self.alpha)
-            self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
-            self.is_seen = self.is_seen & self.warped_quads.is_seen
+            if is_quad:
+                self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
+                self.is_seen = self.is_seen & self.warped_quads.is_seen
             self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
@@ -564,6 +592,8 @@ class View:
         """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
         if isinstance(self.emitter, Sky):
             return self._rays_to_sky(rays)
+        if isinstance(self.emitter, Cluster):
+            return self._rays_to_cluster(rays)
         evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
         shape = (evenly + by_lobe, len(self.index))
         directions = np.empty((3, *shape), np.float32)
@@ -636,6 +666,81 @@ class View:
         factor = self.emitter.brightness_along(directions) / np.maximum(density, _TINY)
         distance = np.full(shape, _FARTHEST, np.float32)
         return directions, distance, self._weights(directions, local, factor)
+
+    def solid_angles(self, flat):
+        """One by the density (R,) of the rays at places in the flat (S, Q) that the light chooses, about."""
+        return self.solid_angle.ravel()[flat % self.solid_angle.size]
+
+    def _rays_to_cluster(self, rays: Rays):
+        """As `rays`: each to a leaf of its own."""
+        even, sharp = (
+            unit_points(self.seeds, stream, *part) for stream, part in enumerate((rays.evenly, rays.by_lobe))
+        )
+        evenly, shape = len(even[0]), (len(even[0]) + len(sharp[0]), len(self.index))
+        leaf, chances, x = self._leaves(np.concatenate([even[0], sharp[0]]), evenly)
+        y, emitter = np.concatenate([even[1], sharp[1]]), self.emitter
+        corners = emitter.corners[:, :, leaf] + self.offset[:, None, None]
+        quads, directions = SphericalQuads(corners), np.empty((3, *shape), np.float32)
+        is_seen, local = quads.is_seen, None
+        quads.part(slice(None, evenly)).directions(x[:evenly], y[:evenly], out=directions[:, :evenly])
+        self.solid_angle = quads.solid_angle / np.maximum(chances[0], np.float32(1e-12))
+        density = np.float32(evenly / shape[0]) * chances[0] / quads.solid_angle
+        if evenly < shape[0]:
+            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
+            warped = SphericalQuads(self.warps.warped(self.warps.local(corners)))
+            is_seen = is_seen & warped.is_seen
+            warped.part(slice(evenly, None)).directions(x[evenly:], y[evenly:], out=local[:, evenly:])
+            length[evenly:] = self.warps.unwarped(local[:, evenly:])
+            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
+            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
+            length[:evenly] = self.warps.lengths(local[:, :evenly])
+            np.clip(length, *_LENGTHS, out=length)
+            scale = np.float32(1.0 - evenly / shape[0]) * chances[-1] * self.warps.determinant / warped.solid_angle
+            density = density + scale / (length * length * length)
+        normal = emitter.normal[:, leaf]
+        falling, height = -dot(directions, normal), -dot(corners[:, 0], normal)
+        distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
+        factor = is_seen & (falling > 0.0) & (height > 0.0) & (density > 0.0)
+        if emitter.is_round is not None:
+            factor &= self._inside_round(leaf, corners, directions * np.where(factor, distance, _ZERO))
+        factor = factor * emitter.brightness[leaf] / np.maximum(density, _TINY)
+        return directions, distance, self._weights(directions, local, factor)
+
+    def _inside_round(self, leaf, corners, place):
+        """False (S, Q) for places (3, S, Q) outside of the ellipses in their parallelograms."""
+        u, v = 0.5 * (corners[:, 1] - corners[:, 0]), 0.5 * (corners[:, 3] - corners[:, 0])
+        offset = place - 0.5 * (corners[:, 0] + corners[:, 2])
+        uu, uv, vv, us, vs = dot(u, u), dot(u, v), dot(v, v), dot(u, offset), dot(v, offset)
+        whole = np.maximum(uu * vv - uv * uv, _TINY)
+        s, t = (vv * us - uv * vs) / whole, (uu * vs - uv * us) / whole
+        return (s * s + t * t <= _ONE) | ~self.emitter.is_round[leaf]
+
+    def _leaves(self, x, evenly):
+        """Leaves (S, Q) that rays go to by numbers x (S, Q), `evenly` of them by the diffuse lobe if there is one; by
+        lobe how likely; and what is left of x."""
+        columns = np.tile(np.arange(len(self.index)), len(x))
+        lobes, own = [], np.zeros(x.shape, np.intp)
+        if "diffuse" in self.lobes:
+            lobes.append(ClusterLobe(self.offset[:, columns], self.horizons[0][:, columns]))
+        if "specular" in self.lobes:
+            normal = self.warps.rows[2]
+            mirrored = np.float32(2.0) * self.cosine * normal - self.view
+            width = np.maximum(LOBE_WIDTH * self.alpha * np.maximum(self.cosine, LEAST_COSINE), np.float32(1e-4))
+            rows = (self.geometric_normal[:, columns], mirrored[:, columns], width[columns].astype(np.float32))
+            lobes.append(ClusterLobe(self.offset[:, columns], *rows))
+            own[evenly:] = len(lobes) - 1
+        leaf, chances, rest = self.emitter.pick(x.ravel(), lobes, own.ravel())
+        return leaf.reshape(x.shape), chances.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
+
+    def corner_heights(self, horizons):
+        """As of `Pairs`, for the corners of the leaves that the probes go to and that face the samples."""
+        x = unit_points(self.seeds, 0, 0, PROBES)[0]
+        leaf, chances, _ = self._leaves(x, PROBES)
+        corners = self.emitter.corners[:, :, leaf] + self.offset[:, None, None]
+        is_lit = (chances[0] > 0.0) & (dot(corners[:, 0], self.emitter.normal[:, leaf]) < 0.0)
+        corners, is_lit = corners.reshape(3, 4 * PROBES, len(self.index)), np.tile(is_lit, (4, 1))
+        heights = np.minimum.reduce([dot(corners, normal[:, None, self.index]) for normal in horizons])
+        return np.where(is_lit, heights, -_ONE), corners
 
     def _axis(self):
         """Unit vectors (3, 1, Q) to the light."""

@@ -9,7 +9,7 @@ import pytest
 from fake_scene import run, wall
 from surface_scenes import four_lights, random_samples
 
-from ltsh_addon import shading
+from ltsh_addon import shading, visibility
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting
 
@@ -50,7 +50,8 @@ def test_many_lights_without_shadows_are_shaded_all_at_once(count, is_one_call):
     (found,) = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), workers=1)
     expected = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1)
     assert found.groups == expected.groups and np.allclose(found.diffuse, expected.diffuse, rtol=1e-2, atol=1e-4)
-    seen = {"diffuse": np.ones((len(lights), len(samples)))}
+    numbers = visibility.shared_numbers(lights)
+    seen = lighting.Shadows({"diffuse": np.ones((len(numbers), len(samples)))}, numbers, {}, 0, "")
     shadowed, unshadowed = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), (seen, None), workers=1)
     assert np.array_equal(shadowed.diffuse, unshadowed.diffuse)
     assert np.array_equal(found.diffuse, shadowed.diffuse) != is_one_call

@@ -200,12 +200,12 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
     names = list(dict.fromkeys(job.shaded_as().values()))
     share, start = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE
-    shares, warnings = None, extraction.warnings
+    shadows, warnings = None, extraction.warnings
     if extraction.occluders is not None:
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share))
-        shares, warnings = shadows.shares, warnings + shadows.warnings
+        warnings += shadows.warnings
     images = {
-        name: _images(extraction, name, shares, _part(progress, start + (index + 1) * share, share))
+        name: _images(extraction, name, shadows, _part(progress, start + (index + 1) * share, share))
         for index, name in enumerate(names)
     }
     passes = {
@@ -229,7 +229,7 @@ def _part(progress: Progress, start: float, share: float) -> Progress:
     return lambda stage, fraction: progress(stage, start + share * fraction)
 
 
-def _images(extraction, technique: str, shares, progress: Progress) -> dict[str, np.ndarray]:
+def _images(extraction, technique: str, shadows, progress: Progress) -> dict[str, np.ndarray]:
     """Radiance (H, W, 3) of each pass times the film's exposure."""
     images = {}
     for index, name in enumerate(PASSES):
@@ -239,7 +239,7 @@ def _images(extraction, technique: str, shares, progress: Progress) -> dict[str,
             extraction.lights,
             technique,
             (name,),
-            (shares,),
+            (shadows,),
             progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
         )
         image = extraction.film.image(extraction.exposure * lit.combined)

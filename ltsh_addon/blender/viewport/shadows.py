@@ -66,7 +66,7 @@ class ShadowRays:
         found = visible_shares(samples, lights, tracer, rays=self._rays, film=Film(width, height, pixel))
         values = np.ones((len(lights), height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, pixel, index] = getattr(found, name)
+            values[:, pixel, index] = found.of_lights(name)
             power = (np.square(part[name], dtype=np.float64).sum() for part in (found.radiance, found.deviation))
             self._power[name] += list(power)
         self.seconds += time.perf_counter() - start
@@ -123,7 +123,7 @@ class _Request:
         )
         values = np.ones((len(self.lights), self.film.height * self.film.width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, self.film.pixel, index] = getattr(found, name)
+            values[:, self.film.pixel, index] = found.of_lights(name)
         return values.reshape(len(self.lights), self.film.height, self.film.width, len(PASSES))
 
 

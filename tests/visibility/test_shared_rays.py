@@ -1,0 +1,135 @@
+"""Many lights that share their rays: beside each by itself, and beside closed forms."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_ratio import OPEN, WALL, floor, past_spheres, textbook_ggx
+
+from ltsh_addon import shading
+from ltsh_addon.pipeline import lighting, relight
+from ltsh_addon.scene import PASSES, AreaLight
+from ltsh_addon.visibility import directions, ratio, shared_numbers
+from ltsh_addon.visibility.directions import Choices, Cluster
+from random_surfaces import unit
+
+THREE_SPHERES = past_spheres(((0.0, 0.3, 0.6), 0.35), ((-1.0, -0.5, 0.3), 0.3), ((1.0, 1.2, 1.0), 0.3))
+
+
+def ceiling(count=100, color=(1.0, 0.5, 0.25), **changes):
+    """Lamps of all shapes and of brightness 1 to 4, 2 to 3 m over the floor, most of which face it."""
+    generator, lights = np.random.default_rng(count), []
+    for number in range(count):
+        direction = unit(np.array([0.0, 0.0, -1.0]) + 0.5 * generator.normal(size=3))
+        half_u = generator.uniform(0.03, 0.1) * unit(np.cross(direction, [0.3, 1.0, 0.0]))
+        center = np.append(generator.uniform(-3.0, 3.0, 2), generator.uniform(2.0, 3.0))
+        half_v, corners = 0.6 * np.cross(direction, half_u), None
+        shape = ("RECTANGLE", "ELLIPSE", "POLYGON")[number % 3]
+        if shape == "POLYGON":
+            # From a triangle to an arrow that is not convex.
+            places = np.array([[-1, -1], [1, -1], [0, 1], [-0.5, 0], [-0.9, 0.4]])[: 3 + number % 9 // 3]
+            corners = center + places @ np.stack([half_u, half_v])
+        radiance = generator.uniform(1.0, 4.0) * np.array(color)
+        values = {"name": "Lamp", "shape": shape, "center": center, "half_u": half_u, "half_v": half_v}
+        lights.append(AreaLight(**{**values, "direction": direction, "radiance": radiance, "corners": corners} | changes))
+    return lights
+
+
+def shadows_of(samples, lights, tracer, film=None, **options):
+    found = ratio.visible_shares(samples, lights, tracer, film=film, workers=1, **options)
+    shares = {name: getattr(found, name) for name in PASSES}
+    return lighting.Shadows(shares, found.numbers, {}, found.rays, "")
+
+
+def test_lights_of_one_color_group_and_kind_share_their_rays():
+    red, blue = ceiling(70, (1.0, 0.0, 0.0)), ceiling(70, (0.0, 0.0, 1.0))
+    few, grouped = ceiling(9, group="Few"), ceiling(64, group="Many")
+    odd = [replace(red[0], spread=1.0), replace(red[0], radiance=-np.ones(3)), replace(red[0], receivers=(1,))]
+    lights = [*red[:35], *odd, *blue, *few, *red[35:], *grouped]
+    numbers = shared_numbers(lights)
+    assert sorted(sum(numbers, ())) == list(range(len(lights)))
+    assert sorted(map(len, numbers)) == [1] * 12 + [64, 70, 70]
+    shared = [{(lights[number].group, *np.sign(lights[number].radiance)) for number in own} for own in numbers]
+    assert all(len(kinds) == 1 for kinds in shared)
+
+
+@pytest.mark.parametrize("roughness", (0.1, 0.4))
+def test_rays_bring_the_light_of_all_lamps(roughness):
+    """The weights of 1024 rays beside midpoints of all lamps: at 2 m cells of 2 cm, errors of 1e-4."""
+    samples, _ = floor(5, roughness)
+    lights = [light for light in ceiling(99) if light.shape != "POLYGON"]
+    cluster = Cluster(lights)
+    surface = ratio.Surface(samples, PASSES, OPEN.starts(samples) and OPEN)
+    pairs = ratio.Pairs(surface, cluster, 0, Choices(samples, cluster.chosen_as, False))
+    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    expected = {name: np.zeros(len(samples)) for name in PASSES}
+    place = (np.arange(10) + 0.5) / 5.0 - 1.0
+    s, t = (axis.ravel() for axis in np.meshgrid(place, place))
+    for light in lights:
+        inside = (s * s + t * t <= 1.0) if light.is_round else np.ones(s.shape, bool)
+        points = light.center + s[inside, None] * light.half_u + t[inside, None] * light.half_v
+        toward = points - samples.position[:, None]
+        distance = np.linalg.norm(toward, axis=2)
+        toward /= distance[..., None]
+        area = np.linalg.norm(light.area_vector) / inside.sum()
+        light_cosine = np.maximum(-toward @ light.direction, 0.0)
+        power = light.radiance.mean() * area * light_cosine / distance**2
+        expected["diffuse"] += (power * np.maximum(toward[..., 2], 0.0)).sum(axis=1) * 0.5 / np.pi
+        half = unit(toward + samples.view[:, None])
+        lobe = textbook_ggx(half[..., 2], toward[..., 2], samples.view[:, None, 2], roughness**2)
+        expected["specular"] += (power * np.maximum(toward[..., 2], 0.0) * lobe).sum(axis=1) * 0.5
+    for name in PASSES:
+        found = pairs.unshadowed(name)
+        assert np.linalg.norm(found - expected[name]) < 0.02 * np.linalg.norm(expected[name]), name
+
+
+def test_shares_are_0_in_the_dark_and_1_in_the_open():
+    samples, film = floor(16)
+    for light in (ceiling(99), ceiling(99, affects_specular=False)):
+        for tracer, share in ((OPEN, 1.0), (WALL, 0.0)):
+            found = ratio.visible_shares(samples, light, tracer, film=film)
+            assert found.diffuse.shape == (1, 256) and found.of_lights("diffuse").shape == (99, 256)
+            assert (found.diffuse == share).all()
+            assert (found.specular == (share if light[0].affects_specular else 1.0)).all()
+
+
+@pytest.mark.parametrize("roughness", (0.1, 0.3))
+def test_shadows_are_those_of_each_lamp_by_itself(roughness, monkeypatch):
+    samples, film = floor(20, roughness)
+    lights = ceiling(80, (1.0, 0.2, 0.1)) + ceiling(70, (0.1, 0.2, 1.0))
+    shared = shadows_of(samples, lights, THREE_SPHERES, film, rays=256)
+    assert len(shared.numbers) == 2
+    monkeypatch.setattr(directions.light_tree, "FEWEST", len(lights))
+    alone = shadows_of(samples, lights, THREE_SPHERES, film, rays=64)
+    assert len(alone.numbers) == 150 and shared.rays < 0.5 * alone.rays
+    monkeypatch.undo()
+    for name in PASSES:
+        found, expected = (
+            getattr(lighting.shade_lights(samples, lights, "ltsh4", (name,), (one,), workers=1)[0], name)
+            for one in (shared, alone)
+        )
+        # Noise of each sample; none of it in the mean of all.
+        assert np.linalg.norm(found - expected) < 0.03 * np.linalg.norm(expected)
+        np.testing.assert_allclose(found.sum(axis=(0, 1)), expected.sum(axis=(0, 1)), rtol=5e-3)
+
+
+def test_lamps_that_nothing_hides_shade_as_without_shadows_bit_by_bit():
+    samples, film = floor(8)
+    lights = ceiling(70, group="A") + ceiling(5, group="B")
+    shadows = shadows_of(samples, lights, OPEN, film)
+    with_shadows, without = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), (shadows, None), workers=1)
+    only = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), workers=1)[0]
+    assert np.array_equal(with_shadows.diffuse, without.diffuse) and np.array_equal(only.diffuse, without.diffuse)
+    plain = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1, dtype=np.float64)
+    np.testing.assert_allclose(only.diffuse, plain.diffuse, rtol=0.02)
+    assert only.groups == plain.groups
+
+
+def test_lights_that_share_rays_are_relit_together():
+    lights = [replace(light, name=f"Lamp {number}") for number, light in enumerate(ceiling(70))]
+    shadows = lighting.Shadows({}, shared_numbers(lights), {}, 0, "")
+    kept = lighting.KeptPicture(SimpleNamespace(lights=lights), shadows, {}, False)
+    relight._check_shared(kept, [replace(light, radiance=[2.0, 3.0, 4.0] * light.radiance) for light in lights])
+    with pytest.raises(ValueError, match="'Lamp 0' and 'Lamp 3' are two of 70 that share their shadow rays"):
+        relight._check_shared(kept, [*lights[:3], replace(lights[3], radiance=np.zeros(3)), *lights[4:]])

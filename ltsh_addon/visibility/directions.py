@@ -269,9 +269,7 @@ def _is_side(light: AreaLight) -> bool:
     if not light.is_distant or light.shape != "RECTANGLE":
         return False
     axes = np.stack([light.center, light.half_u, light.half_v])
-    return bool(
-        np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3))
-    )
+    return bool(np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3)))
 
 
 class Sky(Emitter):

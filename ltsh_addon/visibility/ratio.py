@@ -698,7 +698,7 @@ class View:
             scale = np.float32(1.0 - evenly / shape[0]) * chances[-1] * self.warps.determinant / warped.solid_angle
             density = density + scale / (length * length * length)
         normal = emitter.normal[:, leaf]
-        falling, height = -dot(directions, normal), -dot(corners[:, 0], normal)
+        falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
         factor = is_seen & (falling > 0.0) & (height > 0.0) & (density > 0.0)
         if emitter.is_round is not None:

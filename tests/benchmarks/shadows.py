@@ -207,11 +207,11 @@ class Measured:
             tracer, samples = self.tracer(number)
             with tracer:
                 found.append(tracer.trace(samples, PASSES, rays, film=self.extraction.film))
-        return [self._images(shadows.shares) for shadows in found], found
+        return [self._images({name: self._of_lights(shadows, name) for name in PASSES}) for shadows in found], found
 
     def exact_specular(self, shadows):
         """The specular image (H, W, 3) of shadows, by quadrature of the light."""
-        return self._image("specular", shadows.shares["specular"], self._by_quadrature)
+        return self._image("specular", self._of_lights(shadows, "specular"), self._by_quadrature)
 
     def tracer(self, number):
         """A tracer of the scene, moved by `number` times SHIFT, and the samples there."""
@@ -235,6 +235,13 @@ class Measured:
         """Radiance (L, P, 3) of every light, all of it seen."""
         lights = [replace(light, group=str(number)) for number, light in enumerate(self.extraction.lights)]
         return shading.shade(self.extraction.samples, lights, technique, passes=passes)
+
+    def _of_lights(self, shadows, name):
+        """Shares (L, P) of a pass."""
+        shares = np.empty((len(self.extraction.lights), len(self.extraction.samples)), np.float32)
+        for own, share in zip(shadows.numbers, shadows.shares[name], strict=True):
+            shares[list(own)] = share
+        return shares
 
     def _images(self, shares):
         return {name: self._image(name, shares[name], self._by_technique) for name in PASSES}

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
+from lit_plane import add_lamp_ball
 from material_scenes import Build
 
 from ltsh_addon import imaging
@@ -156,6 +157,27 @@ def test_each_blocker_has_the_shadow_that_it_has_in_cycles(comparison, name):
         unshadowed, _ = bias(layers[f"ltsh4_unshadowed.{part}"][bay], halves)
         if name not in UNBLOCKED and (part, name) not in FAINT:
             assert unshadowed > 0.1**2, "this bay has no shadow to speak of"
+
+
+def test_a_lamp_of_many_faces_has_the_shadows_that_it_has_in_cycles(tmp_path):
+    """Its faces share their rays; on a smooth ball some rays start elsewhere for the light than for the surface."""
+    scene_parts.empty_scene(48, 32)
+    scene_parts.add_camera((0.0, -3.5, 3.0), (0.85, 0.0, 0.0))
+    scene_parts.add_plane(scene_parts.principled("Floor", Roughness=0.4)[0], size=6.0, name="Floor")
+    scene_parts.add_sphere(scene_parts.principled("Ball", Roughness=0.4)[0], 0.5, location=(-0.8, 0.0, 0.5))
+    cube(0.6, size=0.5)
+    add_lamp_ball(segments=16, location=(0.0, 0.8, 1.6))
+    path = scene_parts.save(tmp_path / "lamp.blend")
+    options = {"techniques": ("ltsh4",), "cycles_samples": 256, "shadow_rays": 256, "sub_samples": 4}
+    report = compare_scene(PictureOptions(scene=path, output=tmp_path, **options))
+    layers = imaging.read_layers(tmp_path / "compare.exr")
+    assert len(report["lights"]) > 64 and "visibility.diffuse@Lamp" in layers
+    for part, most in MOST_BIAS.items():
+        halves = np.stack([layers[f"cycles_{half}.{part}"] for half in "AB"])
+        squared, deviation = bias(layers[f"ltsh4.{part}"], halves)
+        own = report["shadows"]["noise"][part]
+        assert squared - 3.0 * deviation < most**2 + own**2, part
+        assert bias(layers[f"ltsh4_unshadowed.{part}"], halves)[0] > 0.05**2
 
 
 def test_faces_whose_smooth_normals_point_to_their_other_side_are_lit_as_in_cycles_bake(tmp_path):

@@ -560,6 +560,9 @@ class View:
             corners = self.disk.corners(SQUARE)
         elif is_quad:
             corners = emitter.corners_from(self.offset, self.height)
+        else:
+            place = np.take(surface.position, index, axis=1)
+            self.least_height = off_plane(light.center + light.radius, place).astype(np.float32)
         if is_quad:
             self.quads = SphericalQuads(corners)
             self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
@@ -700,7 +703,7 @@ class View:
         normal = emitter.normal[:, leaf]
         falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
-        factor = is_seen & (falling > 0.0) & (height > 0.0) & (density > 0.0)
+        factor = is_seen & (falling > 0.0) & (height > self.least_height) & (density > 0.0)
         if emitter.is_round is not None:
             factor &= self._inside_round(leaf, corners, directions * np.where(factor, distance, _ZERO))
         factor = factor * emitter.brightness[leaf] / np.maximum(density, _TINY)
@@ -737,7 +740,7 @@ class View:
         x = unit_points(self.seeds, 0, 0, PROBES)[0]
         leaf, chances, _ = self._leaves(x, PROBES)
         corners = self.emitter.corners[:, :, leaf] + self.offset[:, None, None]
-        is_lit = (chances[0] > 0.0) & (dot(corners[:, 0], self.emitter.normal[:, leaf]) < 0.0)
+        is_lit = (chances[0] > 0.0) & (dot(corners[:, 0], self.emitter.normal[:, leaf]) < -self.least_height)
         corners, is_lit = corners.reshape(3, 4 * PROBES, len(self.index)), np.tile(is_lit, (4, 1))
         heights = np.minimum.reduce([dot(corners, normal[:, None, self.index]) for normal in horizons])
         return np.where(is_lit, heights, -_ONE), corners

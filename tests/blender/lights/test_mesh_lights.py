@@ -98,6 +98,18 @@ def test_lamps_do_not_stand_in_the_light_of_others(tmp_path):
     assert 1 < len(prepared[2].lights) < 1 + BALL
 
 
+def test_a_ball_of_thousands_of_faces_is_taken_as_it_is():
+    start()
+    add_lamp_ball(segments=66)
+    prepared = scene_parts.prepare()
+    lights = prepared[2].lights
+    assert len(lights) > 2000 and not any("'Lamp'" in line for line in prepared[3])
+    area = sum(np.linalg.norm(light.area_vector) for light in lights)
+    # Faces of 5 degrees: their area is 0.2 % smaller.
+    assert abs(area / (4.0 * np.pi * 0.3**2) - 1.0) < 5e-3
+    assert all(np.dot(light.center - (0.0, 1.0, 1.2), light.direction) > 0.29 for light in lights)
+
+
 def test_too_many_faces_are_refused_by_name(tmp_path, monkeypatch):
     monkeypatch.setattr(meshes, "MOST_POLYGONS", 10)
     start()

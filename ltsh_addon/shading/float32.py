@@ -35,6 +35,8 @@ SMALL_CHUNK = 6144
 # Pairs of samples and patches of a distant light at a time; and the share of small lights' size in that of patches that
 # are shaded by their centers: what is lost on one patch its neighbors gain.
 PAIR_CHUNK, PATCH_SHARE = 16384, 0.25
+# Points of lights with a profile at a time.
+POINT_CHUNK = 49152
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -197,8 +199,10 @@ class _Lighting:
             rest = columns
             if not light.is_profiled:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
-                if rest is not None and len(rest) == 0:
-                    continue
+            elif light_cone.ConeRegions.suit(light):
+                rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
+            if rest is not None and len(rest) == 0:
+                continue
             if light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners):
                 chosen = _both(allowed, rest)
                 needs_float64.append(index if chosen is None else index[chosen])
@@ -291,6 +295,34 @@ class _Lighting:
                 total[:, channel, part] += found * np.float32(light.radiance[channel])
         left = np.concatenate(left) if left else np.empty(0, np.intp)
         return None if columns is None and len(left) == count else left
+
+    def _add_points(self, lobes, light, position, among, total) -> np.ndarray:
+        """As `_add_small` for a light with a profile where few points of it suffice: the columns that are left."""
+        columns, allowed = among
+        columns = np.arange(position.shape[1]) if columns is None else columns
+        columns = columns if allowed is None else columns[allowed[columns]]
+        left = [columns[:0]]
+        for piece in moments32.pieces(len(columns), SMALL_CHUNK):
+            part = columns[piece]
+            offset = (light.center[:, None] - position[:, part]).astype(np.float32)
+            view = light_cone.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
+            regions = light_cone.ConeRegions(light, view, lobes.clip_rows)
+            for count, is_whole_cone, index in regions.rules():
+                if count == 0:
+                    left.append(part[index])
+                    continue
+                for some in moments32.pieces(len(index), POINT_CHUNK // (count * count)):
+                    chosen = index[some]
+                    s, t, weights = regions.points(count, is_whole_cone, chosen)
+                    found = lobes.at_point.integral(part[chosen], regions.coordinates(s, t, chosen), weights)
+                    found *= view.distance[chosen]
+                    if lobes.limits is not None:
+                        seen = offset[:, chosen]
+                        seen = SeenLight.of(light, seen, dot(seen, light.direction.astype(np.float32)))
+                        lobes.limits.apply(found, part[chosen], seen, self.scratch)
+                    for channel in range(3):
+                        total[:, channel, part[chosen]] += found * np.float32(light.radiance[channel])
+        return np.concatenate(left)
 
     def _seen(self, light, index, position) -> tuple[FacingDisk, np.ndarray | float]:
         """A light that faces the samples `index` as they see it from position (3, Q), and its `mean_emission`."""

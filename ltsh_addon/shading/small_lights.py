@@ -130,6 +130,23 @@ class CosineAtPoint:
         values /= rays.squares * rays.squares
         return values[None]
 
+    def integral(self, part, coordinates, weights):
+        """Sums (1, Q) over points with coordinates (C, S, T, Q) along the rows of the lobes `part` (Q,): of the lobe by
+        the cubed distance times weights that broadcast to (S, T, Q)."""
+        return _sum(self._at(coordinates), weights)[None]
+
+    @staticmethod
+    def _at(coordinates):
+        x, y, z = coordinates[:3]
+        squares = x * x
+        squares += y * y
+        squares += z * z
+        squares *= squares
+        values = np.maximum(z, np.float32(0.0))
+        values *= np.float32(1.0 / np.pi)
+        values /= squares
+        return values
+
 
 class ShadowedCosineAtPoint:
     """As `CosineAtPoint` times the bump shadowing of `SurfaceSamples`."""
@@ -142,6 +159,15 @@ class ShadowedCosineAtPoint:
         tangent2 = np.maximum(rays.squares / (along * along) - np.float32(1.0), np.float32(0.0))
         shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
         return self.plain(part, rays) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
+
+    def integral(self, part, coordinates, weights):
+        """As that of `CosineAtPoint`."""
+        x, y, z, along = coordinates[:4]
+        along = np.maximum(along, np.float32(1e-15))
+        tangent2 = np.maximum((x * x + y * y + z * z) / (along * along) - np.float32(1.0), np.float32(0.0))
+        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
+        values = self.plain._at(coordinates) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
+        return _sum(values, weights)[None]
 
 
 class LobeAtPoint:
@@ -172,6 +198,34 @@ class LobeAtPoint:
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         self.limits.apply_at_centers(values, part, rays)
         return values
+
+    def integral(self, part, coordinates, weights):
+        """As that of `CosineAtPoint`, (F, Q) and without limits."""
+        x, y, z = coordinates[:3]
+        inverse = x * x
+        inverse += y * y
+        inverse += z * z
+        np.sqrt(inverse, out=inverse)
+        np.divide(np.float32(1.0), inverse, out=inverse)
+        x, z = x * inverse, z * inverse
+        angle = inverse * inverse
+        angle *= inverse
+        angle *= weights
+        determinant = self.determinant[part]
+        cosine = _sum(z, angle) * (determinant * np.float32(1.0 / np.pi))
+        if self.is_cosine:
+            return self.terms[:, 0, part] * cosine
+        values = np.stack([_sum(polynomial(terms[:, part], x, z), angle) for terms in self.terms])
+        values *= determinant
+        np.maximum(values, np.float32(0.0), out=values)
+        np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
+        return values
+
+
+def _sum(values, weights):
+    """Sums (Q,) of values (S, T, Q) times weights that broadcast to them."""
+    values = values * weights
+    return values.reshape(-1, values.shape[-1]).sum(axis=0)
 
 
 def polynomial_terms(weights: np.ndarray) -> np.ndarray:

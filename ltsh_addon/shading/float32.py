@@ -36,7 +36,7 @@ SMALL_CHUNK = 6144
 # are shaded by their centers: what is lost on one patch its neighbors gain.
 PAIR_CHUNK, PATCH_SHARE = 16384, 0.25
 # Points of lights with a profile at a time.
-POINT_CHUNK = 49152
+POINT_CHUNK = 40960
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -307,13 +307,13 @@ class _Lighting:
             offset = (light.center[:, None] - position[:, part]).astype(np.float32)
             view = light_cone.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
             regions = light_cone.ConeRegions(light, view, lobes.clip_rows)
-            for count, is_whole_cone, index in regions.rules():
+            for count, kind, index in regions.rules():
                 if count == 0:
                     left.append(part[index])
                     continue
                 for some in moments32.pieces(len(index), POINT_CHUNK // (count * count)):
                     chosen = index[some]
-                    s, t, weights = regions.points(count, is_whole_cone, chosen)
+                    s, t, weights = regions.points(count, kind, chosen)
                     found = lobes.at_point.integral(part[chosen], regions.coordinates(s, t, chosen), weights)
                     found *= view.distance[chosen]
                     if lobes.limits is not None:

@@ -225,7 +225,7 @@ class LobeAtPoint:
 def _sum(values, weights):
     """Sums (Q,) of values (S, T, Q) times weights that broadcast to them."""
     values = values * weights
-    return values.reshape(-1, values.shape[-1]).sum(axis=0)
+    return values.reshape(values.shape[0] * values.shape[1], -1).sum(axis=0)
 
 
 def polynomial_terms(weights: np.ndarray) -> np.ndarray:

@@ -199,7 +199,9 @@ class _Lighting:
             rest = columns
             if not light.is_profiled:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
-            elif light_cone.ConeRegions.suit(light):
+            elif light_cone.ConeRegions.suit(light) and not isinstance(
+                lobes.at_point, small_lights.ShadowedCosineAtPoint
+            ):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
             if rest is not None and len(rest) == 0:
                 continue

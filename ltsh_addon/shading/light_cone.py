@@ -1,7 +1,7 @@
 """Lights with a spread or a falloff: integrals over the light times a profile.
 
-Exact lobes take integrals over parts of the light, `layers`; where few points of the light suffice, single precision
-takes those, `ConeRegions`, at a tenth to a hundredth of the cost.
+Double precision takes integrals over parts of the light, `layers`. Single precision takes points of the light where few
+of them suffice, `ConeRegions`, at a tenth to a hundredth of the cost.
 
 With the distance d of the point from the light's plane and r the distance in that plane from the foot of the point,
 the factors of `AreaLight` are a profile p(r): that of the spread is (R - r)+ / (d (tan h - h)), R = d tan h and h half
@@ -341,18 +341,21 @@ def _cross(a, b):
 
 
 # Rules with points on chords of a light; of cones that lie in it, with points on rays; and with points that are dense
-# where the lobe peaks. Each is within 0.3 % but for 1 in 100 places, most of them at faint edges.
-EVEN, WHOLE_CONE, GRADED = range(3)
+# where the lobe peaks; SPLIT is EVEN with the chords on either side of the foot apart. Each is within 0.3 % but for 1
+# in 100 places, most of them at faint edges.
+EVEN, SPLIT, WHOLE_CONE, GRADED = range(4)
 # Points per axis by the size of what is seen, in units of its distance, in the coordinates in which lobes are a radian
 # wide; then of GRADED by half the range of arsinh(place by width of the peak). The layers do what has 0 of them.
 SIZES = (0.2, 0.4, 0.6)
 POINTS, ROUND_POINTS = np.array([3, 4, 6, 0]), np.array([5, 6, 8, 0])
 RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 GRADED_POINTS, ROUND_GRADED_POINTS = np.array([8, 8, 12, 14, 14, 20, 0]), np.array([10, 12, 14, 20, 0, 0, 0])
-# Where the foot is in what is seen, or closer than its size, the tip of the profile needs these, by the size in units
-# of the cone's radius.
+# Where the foot is in what is seen, or closer than its size, the tip of the profile needs these, even numbers, by the
+# size in units of the cone's radius.
 TIP_SIZES = (0.15, 0.5)
-TIP_POINTS, ROUND_TIP_POINTS = np.array([0, 6, 10]), np.array([0, 8, 12])
+TIP_POINTS, ROUND_TIP_POINTS = np.array([0, 6, 10]), np.array([0, 8, 16])
+# The longer side of a light by the other.
+LONG = 2.0
 # Of WHOLE_CONE there are this many radii, and twice as many angles.
 RADII = np.array([3, 4, 5])
 
@@ -367,6 +370,7 @@ class ConeRegions:
     def __init__(self, light, view: LightView, horizons):
         """horizons: the coordinates that are positive above them."""
         self.view, self.profile, self.is_round, self.horizons = view, Profile.of(light), light.is_round, horizons
+        self.is_long = max(view.extent) > LONG * min(view.extent)
         dtype = view.distance.dtype.type
         self.reach = np.minimum(dtype(self.profile.tangent) * view.distance, dtype(_WIDE_OPEN))
         e, f = self.turn = self._turns(dtype)
@@ -377,22 +381,27 @@ class ConeRegions:
 
     @staticmethod
     def suit(light) -> bool:
-        """Whether the light is a rectangle or an ellipse in a place."""
+        """Whether the light is a rectangle, or an ellipse that is not long, in a place."""
         u, v = light.half_u, light.half_v
         is_sheared = abs(u @ v) > 1e-6 * np.linalg.norm(u) * np.linalg.norm(v)
-        return light.shape in AREA_LIGHT_SHAPES and not (is_sheared or light.is_distant)
+        is_long = (np.linalg.norm(u) / np.linalg.norm(v) - LONG) * (np.linalg.norm(v) / np.linalg.norm(u) - LONG) < 0.0
+        is_fit = not (is_sheared or light.is_distant or (is_long and light.is_round))
+        return is_fit and light.shape in AREA_LIGHT_SHAPES
 
     def _turns(self, dtype):
-        """Unit vectors (2, P) along s: of a round light away from the foot, so that the cone's chords are symmetric; of
-        others along the side that horizons cut less."""
+        """Unit vectors (2, P) along s: along the longer side, or where there is none of a round light away from the
+        foot, so that the cone's chords are symmetric, of others along the side that horizons cut less."""
         view = self.view
+        u, v = view.extent
+        if self.is_long:
+            across = np.full(len(view.distance), v > u)
+            return np.stack([~across, across]).astype(dtype)
         if self.is_round:
             length = np.sqrt(_dot(view.center, view.center))
             is_off = length > 0.0
             turn = view.center / np.where(is_off, length, dtype(1.0))
             turn[0] += ~is_off
             return turn
-        u, v = view.extent
         row = self.horizons[0]
         across = np.abs(view.axis_u[row]) * dtype(u) > np.abs(view.axis_v[row]) * dtype(v)
         return np.stack([~across, across]).astype(dtype)
@@ -409,8 +418,10 @@ class ConeRegions:
         reach_s, reach_t = (np.sqrt(np.maximum((reach - off) * (reach + off), 0.0)) for off in (off_t, off_s))
         low, high = np.maximum(s - half_s, -reach_s), np.minimum(s + half_s, reach_s)
         self.lowest, self.highest = np.maximum(t - half_t, -reach_t), np.minimum(t + half_t, reach_t)
-        self.is_whole_cone = np.abs(s) + reach < half_s
-        self.is_whole_cone &= s + reach < min(u, v) if self.is_round else np.abs(t) + reach < half_t
+        if self.is_round:
+            self.is_whole_cone = np.sqrt(s * s + t * t) + reach < min(u, v)
+        else:
+            self.is_whole_cone = (np.abs(s) + reach < half_s) & (np.abs(t) + reach < half_t)
         for row in self.horizons:
             along, across = self.along_s[row], self.along_t[row]
             best = self.view.foot[row] + np.maximum(across * self.lowest, across * self.highest)
@@ -446,10 +457,14 @@ class ConeRegions:
         near = (np.abs(middle_s) < half_s + extent) & (np.abs(middle_t) < half_t + extent)
         tip = np.searchsorted(TIP_SIZES, np.where(near, extent / reach, 0.0))
         tip = (ROUND_TIP_POINTS if self.is_round else TIP_POINTS)[tip]
+        if self.is_long:
+            tip = np.where(tip > 0, ROUND_TIP_POINTS[-1], 0)
         number = np.where(number > 0, np.maximum(number, tip), 0)
+        if self.is_long or not self.is_round:
+            kind[(tip >= TIP_POINTS[-1]) & (kind == EVEN)] = SPLIT
         number[whole] = RADII[level[whole]]
-        for key in np.unique(3 * number + kind):
-            yield int(key // 3), int(key % 3), seen[3 * number + kind == key]
+        for key in np.unique(4 * number + kind):
+            yield int(key // 4), int(key % 4), seen[4 * number + kind == key]
 
     def _axes(self, index):
         """Of the points `index` (Q,), `foot`, `along_s` and `along_t` (3, Q) in the coordinates of their lobes."""
@@ -477,13 +492,22 @@ class ConeRegions:
             cosine, sine = (values.astype(dtype)[:, None] for values in (np.cos(angles), np.sin(angles)))
             return radius[:, None] * cosine, radius[:, None] * sine, weights[:, None]
         weights_s, places = weights, nodes
+        if kind == SPLIT:
+            places, weights_s = (values.astype(dtype)[:, None] for values in gauss_legendre(count // 2))
         if self.is_round:
             # Chords grow from 0 as a root; so they grow as a line.
-            places, weights_s = 0.5 * nodes * (3.0 - nodes * nodes), weights * (1.5 - 1.5 * nodes * nodes)
+            places, weights_s = 0.5 * places * (3.0 - places * places), weights_s * (1.5 - 1.5 * places * places)
         low, high = self.low[index], self.high[index]
         axes = self._axes(index)
-        s, stretch = _spaced(places, low, high, _nearest_line(*axes) if kind == GRADED else None)
-        weights_s = weights_s * stretch
+        if kind == SPLIT:
+            middle = np.clip(dtype.type(0.0), low, high)
+            sides = (_spaced(places, *ends, None) for ends in ((low, middle), (middle, high)))
+            s, weights_s = (
+                np.concatenate(values) for values in zip(*((at, weights_s * by) for at, by in sides), strict=True)
+            )
+        else:
+            s, stretch = _spaced(places, low, high, _nearest_line(*axes) if kind == GRADED else None)
+            weights_s = weights_s * stretch
         low, high = self._chords(s, index)
         pole = None
         if kind == GRADED:

@@ -160,15 +160,6 @@ class ShadowedCosineAtPoint:
         shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
         return self.plain(part, rays) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
 
-    def integral(self, part, coordinates, weights):
-        """As that of `CosineAtPoint`."""
-        x, y, z, along = coordinates[:4]
-        along = np.maximum(along, np.float32(1e-15))
-        tangent2 = np.maximum((x * x + y * y + z * z) / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
-        values = self.plain._at(coordinates) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
-        return _sum(values, weights)[None]
-
 
 class LobeAtPoint:
     """Integrals (F, ...) of lobes over small lights, with the weights (F, K, ...) of a `moments32.RidgeTable`."""

@@ -98,6 +98,27 @@ def test_lights_with_a_spread_match_patches(degrees, shape, name):
 
 
 @pytest.mark.parametrize("shape", ["RECTANGLE", "DISK"])
+@pytest.mark.parametrize("degrees", [15.0, 60.0, 120.0])
+def test_few_points_of_a_light_are_as_good_as_many(shape, degrees, monkeypatch):
+    """Of all places 99 in 100 within 0.3 %, or of a hundredth of the largest value, and 0.2 % in L2."""
+    samples = random_samples(150, seed=8, lowest_roughness=0.15)
+    options = {"shape": shape, "spread": np.radians(degrees), "radiance": (1, 1, 1)}
+    lights = [area_light(center=(x, 0.4, 1.5), **options) for x in (0, 1)]
+    few = shading.shade(samples, lights, "ltsh4", workers=1)
+
+    def all_dense(regions):
+        yield 60, light_cone.GRADED, np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
+
+    monkeypatch.setattr(light_cone.ConeRegions, "rules", all_dense)
+    many = shading.shade(samples, lights, "ltsh4", workers=1)
+    for part in shading.PASSES:
+        found, expected = getattr(few, part)[0, :, 0], getattr(many, part)[0, :, 0]
+        error = np.abs(found - expected)
+        assert np.linalg.norm(error) < 2e-3 * np.linalg.norm(expected) and expected.max() > 0.0, part
+        assert np.quantile(error / np.maximum(expected, 0.01 * expected.max()), 0.99) < CLOSED, part
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "DISK"])
 @pytest.mark.parametrize("degrees", [3.0, 45.0, 90.0])
 def test_the_spread_keeps_the_flux(degrees, shape):
     """A floor below the light receives pi times area times radiance, whatever the spread."""
@@ -122,7 +143,7 @@ def repeated(sample, position):
 @pytest.mark.parametrize("degrees", [2.0, 100.0])
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_single_precision_keeps_its_promise(name, degrees):
-    """Horizons, bump maps and all Fresnel terms; the promise is per unit of the radiance straight ahead."""
+    """Horizons, bump maps and all Fresnel terms; the promise is per unit of the radiance straight ahead, and 0.3 %."""
     samples, lights = all_kinds_of_samples(40, seed=5), focused_lights(degrees)
     single = shading.shade(samples, lights, name, workers=1)
     double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
@@ -130,7 +151,7 @@ def test_single_precision_keeps_its_promise(name, degrees):
     for part in shading.PASSES:
         found, expected = getattr(single, part), getattr(double, part)
         assert np.isfinite(found).all() and (found >= 0.0).all() and expected.max() > 0.0
-        assert np.abs(found - expected).max() < limit, part
+        assert (np.abs(found - expected) < limit + CLOSED * expected).all(), part
 
 
 @techniques

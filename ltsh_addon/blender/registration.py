@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import bpy
 
-from ..cli.output import reserve_stdout
+from ..cli.progress import reserve_stdout
 
 # Modules of this package with register() and unregister(), in the order in which they need each other.
 PARTS = (

@@ -22,8 +22,7 @@ from ..shading import TableError
 from .arguments import Misuse
 from .commands import add_bake, add_compare, add_demo, add_merge, add_relight, add_run, add_shade, add_tables, add_view
 from .job_file import Mistakes
-from .output import print_json
-from .progress import ProgressBar, RunLog, print_out
+from .progress import ProgressBar, RunLog, print_json, print_out
 
 EXAMPLES = """examples:
   %(prog)s demo -o out/demo

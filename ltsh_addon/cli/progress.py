@@ -1,8 +1,9 @@
-"""What the command line says meanwhile: a bar, lines of a log."""
+"""What the command line says: a bar and lines of a log meanwhile, documents on stdout."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
 import time
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 
+from ..imaging.report import json_text
 from ..scene import shortened
 
 
@@ -201,10 +203,25 @@ def print_out(text: str) -> None:
         raise OSError(f"stdout: cannot be written ({error.strerror})") from error
 
 
+def print_json(document) -> None:
+    """One document on stdout, in ASCII: a redirected stdout may lack the letters of a light's name."""
+    print_out(json.dumps(json.loads(json_text(document)), indent=2))
+
+
 def _in_letters_of(stream, text: str) -> str:
     """Letters that the encoding of the stream lacks are spelled out."""
     encoding = stream.encoding or "ascii"
     return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def reserve_stdout() -> None:
+    """Keep stdout for what sys.stdout prints: from now on, Blender's own lines (from C) go to stderr."""
+    if sys.stdout is None:
+        return
+    sys.stdout.flush()
+    ours = os.dup(1)
+    os.dup2(2, 1)
+    sys.stdout = open(ours, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, buffering=1)
 
 
 REPORT_SECONDS = 0.1

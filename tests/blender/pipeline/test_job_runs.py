@@ -213,7 +213,7 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path, own_blender):
 
 def test_json_is_alone_on_stdout_whatever_blender_prints():
     code = (
-        "import os, sys\nfrom ltsh_addon.cli.output import reserve_stdout\n"
+        "import os, sys\nfrom ltsh_addon.cli.progress import reserve_stdout\n"
         "print('before', flush=True)\nreserve_stdout()\n"
         "os.write(1, b'from C\\n')\nprint('{}')\nos.write(1, b'at the end\\n')\n"
     )

@@ -43,6 +43,8 @@ class ExtractOptions:
 
 # Materials, or other reasons, that an error names.
 REASONS = 5
+# Smoother surfaces show the patches of a world.
+SHARP_REFLECTION = 0.2
 # Fields of `Extraction` that are those of the manifest.
 UNCHANGED = ("blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter")
 
@@ -99,6 +101,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         warnings += gbuffer.rounded_positions(samples.position, lights)
         if not problems:
             warnings += unlit(samples, lights, manifest["camera"])
+            warnings += faceted(samples, lights)
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
@@ -176,6 +179,18 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
     if unseen and len(unseen) == len({light.name for light in lights}):
         return [f"no light reaches what camera {camera!r} sees: the picture is black; turn or move a light"]
     return [f"nothing that camera {camera!r} sees is lit by {listed(map(repr, unseen))}"] if unseen else []
+
+
+def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
+    """The warning about reflections so sharp that they show the patches of a world."""
+    skies = [light for light in lights if light.is_distant and light.detail and light.affects_specular]
+    sharp = has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
+    if not skies or not sharp.any():
+        return []
+    return [
+        f"world {skies[0].name!r}: its patches show as facets of a degree or more in reflections sharper than "
+        f"roughness {SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have"
+    ]
 
 
 def _read_emission(manifest: dict, folder: Path) -> np.ndarray:

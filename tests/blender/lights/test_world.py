@@ -1,11 +1,14 @@
 """The light of the world is that of Cycles: worlds of all kinds on a ball above a plane."""
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
 import quadrature
 import scene_parts
 
+from ltsh_addon.blender.process import client
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 from ltsh_addon.scene import PASSES
 from ltsh_addon.shading import shade
@@ -164,6 +167,18 @@ def test_a_world_beyond_all_measure_is_named():
     _, _, inventory, warnings = scene_parts.prepare()
     assert [light.name for light in inventory.lights] == ["Key"]
     assert any("world 'Sky'" in line and "not finite" in line for line in warnings), warnings
+
+
+def test_reflections_that_show_the_patches_of_a_world_are_named(tmp_path):
+    start()
+    picture("EQUIRECTANGULAR")
+    prepared = scene_parts.prepare()
+    ((surface, _, _),) = scene_parts.sample(tmp_path, prepared)[0]
+    assert client.faceted(surface, prepared[2].lights) == []
+    sharp = replace(surface, roughness=np.where(np.arange(len(surface)) % 4 == 0, 0.1, surface.roughness))
+    (line,) = client.faceted(sharp, prepared[2].lights)
+    assert "'World'" in line and "25 % of the samples" in line
+    assert client.faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
 
 
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])

@@ -24,8 +24,9 @@ ROUND_CORNERS = (32, 64, 128, 256)
 ROUND_LIMITS = (8.0, 40.0, 300.0)
 FOCUSED_ROUND_CORNERS = (32, 64)
 # By coordinates, how far rounding takes points from the plane that they are in, some of them in front of it: a flat
-# surface that shines must not light itself.
-ROUNDING = 4e-7
+# surface that shines must not light itself. Those of scenes beyond that, in m, were rounded nearer to the origin (see
+# `blender.extract.origin`).
+ROUNDING, FARTHEST_ROUNDED = 4e-7, 4000.0
 # The product of the contrast of a patch (see `_largest_size`) and the square of its size by that length is at most
 # this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
 # sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
@@ -191,7 +192,8 @@ def in_front(samples, light, candidates):
 
 def off_plane(center, position) -> np.ndarray:
     """How far in front of a light, in m, points (3, Q) are that surely see it; its center is (3,) or (3, Q)."""
-    return ROUNDING * (np.abs(center).sum(axis=0) + np.abs(position).sum(axis=0))
+    coordinates = np.abs(center).sum(axis=0) + np.abs(position).sum(axis=0)
+    return ROUNDING * np.minimum(coordinates, FARTHEST_ROUNDED)
 
 
 def may_reach(light, position) -> np.ndarray:

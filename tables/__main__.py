@@ -16,7 +16,7 @@ import numpy as np
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
 from . import families, fit, optimum, validate
-from .brdfs import BRDFS
+from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
 

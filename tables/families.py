@@ -1,14 +1,16 @@
-"""The original distributions that can be fitted: what a warp is applied to."""
+"""What is fitted to what: BRDFs with their quadrature, and the families of original distributions under a warp."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.special import erf
 
-from ltsh_addon.shading import spherical_harmonics
+from ltsh_addon.shading import brdf, spherical_harmonics
 
 
 @dataclass(frozen=True)
@@ -101,3 +103,99 @@ def family_named(name: str) -> Family:
     if match is None:
         raise ValueError(f"table {name!r} is unknown, expected ltc, or ltsh, ridges, zonal or odd with a degree 1..8")
     return makers[match[1]](int(match[2]))
+
+
+def polar_samples(cos_theta_o, alpha, radial: int = 28, angular: int = 28):
+    """Directions (P, S, 3) with y > 0 and weights (P, S) for cos_theta_o (P,) and alpha (P,).
+
+    The weighted sum of a function that is even in y is its integral over the upper hemisphere. The plane x = 0 cuts it
+    in two; each half has polar coordinates of its own, around the mirror direction and around the view direction: at
+    grazing angles a warped lobe can wrap around, and what it then does near the horizon under the view must be seen.
+    The angle r to the pole crowds there like sinh on the scale of the lobe. Every ray ends at the horizon or at the
+    plane between the halves, on either side of azimuth 90 degrees, so that the integrand is smooth on it.
+    The half of the view direction has a third of the S points, about radial * angular * 3 / 2.
+    """
+    mirror = _half(cos_theta_o, alpha, radial, angular // 2)
+    view = _half(cos_theta_o, alpha, (2 * radial + 2) // 3, (3 * angular + 4) // 8)
+    view[0][..., 0] *= -1.0
+    return tuple(np.concatenate(parts, axis=1) for parts in zip(mirror, view, strict=True))
+
+
+def _half(cos_theta_o, alpha, radial, angular):
+    """Points of the half x < 0: `radial` on each ray, `angular` rays toward x = 0 and as many toward the horizon."""
+    sin_o = np.sqrt(1.0 - cos_theta_o**2)
+    zero = np.zeros_like(sin_o)
+    axis = np.stack([-sin_o, zero, cos_theta_o], axis=-1)[:, None, None]
+    up = np.stack([cos_theta_o, zero, sin_o], axis=-1)[:, None, None]
+    quarter, quarter_weights = gauss_legendre(angular, 0.5 * np.pi)
+    azimuth = np.concatenate([quarter, np.pi - quarter])
+    azimuth_weights = np.concatenate([quarter_weights, quarter_weights])
+    cosine, mu, sine = np.abs(np.cos(azimuth)), cos_theta_o[:, None], sin_o[:, None]
+    reach = np.where(azimuth < 0.5 * np.pi, np.arctan2(sine, cosine * mu), np.arctan2(mu, cosine * sine))
+    nodes, weights = gauss_legendre(radial, 1.0)
+    scale = (0.3 * alpha)[:, None, None]
+    stretch = np.arcsinh(reach[..., None] / scale)
+    r = scale * np.sinh(stretch * nodes)
+    measure = 2.0 * np.sin(r) * scale * np.cosh(stretch * nodes) * stretch * weights * azimuth_weights[:, None]
+    side = np.cos(azimuth)[:, None, None] * up + np.sin(azimuth)[:, None, None] * np.array([0.0, 1.0, 0.0])
+    directions = np.cos(r)[..., None] * axis + np.sin(r)[..., None] * side
+    count = len(alpha)
+    return directions.reshape(count, -1, 3), measure.reshape(count, -1)
+
+
+def gauss_legendre(count: int, length: float = 1.0):
+    """Nodes and weights (count,) of the Gauss-Legendre rule on [0, length]."""
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 * length * (nodes + 1.0), 0.5 * length * weights
+
+
+@dataclass(frozen=True)
+class Brdf:
+    """An isotropic reflection lobe of one parameter, alpha = roughness^2, with F = 1."""
+
+    name: str
+    description: str
+    # BRDF times cosine: cos_theta_o (P,), alpha (P,), unit directions (P, S, 3) -> (P, S) in sr^-1
+    value: Callable
+    # cos_theta_o (P,), alpha (P,), counts -> directions (P, S, 3) with y > 0, weights (P, S): `hemisphere_quadrature`
+    samples: Callable
+    # GGX times cosine becomes a warped clamped cosine as alpha -> 0: A = B = C = 1 is then the known limit.
+    cosine_limit: bool = False
+
+
+def beckmann_cosine(cos_theta_o, alpha, directions):
+    """Beckmann BRDF times cosine with F = 1, height-correlated Smith masking-shadowing; as `brdf.ggx_brdf_cosine`.
+
+    Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces", eq. 25; the masking is Heitz 2014,
+    "Understanding the Masking-Shadowing Function", eq. 72 and 99, with the error function instead of its rational fit.
+    """
+    mu_o, alpha = np.asarray(cos_theta_o)[..., None], np.asarray(alpha)[..., None]
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    half_x, half_z = x + np.sqrt(np.maximum(1.0 - mu_o * mu_o, 0.0)), z + mu_o
+    horizontal, vertical = half_x * half_x + y * y, np.maximum(half_z * half_z, 1e-300)
+    slope = horizontal / (vertical * alpha * alpha)
+    distribution = np.exp(-slope) * ((horizontal + vertical) / (vertical * alpha)) ** 2 / np.pi
+    mu_i = np.maximum(z, 1e-12)
+    masking = 1.0 / (1.0 + _beckmann_lambda(mu_i, alpha) + _beckmann_lambda(mu_o, alpha))
+    return np.where(z > 0.0, distribution * masking / (4.0 * np.maximum(mu_o, 1e-12)), 0.0)
+
+
+def _beckmann_lambda(mu, alpha):
+    slope = mu / (alpha * np.sqrt(np.maximum(1.0 - mu * mu, 1e-30)))
+    return 0.5 * (erf(slope) - 1.0) + np.exp(-slope * slope) / (2.0 * np.sqrt(np.pi) * slope)
+
+
+GGX = Brdf(
+    "ggx",
+    "GGX, height-correlated Smith masking-shadowing, alpha = roughness^2, times cosine",
+    brdf.ggx_brdf_cosine,
+    polar_samples,
+    cosine_limit=True,
+)
+BECKMANN = Brdf(
+    "beckmann",
+    "Beckmann, height-correlated Smith masking-shadowing, alpha = roughness^2, times cosine",
+    beckmann_cosine,
+    polar_samples,
+)
+BRDFS = {model.name: model for model in (GGX, BECKMANN)}

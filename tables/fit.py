@@ -14,8 +14,7 @@ from ltsh_addon.files import replacing
 from ltsh_addon.shading.lookup_table import FORMAT_VERSION, roughness_nodes, theta_nodes, warp_entries
 
 from . import projection, refine, walk
-from .brdfs import GGX, Brdf
-from .families import Family
+from .families import GGX, Brdf, Family
 from .projection import (
     CURVE_NAMES,
     FLAT,

@@ -19,8 +19,7 @@ from ltsh_addon.shading import brdf, evaluate_lobe
 from ltsh_addon.shading.edge_integrals import ridge_matrix
 from ltsh_addon.shading.lookup_table import LookupTable
 
-from .brdfs import GGX
-from .families import family_named
+from .families import GGX, family_named
 from .projection import FLAT, Points, project, relative_error, warped_basis
 from .validate import disks, grid, hemisphere_samples
 from .walk import HIGHEST, LOWEST, minimize, warp_of

@@ -15,7 +15,7 @@ import numpy as np
 from ltsh_addon.shading import brdf, evaluate_lobe, header, spherical_harmonics
 from ltsh_addon.shading.lookup_table import LookupTable
 
-from .brdfs import gauss_legendre
+from .families import gauss_legendre
 
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
 # Disk-shaped lights of the light error: as many directions, and the radii in degrees that they take in turn.

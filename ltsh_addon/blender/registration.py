@@ -20,7 +20,6 @@ PARTS = (
     "ui.operators",
     "ui.preflight",
     "ui.view_operators",
-    "ui.overview",
     "ui.comparison",
     "ui.panels",
 )

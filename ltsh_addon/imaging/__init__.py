@@ -5,16 +5,15 @@ scene-referred linear RGB, Rec.709 where a function says nothing else, unless a 
 reference, red too bright, blue too dark.
 """
 
-from .color import chromaticities, exposure_factor, signed_error_colors, to_srgb8
+from .color import chromaticities, exposure_factor, signed_error_colors, to_srgb8, write_png
 from .exr import Layer, read_channels, read_layers, write_layers
-from .flip import mean_flip
 from .metrics import (
     ErrorStatistics,
     error_statistics,
+    mean_flip,
     noisy_error_statistics,
     reference_noise,
     unbiased_relative_error,
 )
-from .png import write_png
 from .report import write_html, write_json, write_overview
 from .sheet import Tile, comparison_sheet

@@ -1,7 +1,12 @@
-"""Error figures of an image against a reference: noise-free, or known as two independent noisy halves.
+"""Error figures of an image against a reference: noise-free, or known as two independent noisy halves; FLIP.
 
 Radiance arrays are (..., 3); a `mask` (...) picks pixels. Sums run over all picked pixels and the three channels;
 nothing is trimmed. NaN and Inf of the technique are counted and left out of every sum.
+
+FLIP tells how different two pictures look to somebody who alternates between them (0: not at all, 1: completely).
+Andersson, Nilsson, Akenine-Moeller, Oskarsson, Aastroem and Fairchild, "FLIP: A Difference Evaluator for Alternating
+Images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020, DOI 10.1145/3406183; equation numbers are theirs. The
+low-dynamic-range version, for which radiance is brought to display values by one exposure for both pictures.
 """
 
 from __future__ import annotations
@@ -10,7 +15,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from .color import luminance
+from .color import exposure_factor, luminance
 
 # Relative errors of single pixels are taken where the reference's luminance is above this share of its maximum.
 LIT_SHARE = 1e-4
@@ -112,3 +117,148 @@ def _picked(values, mask):
 def _where_finite(technique, *others):
     finite = np.isfinite(technique).all(axis=1)
     return technique[finite], *(values[finite] for values in others)
+
+
+# A monitor 0.7 m wide with 3840 pixels, seen from 0.7 m: the paper's own choice.
+PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180.0
+# Contrast sensitivity of the achromatic and the two opponent channels as sums of Gaussians: (a, b) each, Table 1.
+_SENSITIVITY = (((1.0, 0.0047),), ((1.0, 0.0053),), ((34.1, 0.04), (13.5, 0.025)))
+_WIDEST = 0.04
+_FEATURE_WIDTH = 0.082  # degrees
+_COLOR_EXPONENT, _FEATURE_EXPONENT = 0.7, 0.5
+_BEND, _BENT = 0.4, 0.95  # p_c and p_t: errors up to _BEND of the largest take _BENT of the range
+_HUNT = 0.01
+_COLUMNS = 64
+
+_TO_XYZ = np.array(
+    [
+        [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
+        [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
+        [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
+    ]
+)  # linear sRGB, D65
+_TO_RATIO = (_TO_XYZ / _TO_XYZ.sum(axis=1)[:, None]).T  # to XYZ as shares of those of white
+
+
+def flip(reference: np.ndarray, test: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
+    """FLIP (H, W) of two pictures (H, W, 3) in linear sRGB, clipped to [0, 1].
+
+    Within 1e-5 of the authors' own program. Raises ValueError for pictures of different or wrong shape.
+    """
+    reference, test = (np.clip(np.asarray(image, dtype=np.float32), 0.0, 1.0) for image in (reference, test))
+    if reference.shape != test.shape or reference.ndim != 3 or reference.shape[2] != 3:
+        raise ValueError(f"pictures of shape {reference.shape} and {test.shape}, expected both (height, width, 3)")
+    # In these filters for contrast sensitivity are linear.
+    opponents = [_opponents(image @ _TO_RATIO.astype(np.float32)) for image in (reference, test)]
+    color = _color_difference(*(_filtered(image, pixels_per_degree) for image in opponents))
+    lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponents]
+    feature = _feature_difference(*lightness, pixels_per_degree)
+    return color ** (1.0 - feature)  # (1)
+
+
+def mean_flip(reference: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float | None:
+    """Mean FLIP of two radiance pictures (H, W, 3) over the pixels of `mask`, exposed so that the 99th percentile of
+    the reference is nearly white; None without pixels. What is not finite counts as black."""
+    factor = exposure_factor(reference)
+    shown = [factor * np.where(np.isfinite(image), image, 0.0) for image in (reference, test)]
+    values = flip(*shown)
+    values = values if mask is None else values[mask]
+    return float(values.mean(dtype=np.float64)) if values.size else None
+
+
+def _opponents(ratio: np.ndarray) -> np.ndarray:
+    """Y Cx Cz of shares of the white's XYZ; CIELAB where these were bent before."""
+    x, y, z = np.moveaxis(ratio, -1, 0)
+    return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
+
+
+def _linear_of_opponents(opponents: np.ndarray) -> np.ndarray:
+    y = (opponents[..., 0] + 16.0) / 116.0
+    ratio = np.stack([opponents[..., 1] / 500.0 + y, y, y - opponents[..., 2] / 200.0], axis=-1)
+    return ratio @ np.linalg.inv(_TO_RATIO).astype(np.float32)
+
+
+def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+    """What of a picture the eye resolves (Section 4.1): CIELAB with the Hunt effect."""
+    radius = int(np.ceil(3.0 * np.sqrt(_WIDEST / (2.0 * np.pi**2)) * pixels_per_degree))
+    distance = np.arange(-radius, radius + 1) / pixels_per_degree
+    planes = []
+    for channel, terms in enumerate(_SENSITIVITY):
+        kernels = [np.exp(-(np.pi**2) * distance**2 / b) for _, b in terms]
+        weights = np.array([a * np.sqrt(np.pi / b) for a, b in terms])
+        total = sum(weight * kernel.sum() ** 2 for weight, kernel in zip(weights, kernels, strict=True))
+        parts = (
+            float(weight / total) * _convolved(opponent[..., channel], kernel, kernel)
+            for weight, kernel in zip(weights, kernels, strict=True)
+        )
+        planes.append(sum(parts))
+    linear = np.clip(_linear_of_opponents(np.stack(planes, axis=-1)), 0.0, 1.0)
+    return _hunt(_lab(linear))
+
+
+def _lab(linear: np.ndarray) -> np.ndarray:
+    """CIELAB of linear sRGB, white point D65 (CIE 15)."""
+    ratio = linear @ _TO_RATIO.astype(np.float32)
+    delta = 6.0 / 29.0
+    return _opponents(np.where(ratio > delta**3, np.cbrt(ratio), ratio / (3.0 * delta**2) + 4.0 / 29.0))
+
+
+def _hunt(lab: np.ndarray) -> np.ndarray:
+    """Colors seem stronger where it is bright (4)."""
+    return np.concatenate([lab[..., :1], _HUNT * lab[..., :1] * lab[..., 1:]], axis=-1)
+
+
+def _hyab(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Distance of large color differences (5): city block in lightness, Euclidean in chroma."""
+    difference = first - second
+    return np.abs(difference[..., 0]) + np.hypot(difference[..., 1], difference[..., 2])
+
+
+def _color_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Color error in [0, 1]: small differences take most of the range (7)."""
+    green, blue = (_hunt(_lab(np.array(color, dtype=np.float64))) for color in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]))
+    largest = float(_hyab(green, blue)) ** _COLOR_EXPONENT
+    error = _hyab(first, second) ** _COLOR_EXPONENT
+    bend = _BEND * largest
+    above = _BENT + (error - bend) / (largest - bend) * (1.0 - _BENT)
+    return np.where(error < bend, _BENT / bend * error, above)
+
+
+def _feature_difference(first: np.ndarray, second: np.ndarray, pixels_per_degree: float) -> np.ndarray:
+    """How much edges and points differ (Section 4.2), in [0, 1]."""
+    deviation = 0.5 * _FEATURE_WIDTH * pixels_per_degree
+    radius = int(np.ceil(3.0 * deviation))
+    x = np.arange(-radius, radius + 1, dtype=np.float64)
+    smooth = np.exp(-(x**2) / (2.0 * deviation**2))
+    edge, point = -x * smooth, (x**2 / deviation**2 - 1.0) * smooth
+    largest = 0.0
+    for kernel in (edge, point):
+        strengths = [_feature_strength(image, kernel, smooth) for image in (first, second)]
+        largest = np.maximum(largest, np.abs(strengths[0] - strengths[1]))
+    return (largest / np.sqrt(2.0)) ** _FEATURE_EXPONENT  # (10)
+
+
+def _feature_strength(image: np.ndarray, kernel: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Length of the filter's answers along both axes; positive and negative weights of the filter sum to 1 each."""
+    smooth = smooth / smooth.sum()
+    kernel = np.where(kernel > 0.0, kernel / kernel[kernel > 0.0].sum(), -kernel / kernel[kernel < 0.0].sum())
+    return np.hypot(_convolved(image, kernel, smooth), _convolved(image, smooth, kernel))
+
+
+def _convolved(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
+    """`image` (H, W) with two odd kernels, its borders continued."""
+    return _convolved_rows(np.ascontiguousarray(_convolved_rows(np.ascontiguousarray(image.T), along_x).T), along_y)
+
+
+def _convolved_rows(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """Along the first axis."""
+    radius = len(kernel) // 2
+    padded = np.pad(image, ((radius, radius), (0, 0)), mode="edge")
+    result = np.zeros(image.shape, dtype=image.dtype)
+    weights = kernel.astype(image.dtype)
+    for start in range(0, image.shape[1], _COLUMNS):  # what is added up stays in the cache
+        columns = slice(start, start + _COLUMNS)
+        part = np.empty_like(result[:, columns])
+        for offset, weight in enumerate(weights):
+            result[:, columns] += np.multiply(padded[offset : offset + len(image), columns], weight, out=part)
+    return result

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ltsh_addon.imaging.flip import PIXELS_PER_DEGREE, flip, mean_flip
+from ltsh_addon.imaging.metrics import PIXELS_PER_DEGREE, flip, mean_flip
 
 
 def pictures(seed, kind="noise", shape=(40, 56)):

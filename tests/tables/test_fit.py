@@ -8,8 +8,7 @@ import pytest
 from ltsh_addon.shading import brdf, load_table, spherical_harmonics
 from ltsh_addon.shading.lookup_table import roughness_nodes, theta_nodes
 from tables import fit, refine, walk
-from tables.brdfs import BECKMANN, GGX, polar_samples
-from tables.families import family_named
+from tables.families import BECKMANN, GGX, family_named, polar_samples
 from tables.projection import FLAT, Cells, Points, project, relative_error, warped_basis
 from tables.validate import hemisphere_samples, validate
 

@@ -9,8 +9,7 @@ import pytest
 
 from ltsh_addon.shading import SHIPPED_TABLES, evaluate_lobe, integrate_polygon, load_table
 from tables import __main__, optimum
-from tables.brdfs import GGX
-from tables.families import family_named
+from tables.families import GGX, family_named
 from tables.fit import settings
 from tables.validate import _measure, fresnel_basis_error, validate, validate_corners
 

@@ -1,8 +1,10 @@
-"""Lights of an evaluated scene as `AreaLight` (runs in the child); see `points` for those that are no lights.
+"""Lights of an evaluated scene as `AreaLight` (runs in the child).
 
-Radiance as Cycles has it: L = color * temperature color * energy * 2^exposure / pi [/ area if normalize], one-sided
-along the local -Z axis. Size and shape follow the first two columns of the world matrix. Measured against
-Cycles 4.5.15 and 5.2.3 to 2e-5.
+As Cycles 4.5 and 5.2 have them, measured to 2e-5. With the strength S = color * temperature color * energy *
+2^exposure, area lights have the radiance L = S / pi [/ area if normalize], one-sided along the local -Z axis; size and
+shape follow the first two columns of the world matrix. The radius of points and spots is not scaled with the object;
+the cone of a spot is. Balls and disks: L = S / (4 pi^2 r^2), S / pi without Normalize; a sun of half the angle h:
+S / (pi sin^2 h), or S.
 """
 
 from __future__ import annotations
@@ -14,22 +16,25 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight, listed
+from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight, SpotCone, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
 from .emission import NO_FACTOR, Falloff, emission_of, open_studio
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
-from .points import point_light, strength
 from .textures import UnseenLight, look_at_area_lights
 
 # Two axes further from a right angle than this (cosine) are called sheared.
 SHEAR_COSINE = 1e-4
-
-
 # Full angle in degrees of the narrowest beam; below, it is a line of light.
 LEAST_SPREAD = 0.1
+# In m and rad: what has no size is that large. Only its solid angle times its radiance matters.
+LEAST_RADIUS, LEAST_ANGLE = 1e-6, 2e-5
+# Suns fill at most this half angle in rad: as far as a plane in front of the eye reaches.
+WIDEST_SUN = 1.5698
+# Of a cone without blend.
+SHARPEST = 1e9
 
 
 @dataclass
@@ -322,3 +327,66 @@ def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
     if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE:
         inventory.warn(f"light {name!r}: its transform is sheared, which Cycles itself does not sample correctly")
+
+
+def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:
+    """The evaluated point, spot or sun light `ob` at `matrix` (4, 4); `traits` are fields of the AreaLight."""
+    light, axis = ob.data, -matrix[:3, 2] / max(np.linalg.norm(matrix[:3, 2]), 1e-30)
+    if light.type == "SUN":
+        return _sun(light, ob.original.name, axis, traits)
+    radius = max(light.shadow_soft_size, 0.0)
+    # Without a size it is the intensity that is given.
+    area = math.pi * max(radius, LEAST_RADIUS) ** 2 if radius <= LEAST_RADIUS else 1.0
+    scale = 1.0 / math.pi / area
+    if light.normalize:
+        scale /= 4.0 * math.pi * radius**2 if radius > LEAST_RADIUS else 4.0
+    radius = max(radius, LEAST_RADIUS)
+    return AreaLight(
+        name=ob.original.name,
+        shape="FACING_DISK" if light.use_soft_falloff else "BALL",
+        center=matrix[:3, 3],
+        half_u=np.array([radius, 0.0, 0.0]),
+        half_v=np.array([0.0, radius, 0.0]),
+        direction=axis if light.type == "SPOT" else np.array([0.0, 0.0, -1.0]),
+        radiance=strength(light) * scale,
+        cone=_cone(light, matrix) if light.type == "SPOT" else None,
+        **traits,
+    )
+
+
+def strength(light) -> np.ndarray:
+    """Color times power (3,)."""
+    value = np.array(light.color, dtype=np.float64) * light.energy * 2.0**light.exposure
+    if light.use_temperature:
+        value *= np.array(light.temperature_color, dtype=np.float64)[:3]
+    return value
+
+
+def _cone(light, matrix) -> SpotCone:
+    cosine = math.cos(0.5 * light.spot_size)
+    blend = (1.0 - cosine) * light.spot_blend
+    return SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, min(1.0 / max(blend, 1e-30), SHARPEST))
+
+
+def _sun(light, name, axis, traits) -> AreaLight:
+    half = 0.5 * light.angle
+    value = strength(light)
+    if half <= LEAST_ANGLE:
+        half = LEAST_ANGLE
+        value = value / (math.pi * math.sin(half) ** 2)
+    elif light.normalize:
+        value = value / (math.pi * math.sin(half) ** 2)
+    half = min(half, WIDEST_SUN)
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first *= math.sin(half) / np.linalg.norm(first)
+    return AreaLight(
+        name=name,
+        shape="DISK",
+        center=-math.cos(half) * axis,
+        half_u=first,
+        half_v=np.cross(axis, first),
+        direction=axis,
+        radiance=value,
+        is_distant=True,
+        **traits,
+    )

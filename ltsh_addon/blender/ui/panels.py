@@ -9,7 +9,7 @@ from bpy.app.translations import pgettext_iface as translated
 
 from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
-from .overview import APPROXIMATED, EXACT, LEFT_OUT, overview
+from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
 from .preview import is_previewing
 from .view_operators import COMMANDS
 

@@ -13,7 +13,7 @@ from material_scenes import Build
 from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.materials.aovs import inject_aovs
 from ltsh_addon.blender.materials.looks import COAT, look_of
-from ltsh_addon.blender.ui import overview
+from ltsh_addon.blender.ui import preflight
 from ltsh_addon.cycles.lobes import LOBE_KINDS, MAX_LOBES, SMALLEST_WEIGHT
 
 KIND_NAMES = {value: name for name, value in LOBE_KINDS.items()}
@@ -122,12 +122,12 @@ def same(first, second):
 
 def agreed_lobes(material):
     """The lobes that all readers find in the material, and its entry in the overview."""
-    entry = overview._material(material)
+    entry = preflight._material(material)
     shown = lobes_of_look(material)
     written, notes = lobes_of_aovs(material)
     assert same(written, shown), (written, shown)
     assert set(entry.notes) == notes
-    assert (entry.state == overview.EXACT) == (not notes)
+    assert (entry.state == preflight.EXACT) == (not notes)
     return written, entry
 
 
@@ -176,7 +176,7 @@ def test_all_readers_shade_every_node_in_every_variant_alike():
         wanted = expected_kind(node_type, settings)
         assert [lobe[:2] for lobe in lobes] == ([(wanted, 1.0)] if wanted else []), (node_type, settings, lobes)
         is_light = node_type[10:] in ("Emission", "BsdfTransparent", "Holdout")
-        assert (entry.state == overview.LEFT_OUT) == (wanted is None and not is_light), (node_type, settings, entry)
+        assert (entry.state == preflight.LEFT_OUT) == (wanted is None and not is_light), (node_type, settings, entry)
         if node_type[10:] in NAMED or wanted == "velvet":
             assert any(repr(node.name) in note for note in entry.notes), (node_type, entry)
         if wanted in ("principled", "glossy", "glass", "metal", "sheen", CONDUCTOR):
@@ -315,6 +315,6 @@ def test_no_reader_but_aovs_changes_a_material():
 
     before, count = state(), len(bpy.data.node_groups)
     look_of(build.material)
-    overview._material(build.material)
+    preflight._material(build.material)
     emission_of(build.material)
     assert state() == before and len(bpy.data.node_groups) == count

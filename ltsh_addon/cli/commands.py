@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
 import os
 import subprocess
 import sys
@@ -197,13 +198,15 @@ def _merge(arguments, bar, open_file) -> int:
 
 
 RELIGHT = """Write pictures anew with other powers and colors of their lights, without Blender and
-without a ray. OUT is what shade or compare wrote with --keep-visibility."""
+without a ray. OUT is what shade or compare wrote with --keep-visibility. Lights have
+the names that report.json tells."""
 RELIGHT_EXAMPLES = """examples:
   %(prog)s out/room --light Key --power x2 --color 1,.8,.6
-  %(prog)s out/room --light Key --power x0 --light Fill --power x3 -o out/fill_alone
+  %(prog)s out/room --light Fill --exposure -1.5 --mute Rim --mute Lamp
+  %(prog)s out/room --solo Key -o out/key_alone
 
---power and --color are for the --light before them. A color stands in place of the light's own, whose
-brightest channel counts as 1.
+--power, --exposure and --color are for the --light before them. A color stands in place of the light's
+own, whose brightest channel counts as 1; each step of exposure doubles the power.
 """
 
 
@@ -214,10 +217,14 @@ def add_relight(parser) -> None:
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
     )
-    parser.add_argument("--light", dest="changes", action="append", type=_light, required=True, metavar="NAME",
-                        help="as report.json names it; may be given several times")  # fmt: skip
+    parser.add_argument("--light", dest="changes", action="append", type=_light, default=[], metavar="NAME",
+                        help="the light to change; may be given several times")  # fmt: skip
     parser.add_argument("--power", action=_OfLight, type=from_text(_factor), metavar="xF", help="such as x2 or x.5")
+    parser.add_argument("--exposure", action=_OfLight, type=from_text(_steps), metavar="E", help="such as +1 or -.5")
     parser.add_argument("--color", action=_OfLight, type=from_text(_color), metavar="R,G,B", help="such as 1,.8,.6")
+    for flag, what in (("--mute", "this light is dark"), ("--solo", "all lights but this one are dark")):
+        parser.add_argument(flag, action="append", default=[], metavar="NAME",
+                            help=f"{what}; may be given several times")  # fmt: skip
     add_talk(parser)
     parser.set_defaults(run=_relight)
 
@@ -249,6 +256,17 @@ def _factor(text: str) -> float:
     return value
 
 
+def _steps(text: str) -> float:
+    """A number of doublings."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.inf
+    if not abs(value) <= 32.0:
+        raise ValueError(f"exposure is {text!r}, expected a number from -32 to 32, such as +1 or -.5")
+    return value
+
+
 def _color(text: str) -> tuple[float, ...]:
     """Three numbers."""
     try:
@@ -263,8 +281,12 @@ def _color(text: str) -> tuple[float, ...]:
 def _relight(arguments, bar, open_file) -> int:
     from ..pipeline.relight import LightChange, relight
 
+    if not (arguments.changes or arguments.mute or arguments.solo):
+        raise Misuse("nothing to change: expected --light NAME with --power, --exposure or --color, --mute or --solo")
     output = arguments.output or arguments.folder / "relit"
-    report = relight(arguments.folder, [LightChange(**change) for change in arguments.changes], output, bar)
+    changes = [LightChange(**change) for change in arguments.changes]
+    changes += [LightChange(name, muted=True) for name in arguments.mute]
+    report = relight(arguments.folder, changes, output, bar, solo=arguments.solo)
     bar.finish()
     if not arguments.json:
         print_out("\n".join(str(output / name) for one in report.get("reports", [report]) for name in one["files"]))

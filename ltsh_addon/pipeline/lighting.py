@@ -13,7 +13,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from ..files import replacing, temporary_folder
 from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
 from ..shading.light_tree import FEWEST
 
-# Of the files of `keep_picture`.
-KEPT_SUFFIX = ".samples.npz"
+# Of the files of `keep_picture`: all that shading needs, and what shadow rays meet.
+KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # Pairs of a sample and a light whose radiance is kept at a time.
 MOST_PAIRS = 1 << 25
 # Of one sample, however many a pixel has.
@@ -47,6 +47,13 @@ class Shadows:
     def take(self, index: np.ndarray) -> Shadows:
         """Those of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
+
+    def of_lights(self, numbers: Sequence[int]) -> Shadows:
+        """Those of the lights with the sorted `numbers`, which hold all or none of those that share their rays."""
+        place = {number: index for index, number in enumerate(numbers)}
+        rows = [row for row, own in enumerate(self.numbers) if own[0] in place]
+        shares = {name: values[rows] for name, values in self.shares.items()}
+        return replace(self, shares=shares, numbers=tuple(tuple(place[n] for n in self.numbers[row]) for row in rows))
 
     def report(self) -> dict:
         """For report.json."""
@@ -187,18 +194,24 @@ def group_names(groups: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class KeptPicture:
-    """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is."""
+    """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is.
+
+    The whole picture is that of the samples, each pass times `taken`, and `rest`: all of these times the exposure.
+    """
 
     extraction: Any  # blender.process.client.Extraction, without reference and occluders
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
+    # (H, W, 3), or 4 with alpha, by light group: its bounced light; by "": what hangs on no light.
+    rest: dict[str, np.ndarray] = field(default_factory=dict)
+    taken: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W) by pass; left out: 1
 
     @classmethod
     def load(cls, path: Path) -> KeptPicture:
         """Raises OSError, and ValueError where the file is not what `keep_picture` writes."""
         try:
-            with np.load(path) as data:
+            with Path(path).open("rb") as file, np.load(file) as data:
                 arrays = {name: data[name] for name in data.files}
             document = json.loads(str(arrays.pop("document")))
             return cls._of(document, arrays)
@@ -220,6 +233,7 @@ class KeptPicture:
             warnings=tuple(found["warnings"]),
             problems=tuple(found["problems"]),
             reference=None,
+            origin=np.array(found["origin"]),
             border=None if border is None else Border(**border),
             color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
         )
@@ -230,14 +244,20 @@ class KeptPicture:
             shadows = Shadows(shares, numbers, shadows["noise"], shadows["rays"], shadows["tracer"])
         options = document["options"]
         options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
-        return cls(extraction, shadows, {**options, "scene": Path(options["scene"])}, document["had_cycles"])
+        options["scene"] = Path(options["scene"])
+        rest = {name: arrays[f"rest.{name}"] for name in document["rest"]}
+        taken = {name: arrays[f"taken.{name}"] for name in document["taken"]}
+        return cls(extraction, shadows, options, document["had_cycles"], rest, taken)
 
 
 KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
-def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> None:
-    """Write the .npz that `KeptPicture.load` reads, at once or not at all. Raises OSError."""
+def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, rest=None, taken=None) -> list[Path]:
+    """Write the .npz that `KeptPicture.load` reads, at once or not at all, and beside it the occluders; both paths.
+
+    `rest` and `taken` are as of KeptPicture. Raises OSError.
+    """
     from ..blender.process.client import UNCHANGED
 
     film, space = extraction.film, extraction.color_space
@@ -248,12 +268,15 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> No
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
+            "origin": np.asarray(extraction.origin).tolist(),
             "border": None if extraction.border is None else vars(extraction.border),
             "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
         "had_cycles": extraction.reference is not None,
+        "rest": list(rest or ()),
+        "taken": list(taken or ()),
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
     arrays["film.pixel"] = film.pixel
@@ -261,5 +284,12 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path) -> No
         arrays["film.first"] = film.first
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
+    arrays |= {f"rest.{name}": np.asarray(values, np.float32) for name, values in (rest or {}).items()}
+    arrays |= {f"taken.{name}": np.asarray(values, np.float32) for name, values in (taken or {}).items()}
     with replacing(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, document=json.dumps(document), **arrays)
+    if extraction.occluders is None:
+        return [path]
+    occluders = path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX)
+    extraction.occluders.save(occluders)
+    return [path, occluders]

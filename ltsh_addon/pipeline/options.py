@@ -352,7 +352,7 @@ class PictureOptions:
     cycles_samples: int = _cycles_samples("the Cycles reference", 512)
     shadows: str = _shadows()
     shadow_rays: int = _shadow_rays()
-    keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
+    keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as two .npz")
     scripts: bool = _scripts()
     page: str = option(default="report.html", matters=False)  # of a comparison
 

@@ -175,8 +175,11 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     report = comparison.report()
     files = comparison.write(Path(options.output), report, with_cycles, progress)
     if options.keep_visibility:
-        files.append(Path(files[0]).with_suffix(lighting.KEPT_SUFFIX).as_posix())
-        lighting.keep_picture(extraction, shadows, options, Path(options.output) / files[-1])
+        output = Path(options.output)
+        kept = lighting.keep_picture(
+            extraction, shadows, options, (output / files[0]).with_suffix(lighting.KEPT_SUFFIX)
+        )
+        files += [path.relative_to(output).as_posix() for path in kept]
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
     if shadows is not None:

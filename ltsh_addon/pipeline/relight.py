@@ -1,17 +1,25 @@
-"""Pictures made anew of the samples that they have kept: other powers and colors of lights, without a ray."""
+"""Finished pictures in another light: `relight` writes them anew, a `Mixer` changes their lights while one looks.
+
+Radiance is linear in that of each light: a picture is the sum of the pictures of its lights, each times a factor per
+color. No ray is traced, but by `moved_picture` for a light that has moved.
+"""
 
 from __future__ import annotations
 
+import json
+import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from .. import imaging
-from ..scene import AreaLight, Progress, SurfaceSamples, listed
+from ..files import replacing
+from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
+from ..visibility import Occluders
 from . import picture
-from .lighting import KEPT_SUFFIX, KeptPicture
+from .lighting import KEPT_SUFFIX, KeptPicture, Shadows, ShadowTracer, rays_of_point, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -28,10 +36,25 @@ class LightChange:
     name: str
     power: float = 1.0  # factor
     color: tuple[float, float, float] | None = None  # in place of its own, whose brightest channel counts as 1
+    exposure: float = 0.0  # each step doubles the power
+    muted: bool = False
+
+    @property
+    def factor(self) -> float:
+        """Of the power."""
+        return 0.0 if self.muted else self.power * 2.0**self.exposure
 
 
-def relight(folder: Path, changes: Sequence[LightChange], output: Path, progress: Progress | None = None) -> dict:
-    """Write the pictures that `folder` has kept samples of with changed lights into `output`.
+def relight(
+    folder: Path,
+    changes: Sequence[LightChange],
+    output: Path,
+    progress: Progress | None = None,
+    *,
+    solo: Sequence[str] = (),
+) -> dict:
+    """Write the pictures that `folder` has kept samples of with changed lights into `output`; where there are `solo`
+    lights, all others are dark.
 
     Files and layers have the same names, but for those of Cycles. Returns report.json of the only picture, else
     {"reports": [...]}. Raises ValueError for an unknown light or where nothing was kept, OSError, TableError.
@@ -40,15 +63,16 @@ def relight(folder: Path, changes: Sequence[LightChange], output: Path, progress
     files = sorted(folder.rglob(f"*{KEPT_SUFFIX}"))
     if not files:
         raise ValueError(f"{folder}: no picture kept its samples there; run shade or compare with --keep-visibility")
-    reports = [_relit(path, path.relative_to(folder), changes, output, progress) for path in files]
+    reports = [_relit(path, path.relative_to(folder), (changes, solo), output, progress) for path in files]
     report = reports[0] if len(reports) == 1 else {"reports": reports}
     imaging.write_json(output / "report.json", report)
     return report
 
 
-def _relit(path: Path, place: Path, changes, output: Path, progress) -> dict:
+def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     """The report of the picture that kept its samples in `path`; its files are at the same `place` below `output`."""
     kept = KeptPicture.load(path)
+    changes = [*wanted[0], *others_muted(kept.extraction.lights, wanted[1])]
     lights = changed_lights(kept.extraction.lights, changes)
     if kept.shadows is not None:
         _check_shared(kept, lights)
@@ -61,9 +85,24 @@ def _relit(path: Path, place: Path, changes, output: Path, progress) -> dict:
     extraction = replace(kept.extraction, lights=lights, warnings=warnings)
     results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
     comparison = picture.Comparison(options, extraction, results, kept.shadows)
-    changed = [{"light": change.name, "power": change.power, "color": change.color} for change in changes]
+    changed = [{"light": change.name, **{key: value for key, value in asdict(change).items() if key != "name"}}
+               for change in changes]  # fmt: skip
     report = {**comparison.report(), "relit": changed}
     return {"files": comparison.write(output, report, False, progress), **report}
+
+
+def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
+    """What makes all lights dark but those called `solo`; nothing where there are none. Raises ValueError for a light
+    that is not there."""
+    names = dict.fromkeys(light.name for light in lights)
+    for name in solo:
+        _check_known(name, names)
+    return [LightChange(name, muted=True) for name in names if solo and name not in solo]
+
+
+def _check_known(name: str, names) -> None:
+    if name not in names:
+        raise ValueError(f"light {name!r} is not in the picture; lights there: {listed(map(repr, names))}")
 
 
 def _split_at_horizons(samples: SurfaceSamples) -> int:
@@ -95,10 +134,9 @@ def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) 
     names = list(dict.fromkeys(light.name for light in lights))
     found = list(lights)
     for change in changes:
-        if change.name not in names:
-            raise ValueError(f"light {change.name!r} is not in the picture; lights there: {listed(map(repr, names))}")
+        _check_known(change.name, names)
         own = [light for light in lights if light.name == change.name]
-        factor = change.power * _tint(own, change)
+        factor = change.factor * _tint(own, change)
         found = [_scaled(light, factor) if light.name == change.name else light for light in found]
     return tuple(found)
 
@@ -107,15 +145,265 @@ def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
     """By what the radiance of a light of several parts is multiplied to get the color."""
     if change.color is None:
         return np.ones(3)
-    weights = [np.linalg.norm(light.area_vector) for light in own]
-    mean = np.average([light.radiance for light in own], axis=0, weights=weights)
-    missing = [channel for channel, value in zip(("red", "green", "blue"), mean, strict=True) if value == 0.0]
+    color = own_color(own)
+    missing = [channel for channel, value in zip(("red", "green", "blue"), color, strict=True) if value == 0.0]
     if missing and any(change.color[("red", "green", "blue").index(channel)] for channel in missing):
         raise ValueError(f"light {change.name!r} has no {' and no '.join(missing)}: render it anew to give it some")
-    own_color = mean / np.max(np.abs(mean), initial=0.0, where=mean != 0.0) if mean.any() else np.ones(3)
-    return np.divide(change.color, own_color, out=np.zeros(3), where=own_color != 0.0)
+    return tint(color, change.color)
+
+
+def own_color(lights: Sequence[AreaLight]) -> np.ndarray:
+    """The color (3,) of `lights` together, its brightest channel 1; white where they are dark."""
+    weights = [np.linalg.norm(light.area_vector) for light in lights]
+    mean = np.average([light.radiance for light in lights], axis=0, weights=weights)
+    return mean / np.max(np.abs(mean)) if mean.any() else np.ones(3)
+
+
+def tint(own: np.ndarray, color: Sequence[float]) -> np.ndarray:
+    """By what light of the color `own` (3,) is multiplied to get another; nothing where it has nothing."""
+    return np.divide(color, own, out=np.zeros(3), where=np.asarray(own) != 0.0)
 
 
 def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
     detail = tuple(_scaled(part, factor) for part in light.detail)
     return replace(light, radiance=light.radiance * factor, detail=detail)
+
+
+# -- the mixer --------------------------------------------------------------------------------------------------------
+
+MIXER_FILE = "lights.npz"
+# Rows of a mixer: of more lights the weakest are one.
+MOST_ROWS = 64
+REST = "Everything else"
+# Pairs of a sample and a row whose radiance is kept at a time.
+MOST_PAIRS = 1 << 23
+# Of pictures, that are summed at a time: as many as stay in the processor's cache.
+LINES = 16
+SHARED = "they share their shadow rays, so they change together"
+WEAKEST = "the weakest lights of the picture, which change together"
+NO_BOUNCES = f"bounced light is part of {REST!r}: it does not follow the lights"
+SHARED_OUT = "bounced light of light group {!r} is shared out among {} by their direct light"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a mixer changes as one: the lights called `lights`, or what hangs on no light where there are none."""
+
+    name: str
+    lights: tuple[str, ...]
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of their light, the brightest channel 1
+    settings: dict[str, list[float]] = field(default_factory=dict)  # of those that are lights in Blender
+    light: dict | None = None  # record of the only one, where it is plain
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class LightPictures:
+    """A picture as the sum of one for each row."""
+
+    rows: tuple[Row, ...]
+    layers: np.ndarray  # (R, H, W, 3) float32, row 0 on top
+    alpha: np.ndarray  # (H, W) float32
+    facts: dict  # "camera", "frame", "technique", "notes"
+
+    def save(self, path: Path) -> None:
+        """Write what `load` reads, at once or not at all. Raises OSError."""
+        document = {**self.facts, "rows": [asdict(row) for row in self.rows]}
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, document=json.dumps(document), layers=self.layers, alpha=self.alpha)
+
+    @classmethod
+    def load(cls, path: Path) -> LightPictures:
+        """Raises OSError, and ValueError where the file is not what `save` writes."""
+        try:
+            with Path(path).open("rb") as file, np.load(file) as data:
+                facts, layers, alpha = json.loads(str(data["document"])), data["layers"], data["alpha"]
+            rows = tuple(
+                Row(**{**row, "lights": tuple(row["lights"]), "color": tuple(row["color"])})
+                for row in facts.pop("rows")
+            )
+            if layers.ndim != 4 or layers.shape != (len(rows), *alpha.shape, 3):
+                raise ValueError(f"{len(rows)} rows, layers {layers.shape}, alpha {alpha.shape}")
+        except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: is no file of the light mixer, or not whole ({error_line(error)})") from error
+        return cls(rows, layers, alpha, facts)
+
+
+def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> LightPictures:
+    """The pictures of the lights of `kept`, shaded anew by its most accurate table. Raises TableError, Cancelled."""
+    extraction, shadows = kept.extraction, kept.shadows
+    members, technique = _members(extraction.lights, shadows), technique_of(kept)
+    shape = extraction.film.height, extraction.film.width
+    layers = np.zeros((len(members), *shape, 3), np.float32)
+    (table,) = picture.load_tables((technique,)).values()
+    most = max(1, MOST_PAIRS // max(1, len(extraction.samples)))
+    for first in range(0, len(members), most):
+        part = members[first : first + most]
+        share = first / len(members), len(part) / len(members)
+
+        def report(fraction, share=share):
+            return None if progress is None else progress("lights", share[0] + fraction * share[1])
+
+        layers[first : first + most] = _layers(kept, table, part, report)
+    rows = [_row(extraction, own) for own in members]
+    notes = _share_out_bounces(kept, rows, members, layers)
+    rest = kept.rest.get("")
+    if rest is not None:
+        rows.append(Row(REST, (), note=NO_BOUNCES))
+        layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
+    alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
+    facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
+    return LightPictures(tuple(rows), layers, alpha, facts)
+
+
+def technique_of(kept: KeptPicture) -> str:
+    """The most accurate of those that `kept` was made with."""
+    names = [name for name in kept.options["techniques"] if name != REFERENCE]
+    return names[-1] if names else "ltsh4"
+
+
+def _members(lights: Sequence[AreaLight], shadows: Shadows | None) -> list[list[int]]:
+    """Numbers of the lights of each row: those of one name, and those that share their rays."""
+    root = {light.name: light.name for light in lights}
+
+    def first(name):
+        while root[name] != name:
+            root[name] = root[root[name]]
+            name = root[name]
+        return name
+
+    for own in shadows.numbers if shadows is not None else ():
+        for number in own[1:]:
+            root[first(lights[number].name)] = first(lights[own[0]].name)
+    members: dict[str, list[int]] = {}
+    for number, light in enumerate(lights):
+        members.setdefault(first(light.name), []).append(number)
+    rows = list(members.values())
+    if len(rows) <= MOST_ROWS:
+        return rows
+    power = [sum(np.linalg.norm(lights[n].area_vector) * lights[n].radiance.sum() for n in own) for own in rows]
+    strong = set(np.argsort(power)[::-1][: MOST_ROWS - 1].tolist())
+    weak = [number for row, own in enumerate(rows) if row not in strong for number in own]
+    return [*(own for row, own in enumerate(rows) if row in strong), weak]
+
+
+def _row(extraction, own: list[int]) -> Row:
+    """The row of the lights with the numbers `own`."""
+    lights = [extraction.lights[number] for number in own]
+    names, color = tuple(dict.fromkeys(light.name for light in lights)), tuple(own_color(lights).tolist())
+    known = extraction.light_settings
+    settings = {name: known[name] for name in names if name in known}
+    if len(names) > 1:
+        note = WEAKEST if len({tuple(light.radiance) for light in lights}) > 1 else SHARED
+        return Row(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
+    plain = len(lights) == 1 and not lights[0].detail and lights[0].pattern is None
+    return Row(names[0], names, color, settings, lights[0].record() if plain else None)
+
+
+def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.ndarray:
+    """Radiance (R, H, W, 3) of rows of lights times the exposure."""
+    extraction = kept.extraction
+    numbers = sorted(number for own in members for number in own)
+    row_of = {number: row for row, own in enumerate(members) for number in own}
+    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
+    shadows = None if kept.shadows is None else kept.shadows.of_lights(numbers)
+    passes = kept.options["passes"]
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
+    for name in passes:
+        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
+            image = extraction.film.image(extraction.exposure * values)
+            layers[int(group)] += image if name not in kept.taken else kept.taken[name][..., None] * image
+    return layers
+
+
+def _share_out_bounces(kept: KeptPicture, rows, members, layers) -> list[str]:
+    """Add the bounced light of each light group to the `layers` of its lights; what is only about right."""
+    notes = []
+    for group, bounced in kept.rest.items():
+        if group == "":
+            continue
+        own = [row for row, numbers in enumerate(members) if kept.extraction.lights[numbers[0]].group == group]
+        weights = layers[own].sum(axis=(1, 2), dtype=np.float64)
+        shares = (
+            weights / np.maximum(weights.sum(axis=0), 1e-30) if weights.any() else np.full_like(weights, 1 / len(own))
+        )
+        for row, share in zip(own, shares, strict=True):
+            layers[row] += (share * bounced[..., :3]).astype(np.float32)
+        if len(own) > 1:
+            notes.append(SHARED_OUT.format(group, listed(repr(rows[row].name) for row in own)))
+    return notes
+
+
+class Mixer:
+    """The pictures of the lights, ready to be mixed: a change of one row costs one multiplication and one addition per
+    pixel and channel, because the sum of the others is kept."""
+
+    def __init__(self, pictures: LightPictures):
+        count, height, width, _ = pictures.layers.shape
+        self.rows, self.facts, self._width = pictures.rows, pictures.facts, width
+        # As images of Blender are: row 0 below, four channels one after another.
+        self._layers = np.zeros((count, height, width, 4), np.float32)
+        self._layers[..., :3] = pictures.layers[:, ::-1]
+        self._background = np.zeros((height, width, 4), np.float32)
+        self._background[..., 3] = pictures.alpha[::-1]
+        self._whole, self._others = self._background.copy(), np.empty_like(self._background)
+        self._factors = np.zeros((count, 3))
+        self._changing: int | None = None  # the row that changed last: `_others` is the sum of all others
+
+    @property
+    def pictures(self) -> LightPictures:
+        """What was given, and what came in its place since."""
+        layers, alpha = self._layers[:, ::-1, :, :3], self._background[::-1, :, 3]
+        return LightPictures(self.rows, layers, alpha, self.facts)
+
+    def replace(self, number: int, row: Row, layer: np.ndarray) -> None:
+        """Put another row, and its picture (H, W, 3), in the place of one."""
+        self.rows = (*self.rows[:number], row, *self.rows[number + 1 :])
+        self._layers[number, ..., :3] = layer[::-1]
+        self._factors[:], self._changing = np.nan, None
+
+    def mixed(self, factors: np.ndarray) -> np.ndarray:
+        """The sum (H, W, 4) of all rows times `factors` (R, 3), row 0 below; the next call overwrites it."""
+        factors = np.array(factors, dtype=float)
+        changed = np.flatnonzero((self._factors != factors).any(axis=1))
+        self._factors = factors
+        if len(changed) > 1:
+            self._changing = None
+            self._sum(self._whole, self._background, range(len(factors)))
+        elif len(changed) == 1:
+            (row,) = changed.tolist()
+            if row != self._changing:
+                self._changing = row
+                self._sum(self._others, self._background, [other for other in range(len(factors)) if other != row])
+            self._sum(self._whole, self._others, [row])
+        return self._whole
+
+    def _sum(self, out: np.ndarray, start: np.ndarray, rows: Sequence[int]) -> None:
+        """Set `out` to `start` and the `rows` times their factors."""
+        tiles = [np.tile(np.append(self._factors[row], 0.0).astype(np.float32), (self._width, 1)) for row in rows]
+        term = np.empty((LINES, self._width, 4), np.float32)
+        for first in range(0, len(out), LINES):
+            lines = slice(first, first + LINES)
+            out[lines] = start[lines]
+            for row, tile in zip(rows, tiles, strict=True):
+                if tile.any():
+                    out[lines] += np.multiply(self._layers[row, lines], tile, out=term[: len(out[lines])])
+
+
+# -- lights that have moved -------------------------------------------------------------------------------------------
+
+
+def moved_picture(kept: KeptPicture, occluders: Occluders | None, light: AreaLight) -> np.ndarray:
+    """The picture (H, W, 3) of one light of `kept` where it is now, by its own rays and lobes alone.
+
+    Raises SceneError, TableError.
+    """
+    extraction, passes, shadows = kept.extraction, kept.options["passes"], None
+    if occluders is not None:
+        with ShadowTracer(occluders, (light,), extraction.origin) as tracer:
+            rays = rays_of_point(kept.options["shadow_rays"], extraction.film.sub_samples)
+            shadows = tracer.trace(extraction.samples, passes, rays, film=extraction.film)
+    (table,) = picture.load_tables((technique_of(kept),)).values()
+    alone = replace(kept, extraction=replace(extraction, lights=(light,)), shadows=shadows)
+    return _layers(alone, table, [[0]], None)[0]

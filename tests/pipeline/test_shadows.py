@@ -101,7 +101,26 @@ def test_a_picture_lit_anew_is_that_of_other_lights(capsys, monkeypatch, room, o
     for name, values in rendered.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-6, err_msg=name)
     report = json.loads((out / "relit" / "report.json").read_text(encoding="utf-8"))
-    assert report["relit"][0] == {"light": "Light 1", "power": 2.0, "color": [1.0, 0.5, 0.25]}
+    expected = {"light": "Light 1", "power": 2.0, "color": [1.0, 0.5, 0.25], "exposure": 0.0, "muted": False}
+    assert report["relit"][0] == expected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "factors"),
+    [
+        (("--light", "Light 0", "--exposure", "-1.5", "--mute", "Light 2"), (2.0**-1.5, 1.0, 0.0)),
+        (("--solo", "Light 1", "--solo", "Light 2", "--light", "Light 2", "--exposure", "+1"), (0.0, 1.0, 2.0)),
+        (("--solo", "Light 1", "--mute", "Light 1"), (0.0, 0.0, 0.0)),
+    ],
+)
+def test_exposure_mute_and_solo_are_factors_of_power(capsys, monkeypatch, room, out, arguments, factors):
+    first = shade(capsys, monkeypatch, room, out, "--keep-visibility")
+    assert run(capsys, "relight", out, *arguments, "--quiet")[0] == 0
+    found = read_channels(out / "relit" / "shade.exr")
+    for layer in ("ltsh4.specular", "ltsh4.diffuse"):
+        groups = (first[f"{layer}@{group}.G"] for group in ("Key", "Fill_001", "ungrouped"))
+        expected = sum(factor * part for factor, part in zip(factors, groups, strict=True))
+        np.testing.assert_allclose(found[f"{layer}.G"], expected, rtol=1e-5, atol=1e-9)
 
 
 def test_a_picture_lit_anew_keeps_its_shadows(capsys, monkeypatch, room, out):
@@ -156,7 +175,11 @@ def test_cycles_picture_of_the_former_lights_is_left_out_with_a_word(capsys, mon
         (("--light", "Light 0", "--power", "2"), 2, "power is '2', expected x and a factor, such as x2 or x.5"),
         (("--light", "Light 0", "--color", "1,2"), 2, "color is '1,2', expected red, green and blue such as 1,.8,.6"),
         (("--light", "Light 0", "--power", "x1", "--power", "x2"), 2, "--power: given twice for light 'Light 0'"),
-        ((), 2, "--light"),
+        (("--exposure", "+1"), 2, "--exposure: expected --light NAME before it"),
+        (("--light", "Light 0", "--exposure", "40"), 2, "exposure is '40', expected a number from -32 to 32"),
+        (("--mute", "Key"), 1, "light 'Key' is not in the picture; lights there: 'Light 0', 'Light 1', 'Light 2'"),
+        (("--solo", "Key"), 1, "light 'Key' is not in the picture; lights there: 'Light 0', 'Light 1', 'Light 2'"),
+        ((), 2, "nothing to change: expected --light NAME with --power, --exposure or --color, --mute or --solo"),
     ],
 )
 def test_wrong_changes_are_named(capsys, monkeypatch, room, out, arguments, code, complaint):

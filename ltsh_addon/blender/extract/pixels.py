@@ -252,6 +252,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "camera": camera.name,
         **picture,
         "lights": [light.record() for light in inventory.lights],
+        "light_settings": inventory.settings,
         "origin": inventory.origin.tolist(),
         "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,

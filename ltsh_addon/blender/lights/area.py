@@ -53,6 +53,7 @@ class LightInventory:
     world: Any = None  # that lights the scene
     occluders: Any = None  # visibility.Occluders, where shadows are wanted
     made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
+    settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -90,6 +91,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
             placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
+            inventory.settings[light.name] = [ob.data.energy, ob.data.exposure, *ob.data.color]
             if cycles_setting(ob.data, "use_multiple_importance_sampling") and ob.data.type == "AREA":
                 hit.append(light)
             note_unsupported(ob, matrix, inventory)

@@ -46,7 +46,9 @@ REASONS = 5
 # Smoother surfaces show the patches of a world.
 SHARP_REFLECTION = 0.2
 # Fields of `Extraction` that are those of the manifest.
-UNCHANGED = ("blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter")
+UNCHANGED = (
+    "blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter", "light_settings",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ class Extraction:
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
     the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
     exposure; None where it was not asked for. `problems` say why most of the picture is not shaded. `occluders` are
-    what stands in the way of light, around `origin` (3,) in m; None without shadows.
+    what stands in the way of light, around `origin` (3,) in m; None without shadows. `light_settings` are power,
+    exposure, red, green and blue of light objects as Blender has them.
     """
 
     lights: tuple[AreaLight, ...]
@@ -80,6 +83,7 @@ class Extraction:
     problems: tuple[str, ...] = ()
     occluders: Occluders | None = None
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    light_settings: dict[str, list[float]] = field(default_factory=dict)
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:

@@ -1,0 +1,175 @@
+"""The light mixer: a kept picture as the sum of its lights. No Blender: see `fake_scene`."""
+
+from dataclasses import replace
+
+import fake_scene
+import numpy as np
+import pytest
+from fake_scene import run, wall
+
+from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.pipeline import lighting, relight
+from ltsh_addon.pipeline.lighting import KeptPicture
+from ltsh_addon.pipeline.relight import LightPictures, Mixer, light_pictures, moved_picture
+from ltsh_addon.visibility import Occluders
+
+# float32 sums of three lights in another order, and what EXR files hold of them.
+ROUNDING = 1e-5
+
+
+def shade(capsys, monkeypatch, room, output, *arguments, **scene):
+    """The whole light (H, W, 3) of a picture of the fake scene by LTSH 4."""
+    fake_scene.FakeChild(**scene).install(monkeypatch)
+    words = ("--techniques", "ltc,ltsh4,reference", "--keep-visibility", "--quiet", *arguments)
+    assert run(capsys, "shade", room, "-o", output, *words)[0] == 0
+    channels = read_channels(output / "shade.exr")
+    return sum(np.stack([channels[f"ltsh4.{name}.{c}"] for c in "RGB"], -1) for name in ("specular", "diffuse"))
+
+
+def kept_in(output):
+    return KeptPicture.load(output / "shade.samples.npz")
+
+
+def mixed(mixer, factors):
+    """With row 0 on top."""
+    found = mixer.mixed(factors)
+    assert (found[..., 3] == 1.0).all()
+    return found[::-1, :, :3].copy()
+
+
+FACTORS = np.array([[0.5, 0.5, 0.5], [2.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
+
+
+def changed(lights):
+    return tuple(replace(one, radiance=one.radiance * factor) for one, factor in zip(lights, FACTORS, strict=True))
+
+
+def test_a_mixed_picture_is_that_of_other_lights(capsys, monkeypatch, room, out):
+    first = shade(capsys, monkeypatch, room, out / "first")
+    second = shade(capsys, monkeypatch, room, out / "second", change=changed)
+    mixer = Mixer(light_pictures(kept_in(out / "first")))
+    assert [row.name for row in mixer.rows] == ["Light 0", "Light 1", "Light 2"]
+    np.testing.assert_allclose(mixed(mixer, np.ones((3, 3))), first, rtol=ROUNDING, atol=ROUNDING * first.max())
+    np.testing.assert_allclose(mixed(mixer, FACTORS), second, rtol=ROUNDING, atol=ROUNDING * second.max())
+
+
+def test_shadows_stay_while_all_lights_change_alike(capsys, monkeypatch, room, out):
+    """Then rays are chosen as before; else noise differs."""
+    scene = {"wall": wall(0.7, left=0.0)}
+    first = shade(capsys, monkeypatch, room, out / "first", **scene)
+    scene["change"] = lambda lights: tuple(replace(one, radiance=2.0 * one.radiance) for one in lights)
+    second = shade(capsys, monkeypatch, room, out / "second", **scene)
+    mixer = Mixer(light_pictures(kept_in(out / "first")))
+    for factor, expected in ((1.0, first), (2.0, second)):
+        found = mixed(mixer, np.full((3, 3), factor))
+        np.testing.assert_allclose(found, expected, rtol=ROUNDING, atol=ROUNDING * expected.max())
+
+
+def random_mixer(rows=5, size=(40, 30)):
+    random = np.random.default_rng(7)
+    layers = random.random((rows, *size, 3)).astype(np.float32) * 10.0 ** random.integers(-3, 4, (rows, 1, 1, 1))
+    names = [relight.Row(f"Light {number}", (f"Light {number}",)) for number in range(rows)]
+    return Mixer(LightPictures(tuple(names), layers, np.ones(size, np.float32), {})), layers
+
+
+def test_any_order_of_changes_gives_the_same_bits():
+    """Whatever sums are kept meanwhile: nothing adds up."""
+    mixer, layers = random_mixer()
+    random, factors = np.random.default_rng(8), np.ones((5, 3))
+    for _ in range(60):
+        for row in random.choice(5, random.choice([1, 1, 1, 2, 5]), replace=False):
+            factors[row] = random.choice([0.0, 1.0, random.random()])
+        found = mixed(mixer, factors)
+        expected = np.einsum("rc,rhwc->hwc", factors, layers.astype(float))
+        # Five products and five sums of positive numbers.
+        np.testing.assert_allclose(found, expected, rtol=10 * 2.0**-24, atol=1e-30)
+
+
+def test_pictures_of_lights_are_read_back(tmp_path):
+    mixer, _ = random_mixer()
+    mixer.replace(2, relight.Row("Other", ("Other",)), np.full((40, 30, 3), 7.0))
+    mixer.pictures.save(tmp_path / "lights.npz")
+    found = LightPictures.load(tmp_path / "lights.npz")
+    assert found.rows == mixer.rows and np.array_equal(found.layers, mixer.pictures.layers)
+    assert (found.layers[2] == 7.0).all()
+    whole = (tmp_path / "lights.npz").read_bytes()
+    for content in (b"", b"no archive", whole[:3000], whole[:-30000]):
+        (tmp_path / "lights.npz").write_bytes(content)
+        with pytest.raises(ValueError, match="is no file of the light mixer"):
+            LightPictures.load(tmp_path / "lights.npz")
+
+
+def test_lights_that_change_together_are_one_row(capsys, monkeypatch, room, out):
+    """Those of one name, as faces of a lamp, those that share rays, and the weakest of very many."""
+    shade(capsys, monkeypatch, room, out)
+    kept = kept_in(out)
+    lights = [replace(kept.extraction.lights[0], name=f"L{n // 2}", radiance=[1.0 + n] * 3) for n in range(6)]
+    shadows = lighting.Shadows({}, ((0,), (1, 2), (3,), (4,), (5,)), {}, 0, "")
+    assert relight._members(lights, None) == [[0, 1], [2, 3], [4, 5]]
+    assert relight._members(lights, shadows) == [[0, 1, 2, 3], [4, 5]]
+    many = [replace(lights[0], name=f"M{n}", radiance=[100.0 - n] * 3) for n in range(100)]
+    members = relight._members(many, None)
+    assert len(members) == 64 and members[-1] == list(range(63, 100))
+    row = relight._row(replace(kept.extraction, lights=tuple(many)), members[-1])
+    assert row.name == "M63 and 36 more" and row.note == relight.WEAKEST
+
+
+def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_group(capsys, monkeypatch, room, out):
+    whole = shade(capsys, monkeypatch, room, out)
+    kept = kept_in(out)
+    shape, random = whole.shape[:2], np.random.default_rng(3)
+    rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3))}
+    taken = {"diffuse": random.random(shape)}
+    path = out / "render.samples.npz"
+    lighting.keep_picture(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
+    pictures = light_pictures(KeptPicture.load(path))
+    assert [row.name for row in pictures.rows][-1] == relight.REST and len(pictures.rows) == 4
+    np.testing.assert_allclose(pictures.alpha, rest[""][..., 3], rtol=1e-6)
+    plain = light_pictures(kept)
+    bounced = pictures.layers[0] - plain.layers[0]
+    channels = read_channels(out / "shade.exr")
+    diffuse = np.stack([channels[f"ltsh4.diffuse@Key.{c}"] for c in "RGB"], -1)
+    expected = rest["Key"] - (1.0 - taken["diffuse"])[..., None] * diffuse
+    np.testing.assert_allclose(bounced, expected, atol=1e-5)
+
+
+def options(room, output):
+    from ltsh_addon.pipeline.options import PictureOptions
+
+    return PictureOptions(room, output, techniques=("ltc", "ltsh4"))
+
+
+def test_bounced_light_of_several_lights_is_shared_out(capsys, monkeypatch, room, out):
+    shade(capsys, monkeypatch, room, out, groups=("Key", "Key", ""))
+    kept = kept_in(out)
+    bounced = np.full((fake_scene.HEIGHT, fake_scene.WIDTH, 3), 0.25)
+    found = light_pictures(replace(kept, rest={"Key": bounced}))
+    plain = light_pictures(kept)
+    more = found.layers - plain.layers
+    np.testing.assert_allclose(more.sum(axis=0), bounced, rtol=1e-5)
+    assert (more[0] > 0.01).all() and (more[1] > 0.01).all() and (more[2] == 0.0).all()
+    assert found.facts["notes"] == [relight.SHARED_OUT.format("Key", "'Light 0', 'Light 1'")]
+
+
+def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
+    occluders = {"wall": wall(0.7, left=0.0)}
+    before = shade(capsys, monkeypatch, room, out / "first", **occluders)
+
+    def move(lights):
+        return lights[0].moved(np.array([0.3, -0.2, 0.1])), *lights[1:]
+
+    shade(capsys, monkeypatch, room, out / "second", **occluders, change=move)
+    kept, expected = kept_in(out / "first"), light_pictures(kept_in(out / "second"))
+    (path,) = (out / "first").glob("*.occluders.npz")
+    mixer = Mixer(light_pictures(kept))
+    moved = moved_picture(kept, Occluders.load(path), move(kept.extraction.lights)[0])
+    # Rays of both are as many as the share of the light in all light, which differs, asks for.
+    assert np.abs(moved - expected.layers[0]).mean() < 0.02 * expected.layers[0].mean()
+    mixer.replace(0, mixer.rows[0], moved)
+    assert not np.allclose(mixed(mixer, np.ones((3, 3))), before, rtol=0.05)
+
+
+def test_no_samples_give_a_black_picture(capsys, monkeypatch, room, out):
+    shade(capsys, monkeypatch, room, out, empty=True)
+    pictures = light_pictures(kept_in(out))
+    assert pictures.layers.shape == (3, fake_scene.HEIGHT, fake_scene.WIDTH, 3) and not pictures.layers.any()

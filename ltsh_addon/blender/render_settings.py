@@ -278,7 +278,7 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
         if getattr(owner, name):
             warnings.append(f"{label} is switched off, in the Cycles reference as well")
             setattr(owner, name, False)
-    warnings.extend(_steps_after_rendering(scene))
+    warnings.extend(steps_after_rendering(scene))
     scene.camera = camera
     hold_still(scene, camera)
     render.engine = "CYCLES"
@@ -332,7 +332,7 @@ def without_scripts(scene):
             node.mute = False
 
 
-def _steps_after_rendering(scene) -> list[str]:
+def steps_after_rendering(scene) -> list[str]:
     """Warnings about what Blender would do to the rendered picture and is switched off."""
     render, found = scene.render, []
     if render.use_freestyle:
@@ -412,3 +412,21 @@ def pass_names() -> dict[str, str]:
         names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit")
     keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission")
     return dict(zip(keys, names, strict=True))
+
+
+def save_png(scene, pixels: np.ndarray, path: Path) -> None:
+    """Save `pixels` (H, W, 4), row 0 on top, as Blender shows them: through the view transform of the scene."""
+    height, width = pixels.shape[:2]
+    image = bpy.data.images.new("LTSH picture", width, height, alpha=True, float_buffer=True)
+    if bpy.app.version >= (5, 0, 0):
+        image.colorspace_settings.name = bpy.data.colorspace.working_space
+    # Blender takes color for multiplied by alpha, as it is.
+    image.alpha_mode = "PREMUL"
+    image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1], np.float32).ravel())
+    settings = scene.render.image_settings
+    if bpy.app.version >= (5, 0, 0):
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_depth = "PNG", "8"
+    settings.color_mode = "RGBA" if scene.render.film_transparent else "RGB"
+    image.save_render(str(path), scene=scene)
+    bpy.data.images.remove(image)

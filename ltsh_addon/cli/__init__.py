@@ -20,7 +20,18 @@ from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Misuse
-from .commands import add_bake, add_compare, add_demo, add_merge, add_relight, add_run, add_shade, add_tables, add_view
+from .commands import (
+    add_bake,
+    add_compare,
+    add_demo,
+    add_merge,
+    add_relight,
+    add_render,
+    add_run,
+    add_shade,
+    add_tables,
+    add_view,
+)
 from .job_file import Mistakes
 from .progress import ProgressBar, RunLog, print_json, print_out
 
@@ -28,6 +39,7 @@ EXAMPLES = """examples:
   %(prog)s demo -o out/demo
   %(prog)s compare room.blend -o out/room --resolution 960x540 --cycles-samples 1024
   %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
+  %(prog)s render room.blend -o out/room --budget 30
   %(prog)s bake room.blend -o out/room --object Floor --size 2048 --error
   %(prog)s compare room.blend -o out/room --frames 1-240 --shard 1/4 --resume
   %(prog)s merge out/room
@@ -159,6 +171,7 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
         ("shade", add_shade, "shade per pixel of the camera"),
         ("bake", add_bake, "bake lighting and errors into the texels of UV maps"),
         ("view", add_view, "the viewport's own picture, without a window"),
+        ("render", add_render, "the finished picture: direct light by LTSH, the rest by Cycles, denoised"),
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
-from ..pipeline.options import BakeOptions, PictureOptions, ViewOptions, options_from, table
+from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
 from ..pipeline.picture import prepare
 from ..pipeline.tasks import Job
 from ..scene import SHIPPED_TABLES, SceneError, error_line
@@ -82,6 +82,17 @@ VIEW_EXAMPLES = """examples:
 """
 
 
+RENDER = """Finish what the camera sees: direct light by LTSH, everything else by Cycles, which is
+denoised. OUT gets render.exr (combined, both parts of the direct light, and Cycles'
+passes), render.png, which shows it through the scene's view transform, and
+report.json, which tells what came from where."""
+RENDER_EXAMPLES = """examples:
+  %(prog)s room.blend -o out/room --cycles-samples 64
+  %(prog)s room.blend -o out/room --budget 30
+  %(prog)s room.blend -o out/room --frames 1-240 --cycles-samples 64 --resume
+"""
+
+
 def add_demo(parser) -> None:
     """`ltsh demo`."""
     size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
@@ -114,6 +125,12 @@ def add_view(parser) -> None:
     """`ltsh view`."""
     with_examples(parser, VIEW, VIEW_EXAMPLES)
     _add_job(parser, ViewOptions)
+
+
+def add_render(parser) -> None:
+    """`ltsh render`."""
+    with_examples(parser, RENDER, RENDER_EXAMPLES)
+    _add_job(parser, RenderOptions)
 
 
 def _add_job(parser, kind, *, but=(), **changes) -> None:
@@ -149,12 +166,15 @@ def _demo(arguments, bar, open_file) -> int:
 
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
-    """The job that the arguments of demo, compare, shade, bake or view describe. Raises Misuse."""
-    kind = {"bake": BakeOptions, "view": ViewOptions}.get(arguments.command, PictureOptions)
+    """The job that the arguments of demo, compare, shade, bake, view or render describe. Raises Misuse."""
+    kinds = {"bake": BakeOptions, "view": ViewOptions, "render": RenderOptions}
+    kind = kinds.get(arguments.command, PictureOptions)
     command = "compare" if arguments.command == "demo" else arguments.command
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
+    if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:
+        raise Misuse("--budget chooses the samples of Cycles: give it or --cycles-samples, not both")
     options = options_from(kind, vars(arguments), scene=scenes[0])
     return Job(command, options, scenes, cameras, frames, arguments.pattern)
 
@@ -293,7 +313,7 @@ def _relight(arguments, bar, open_file) -> int:
     return _printed(arguments, report, 0)
 
 
-RUN = "Do the jobs of a file, each a shade, compare, bake or view, one after another."
+RUN = "Do the jobs of a file, each a shade, compare, bake, view or render, one after another."
 RUN_EXAMPLES = """examples:
   %(prog)s night.toml
   %(prog)s night.toml --shard 1/4 --resume --log night.log
@@ -303,7 +323,7 @@ night.toml:
   techniques = ["ltc", "ltsh4"]
 
   [[job]]
-  command = "compare"              # or "bake", "shade" or "view"
+  command = "compare"              # or "bake", "shade", "view" or "render"
   scene = "room.blend"             # or scenes = [...]; paths are relative to the job file
   output = "out/room"              # a folder for each job
   frames = "1-240:10"              # options are named as on the command line, without the dashes
@@ -345,7 +365,8 @@ def _run_jobs(arguments, bar, open_file) -> int:
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
     found = {}
-    for name, add_arguments in (("shade", add_shade), ("compare", add_compare), ("bake", add_bake), ("view", add_view)):
+    adders = {"shade": add_shade, "compare": add_compare, "bake": add_bake, "view": add_view, "render": add_render}
+    for name, add_arguments in adders.items():
         found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         add_arguments(found[name])
         found[name].set_defaults(command=name)
@@ -509,9 +530,9 @@ def _warnings(merged) -> list[str]:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, view
+    from ..pipeline import bake, picture, render, view
 
-    tables = {"bake": bake, "view": view}.get(merged.command, picture)
+    tables = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
     if merged.single and "reports" not in merged.report:
         lines = tables.summary(merged.report, merged.seconds)
     else:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..scene import FARTHEST, Film, SurfaceSamples
 from .horizons import unit
-from .lobes import HIT_AOVS, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
+from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
 
 # Arrays of one block stay in the cache.
 HITS_PER_BLOCK = 65536
@@ -90,9 +90,13 @@ def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
     """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV and is no holdout."""
+    return int(np.count_nonzero(_shows_surface(channels) & (read_aov(channels, "hit") == 0.0)))
+
+
+def _shows_surface(channels: dict[str, np.ndarray]) -> np.ndarray:
+    """Mask (H, W)."""
     depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")
-    shown = (depth < 1e9) & (read_layer(channels, "Combined", "A") != 0.0)
-    return int(np.count_nonzero(shown & (read_aov(channels, "hit") == 0.0)))
+    return (depth < 1e9) & (read_layer(channels, "Combined", "A") != 0.0)
 
 
 def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
@@ -102,6 +106,17 @@ def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
         return np.zeros(0, dtype=int)
     number = -np.rint(read_aov(channels, lobe_aov("kind", 0))[read_aov(channels, "hit") == 1.0]).astype(int)
     return np.bincount(number[number > 0] - 1, minlength=count)
+
+
+def kept_by_cycles(channels: dict[str, np.ndarray]) -> np.ndarray:
+    """Sum (H, W) of the KEPT_BITS of the passes in which what a one-sample render shows is not shaded as in Cycles."""
+    hit = read_aov(channels, "hit")
+    kept = read_aov(channels, KEPT_AOV) if any(f"{AOV_PREFIX}{KEPT_AOV}." in key for key in channels) else 0.0 * hit
+    kept = np.minimum(np.rint(kept), 3).astype(int)
+    # Several surfaces, or one that wrote nothing.
+    kept[(hit != 0.0) & (np.abs(hit - 1.0) > 1e-6)] = 3
+    kept[_shows_surface(channels) & (hit == 0.0)] = 3
+    return kept
 
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:

@@ -26,6 +26,8 @@ HIT_AOVS = {
     "smooth_normal": "COLOR",
     "true_normal": "COLOR",
 }
+# Of finished pictures alone: the sum of the bits of the passes in which Cycles keeps its direct light.
+KEPT_AOV, KEPT_BITS = "kept", {"specular": 1, "diffuse": 2}
 # Name of the quantity -> type of the AOV, and the value that changes nothing: an AOV that no material needs is left out
 # (None: never left out).
 LOBE_AOVS = {
@@ -73,6 +75,8 @@ def lobe_aov(name: str, slot: int) -> str:
 
 def aov_kind(name: str) -> str:
     """Type of an AOV: of HIT_AOVS, or as `lobe_aov` names it."""
+    if name == KEPT_AOV:
+        return "VALUE"
     return HIT_AOVS[name] if name in HIT_AOVS else LOBE_AOVS[name.rpartition("_")[0]][0]
 
 

@@ -9,7 +9,16 @@ Blender runs in a process of its own, so that nothing here needs bpy to be impor
 """
 
 from .bake import bake_scene
-from .options import BakeOptions, PictureOptions
+from .options import BakeOptions, PictureOptions, RenderOptions
 from .picture import compare_scene, shade_scene
+from .render import render_scene
 
-__all__ = ["BakeOptions", "PictureOptions", "bake_scene", "compare_scene", "shade_scene"]
+__all__ = [
+    "BakeOptions",
+    "PictureOptions",
+    "RenderOptions",
+    "bake_scene",
+    "compare_scene",
+    "render_scene",
+    "shade_scene",
+]

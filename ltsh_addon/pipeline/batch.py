@@ -13,7 +13,7 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, picture, view
+from . import bake, picture, render, view
 from .tasks import (
     FOLDER,
     FORMAT,
@@ -126,6 +126,8 @@ def _perform(job: Job, task: Task, following: tuple, existing: str, progress) ->
     if job.command == "bake":
         options = replace(options, resume=existing == RESUME)
         return bake.bake_objects(options, progress, tile=task.tile, following=following)
+    if job.command == "render":
+        return render.make_finished(options, progress)
     if job.command == "view":
         return view.draw_view(options, progress)
     return picture.make_picture(options, job.command == "compare", progress)
@@ -215,7 +217,7 @@ def _read_job(output: Path) -> dict:
 
 
 def _task_records(output, command) -> Records:
-    """Those of shade, compare and view hold the report of a picture; what failed has a problem instead."""
+    """Those of shade, compare, view and render hold the report of a picture; what failed has a problem instead."""
     report = bake.REPORT if command == "bake" else picture.REPORT
     return Records(output, "tasks", {**TASK_RECORD, "report?": report})
 

@@ -65,6 +65,22 @@ def tables(text: str) -> tuple[str, ...]:
     return tuple(table(name) for name in _parts(text) or ("",))
 
 
+def one_table(text: str) -> tuple[str, ...]:
+    """A shipped table or a path."""
+    return (table(text),)
+
+
+def seconds(text: str) -> float:
+    """Seconds of a budget."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < 1e9:
+        raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
+    return value
+
+
 def passes(text: str) -> tuple[str, ...]:
     """Passes of a picture, separated by commas."""
     return _passes(text, PASSES)
@@ -423,6 +439,39 @@ class ViewOptions:
     )  # fmt: skip
     shadows: str = _shadows()
     shadow_rays: int = _shadow_rays()
+    scripts: bool = _scripts()
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """What to finish and how; None means as in the file."""
+
+    scene: Path = _scene("one or more; left out when Blender has a file open")
+    frame: int | None = _frame()
+    camera: str | None = _camera()
+    name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
+    output: Path = _output()
+    techniques: tuple[str, ...] = option(
+        "--technique", default=("ltsh4",), type=one_table, metavar="T",
+        help=f"of the direct light: {', '.join(SHIPPED_TABLES)} or the path of a table (.npz) (default: ltsh4)",
+    )  # fmt: skip
+    resolution: tuple[int, int] | None = _resolution()
+    sub_samples: int | None = option(
+        "--aa", default=None, type=positive, metavar="N",
+        help="points per pixel of the direct light, drawn from the pixel filter (default: 8, or by the budget)",
+    )  # fmt: skip
+    cycles_samples: int | None = option(
+        "--cycles-samples", default=None, type=cycles_samples, metavar="N", help="of Cycles; default: as in the file"
+    )
+    budget: float | None = option(
+        "--budget", default=None, type=seconds, metavar="SECONDS",
+        help="of processor time for the whole picture, in place of --cycles-samples",
+    )  # fmt: skip
+    denoise: str = option(
+        "--denoise", default="on", choices=("on", "off"), help="what Cycles renders (default: %(default)s)"
+    )
+    shadow_rays: int = _shadow_rays()
+    keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
     scripts: bool = _scripts()
 
 

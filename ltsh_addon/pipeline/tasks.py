@@ -30,7 +30,7 @@ _TASK = {
     "name": file_name,
 }
 JOB = {
-    "command": ("shade", "compare", "bake", "view"),
+    "command": ("shade", "compare", "bake", "view", "render"),
     **dict.fromkeys(("single", "any_key"), bool),
     "applied_layer": str | None,
     "tasks": some([_TASK]),
@@ -52,11 +52,12 @@ _digests: dict[tuple, str] = {}
 class Job:
     """What is to be done: one command for every combination of scene, camera, frame (and object of a bake).
 
-    `options` are PictureOptions, BakeOptions or ViewOptions, of which scene, camera, frame and name are set for each
-    task. No cameras or frames means those of the file. `name` is a pattern of names of files, None the default one.
+    `options` are PictureOptions, BakeOptions, ViewOptions or RenderOptions, of which scene, camera, frame and name are
+    set for each task. No cameras or frames means those of the file. `name` is a pattern of names of files, None the
+    default one.
     """
 
-    command: str  # "shade", "compare", "bake" or "view"
+    command: str  # "shade", "compare", "bake", "view" or "render"
     options: Any
     scenes: tuple[Path, ...]
     cameras: tuple[str, ...] = ()
@@ -107,7 +108,7 @@ class Task:
         options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
         if self.object is not None:
             return replace(options, objects=(self.object,), name=self.stem)
-        if job.command == "view":
+        if job.command in ("view", "render"):
             return replace(options, name=self.name)
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
 

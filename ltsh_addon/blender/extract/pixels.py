@@ -166,8 +166,11 @@ def _reason(error: RuntimeError, path: Path) -> str:
     return text
 
 
-def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False) -> LightInventory:
-    """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found."""
+def prepare_scene(
+    scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False, for_finished: bool = False
+) -> LightInventory:
+    """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found, of which a
+    finished picture may have none."""
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -186,11 +189,12 @@ def prepare_scene(scene, view_layer, camera, warnings: list[str], *, with_occlud
     inventory.origin = origin
     default = give_default_material(bare)
     materials += [default] if default else []
-    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque)
+    kept = inventory.kept if for_finished else None
+    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, kept)
     inventory.receivers.mark()
     add_world(inventory, scene, world)
     warnings.extend(inventory.warnings)
-    if not inventory.lights:
+    if not inventory.lights and not for_finished:
         raise no_light(scene, inventory.warnings)
     warnings.extend(of_materials)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
@@ -220,13 +224,16 @@ def extract(job: dict, folder: Path, progress) -> dict:
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job.get("scripts", False))
-    scene = _scene_named(job.get("scene_name"))
+    scene = scene_named(job.get("scene_name"))
     render_settings.go_to_frame(scene, job["frame"])
     camera = render_settings.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
     picture = _picture(scene, job)
     has_shadows = job.get("shadows") == "on"
-    inventory = prepare_scene(scene, view_layer, camera, warnings, with_occluders=has_shadows)
+    for_finished = job.get("for_finished", False)
+    inventory = prepare_scene(
+        scene, view_layer, camera, warnings, with_occluders=has_shadows, for_finished=for_finished
+    )
     seconds["start"] = time.monotonic() - started
 
     if has_shadows:
@@ -257,6 +264,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
+        "kept": {**vars(inventory.kept), "warnings": inventory.warnings} if for_finished else None,
         "samples": samples,
         "reference": reference,
         "passes": render_settings.pass_names(),
@@ -264,7 +272,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
     }
 
 
-def _scene_named(name: str | None):
+def scene_named(name: str | None):
     """The scene `name` of the open file; None: the one it was saved with."""
     if name is None:
         return bpy.context.scene

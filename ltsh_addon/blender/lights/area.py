@@ -18,6 +18,7 @@ import numpy as np
 
 from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight, SpotCone, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
+from ..materials.aovs import KeptByCycles
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
 from .emission import NO_FACTOR, Falloff, emission_of, open_studio
@@ -54,6 +55,7 @@ class LightInventory:
     occluders: Any = None  # visibility.Occluders, where shadows are wanted
     made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
+    kept: KeptByCycles = field(default_factory=KeptByCycles)  # by Cycles, in finished pictures
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -87,6 +89,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         if problem:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
+            if not cycles_setting(ob.data, "is_portal"):
+                inventory.kept.everything.append(f"light {ob.original.name!r}, {problem}")
             continue
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
@@ -105,7 +109,11 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
                 inventory.unseen[len(inventory.lights)] = unseen
             inventory.lights.append(light)
     _note_overlaps(hit, inventory)
-    inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, inventory.warn)
+    lost: list[str] = []
+    inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, lost.append)
+    for reason in lost:
+        inventory.warn(reason)
+    inventory.kept.everything += lost
     for mesh in inventory.meshes:
         if mesh.light.affects_diffuse != mesh.light.affects_specular:
             inventory.warn(half_hidden(mesh.light))
@@ -219,7 +227,10 @@ def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
     eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
     with open_studio(scene) as studio:
         lights = look_at_area_lights(inventory.lights, inventory.unseen, studio, inventory.warn)
-        return lights + mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
+        of_meshes = mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
+    dark = [mesh.ob.name for mesh in inventory.meshes if mesh.is_dropped]
+    inventory.kept.everything += [f"object {name!r}, which emits from too many faces" for name in dark]
+    return lights + of_meshes
 
 
 def reason_to_leave_out(ob, matrix: np.ndarray) -> str:

@@ -39,6 +39,7 @@ class MeshLight:
     emission: list[Emission]  # per slot
     placements: list[Placement] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
+    is_dropped: bool = False  # it lights nothing, for it has too many faces
 
     @property
     def varies(self) -> bool:
@@ -203,6 +204,7 @@ def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn
                 f"object {mesh_light.ob.name!r}: it emits from {count} flat faces, more than {MOST_POLYGONS}; it "
                 "lights nothing, in the Cycles reference neither; give it fewer faces or light the scene by area lights"
             )
+            mesh_light.is_dropped = True
             continue
         own = _constant_lights(mesh_light, parts, radiance, side)
         own += _textured_lights(mesh_light, parts, side, studio, warn)

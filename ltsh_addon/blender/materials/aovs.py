@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import functools
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import bpy
 
-from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, KEPT_BITS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
 from ...scene import listed
 from ..render_settings import SCRIPT
-from .bsdfs import bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of
+from .bsdfs import BOTH, NEITHER, bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of, passes_of_cycles
 from .graph import (
     CLEAR,
     MIX,
@@ -63,6 +63,24 @@ class MaterialLobes:
     is_transparent: bool = False  # rays pass through it and meet the next surface
     unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
     made_opaque: tuple[tuple, ...] = ()  # input sockets, and the socket or number that was there
+    kept: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
+    has_volume: bool = False
+
+
+@dataclass
+class KeptByCycles:
+    """What finished pictures leave to Cycles: of materials some passes, with the reason, or all direct light."""
+
+    materials: list[str] = field(default_factory=list)
+    everything: list[str] = field(default_factory=list)
+
+    def note(self, material, lobes: MaterialLobes) -> None:
+        """Take over what is said of the `lobes` of a material."""
+        if lobes.has_volume:
+            self.everything.append(f"the volume of material {material.name!r}")
+        if lobes.kept:
+            why = listed([line.partition(": ")[2] for line in lobes.warnings] or [lobes.unshaded], 2, "; ")
+            self.materials.append(f"material {material.name!r} ({' and '.join(sorted(lobes.kept))}: {why})")
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
@@ -73,6 +91,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
+    kept, has_volume = _kept_by_cycles(output, shaders), live_link(output.inputs["Volume"]) is not None
     made_opaque = []
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
@@ -92,7 +111,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
-        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque))
+        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque), kept, has_volume)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             alpha = leaf.node.inputs["Alpha"]
@@ -110,7 +129,17 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     unshaded = ""
     if unknown and not leaves:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    return MaterialLobes(tuple(leaves), values, warnings, False, unshaded, tuple(made_opaque))
+    return MaterialLobes(tuple(leaves), values, warnings, False, unshaded, tuple(made_opaque), kept, has_volume)
+
+
+def _kept_by_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
+    """The passes in which direct light on a material is not as in Cycles."""
+    leaves = shaders.leaves
+    if all(leaf.is_transparent for leaf in leaves):
+        return BOTH if _tinted(leaves) else NEITHER
+    if shaders.cuts or _noted_nodes(output.id_data) or shaded_leaves(shaders)[1]:
+        return BOTH
+    return NEITHER.union(*(passes_of_cycles(leaf.node) for leaf in leaves if not is_emission(leaf.node)))
 
 
 def let_shadow_rays_through(made_opaque) -> None:
@@ -232,12 +261,13 @@ def inject_aovs(
     emitters: frozenset[str] = frozenset(),
     unshaded: list[str] | None = None,
     made_opaque: list[tuple] | None = None,
+    kept: KeptByCycles | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; warnings.
 
     Materials light nothing, but for those with a full name in `emitters`. A material that is not shaded at all writes
     -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry; `made_opaque` gets what
-    `let_shadow_rays_through` takes.
+    `let_shadow_rays_through` takes, and `kept` what a finished picture leaves to Cycles.
     """
     unshaded = [] if unshaded is None else unshaded
     made_opaque = [] if made_opaque is None else made_opaque
@@ -250,6 +280,10 @@ def inject_aovs(
         lobes = lobes_of(material, emitter)
         warnings += lobes.warnings
         made_opaque += lobes.made_opaque
+        if kept is not None:
+            kept.note(material, lobes)
+            if lobes.kept:
+                _write_aov(material.node_tree, KEPT_AOV, sum(KEPT_BITS[name] for name in lobes.kept))
         if not lobes.is_transparent:
             found.append(lobes)
             _write_hit(material)

@@ -15,6 +15,7 @@ from .graph import PRINCIPLED, is_constant, is_socket, live_link, product, value
 EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
+SUBSURFACE = "ShaderNodeSubsurfaceScattering"
 NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> the property that chooses among its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}
@@ -79,7 +80,7 @@ BSDFS = {
     ),
     # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
     (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
-    ("ShaderNodeSubsurfaceScattering", ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),
+    (SUBSURFACE, ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),
 }
 # Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
 NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
@@ -171,6 +172,26 @@ def notes_of(node) -> list[str]:
         alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
         notes.append(f"distribution {distribution} of {node.name!r} is shaded as GGX of {alpha}")
     return notes
+
+
+# Where a node is not what Cycles makes of it, its specular reflection is not, unless something else stands here.
+BOTH, DIFFUSE_ALONE, NEITHER = frozenset(("specular", "diffuse")), frozenset(("diffuse",)), frozenset()
+DIFFERENT_PASSES = {
+    GLASS: NEITHER, SUBSURFACE: DIFFUSE_ALONE, SHEEN: BOTH, TOON: BOTH,
+    "Subsurface Weight": DIFFUSE_ALONE, "Transmission Weight": NEITHER, "Thin Wall": BOTH,
+}  # fmt: skip
+
+
+def passes_of_cycles(node) -> frozenset[str]:
+    """The passes in which direct light on the shader `node` is not what Cycles makes of it."""
+    bsdf = bsdf_of(node)
+    if bsdf is None or has_alpha(node):
+        return BOTH
+    different = [name for name, (neutral, _) in bsdf.not_shaded.items()
+                 if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral)]  # fmt: skip
+    different += [node.bl_idname] if bsdf.nearest else []
+    different += ["distribution"] if getattr(node, "distribution", "") in NEAREST_ALPHA else []
+    return NEITHER.union(*(DIFFERENT_PASSES.get(name, frozenset(("specular",))) for name in different))
 
 
 def has_alpha(node) -> bool:

@@ -90,15 +90,33 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
 EMBREE_PLACES = ("lib/libembree4*", "blender.shared/embree4*.dll", "embree4*.dll", "../Resources/lib/libembree4*")
 
 
+DENOISER_PLACES = tuple(
+    f"{folder}{name}"
+    for folder, name in (
+        ("lib/", "libOpenImageDenoise.so*"), ("blender.shared/", "OpenImageDenoise.dll"), ("", "OpenImageDenoise.dll"),
+        ("../Resources/lib/", "libOpenImageDenoise*"), ("lib/", "libOpenImageDenoise*.dylib"),
+    )
+)  # fmt: skip
+
+
 def embree_libraries() -> list[Path]:
     """Files of Embree 4 that this Blender, or pip's bpy, has brought along; none where the system has it."""
+    return _brought_along(EMBREE_PLACES)
+
+
+def denoiser_libraries() -> list[Path]:
+    """The same of Open Image Denoise 2."""
+    return _brought_along(DENOISER_PLACES)
+
+
+def _brought_along(places) -> list[Path]:
     bpy = sys.modules.get("bpy")
     own = bpy.app.binary_path if bpy is not None else ""
     if not own:
         spec = importlib.util.find_spec("bpy")
         own = spec.origin if spec is not None and spec.origin else ""
     folder = Path(own).parent
-    return [path for place in EMBREE_PLACES for path in sorted(folder.glob(place))] if own else []
+    return [path for place in places for path in sorted(folder.glob(place))] if own else []
 
 
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:

@@ -39,6 +39,17 @@ class ExtractOptions:
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
+    for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
+
+
+@dataclass(frozen=True)
+class KeptByCycles:
+    """Of a finished picture: where direct light is Cycles' own, and why."""
+
+    by_pass: dict[str, np.ndarray]  # (H, W) bool
+    materials: tuple[str, ...]
+    everything: tuple[str, ...]  # why all of it is
+    warnings: tuple[str, ...]  # about what is shaded in place of it
 
 
 # Materials, or other reasons, that an error names.
@@ -82,8 +93,10 @@ class Extraction:
     emission: np.ndarray | None = None
     problems: tuple[str, ...] = ()
     occluders: Occluders | None = None
+    kept: KeptByCycles | None = None
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     light_settings: dict[str, list[float]] = field(default_factory=dict)
+    processor_seconds: float = 0.0  # of the child
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -103,7 +116,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         samples, film, warnings, problems = _read_samples(manifest, folder)
         lights = tuple(AreaLight(**record) for record in manifest["lights"])
         warnings += gbuffer.rounded_positions(samples.position, lights)
-        if not problems:
+        if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
         # In the file, where double precision tells positions apart.
@@ -120,9 +133,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
             emission=_read_emission(manifest, folder) if options.emission else None,
+            kept=_read_kept(manifest, folder),
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
+            processor_seconds=manifest["processor_seconds"],
         )
 
 
@@ -204,6 +219,16 @@ def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
     return np.mean(images, axis=0, dtype=np.float64)
 
 
+def _read_kept(manifest: dict, folder: Path) -> KeptByCycles | None:
+    """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
+    found = manifest.get("kept")
+    if found is None:
+        return None
+    bits = [gbuffer.kept_by_cycles(_rendered(folder / file)) for file in manifest["samples"]]
+    by_pass = {name: np.any([(number & bit) > 0 for number in bits], axis=0) for name, bit in lobes.KEPT_BITS.items()}
+    return KeptByCycles(by_pass, *(tuple(found[name]) for name in ("materials", "everything", "warnings")))
+
+
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
     """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
     if manifest["reference"] is None:
@@ -228,6 +253,82 @@ def _rendered(path: Path) -> dict[str, np.ndarray]:
         return read_channels(path)
     except ValueError as error:
         raise OSError(errno.ENOSPC, "a picture was not written whole") from error
+
+
+@dataclass(frozen=True)
+class FinishedJob:
+    """What Cycles is to render of which file, untouched; None means as in the file."""
+
+    scene: Path
+    frame: int | None
+    camera: str | None
+    scene_name: str | None
+    view_layer: str | None
+    width: int | None
+    height: int | None
+    cycles_samples: int | None
+    seconds: float | None  # of processor time, in place of samples
+    scripts: bool = False  # run those of the file
+
+
+@dataclass(frozen=True)
+class CyclesPicture:
+    """What Cycles has rendered, row 0 on top: channels (H, W) by name, without the name of the view layer."""
+
+    channels: dict[str, np.ndarray]
+    guides: dict[str, np.ndarray]  # for the denoiser
+    names: dict[str, str]  # of passes, as `pass_names` has them
+    samples: int
+    everything: tuple[str, ...]  # why all direct light is to be that of Cycles
+    warnings: tuple[str, ...]
+    camera: str
+    frame: int
+    processor_seconds: float
+
+
+def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
+    """The scene as Cycles renders it. Raises as `extract` does."""
+    scene = Path(job.scene).absolute()
+    check_readable(scene)
+    manifest = run_child({"task": "finished", **asdict(job), "scene": str(scene)}, folder, progress)
+    channels = _mean_of_chunks(manifest, folder)
+    guides = {name: plane for name, plane in channels.items() if name.startswith("Denoising ")}
+    dropped = tuple(f"{name}." for name in manifest["dropped"])
+    return CyclesPicture(
+        channels={name: plane for name, plane in channels.items() if not name.startswith(dropped)},
+        guides=guides,
+        names=manifest["passes"],
+        samples=sum(count for _, count in manifest["files"]),
+        everything=tuple(manifest["everything"]),
+        warnings=tuple(manifest["warnings"]),
+        camera=manifest["camera"],
+        frame=manifest["frame"],
+        processor_seconds=manifest["processor_seconds"],
+    )
+
+
+def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:
+    """The channels: of light the mean over all chunks, of all else those of the largest one."""
+    files = sorted(manifest["files"], key=lambda item: -item[1])
+    total, prefix, channels = sum(count for _, count in files), f"{manifest['layer']}.", {}
+    for name, count in files:
+        read = {key.removeprefix(prefix): plane for key, plane in _rendered(folder / name).items()}
+        if not channels:
+            channels = read
+            light = [key for key in read if key[-2:] in (".R", ".G", ".B", ".A") or key.startswith("Denoising ")]
+            if len(files) > 1:
+                channels |= {key: count / total * read[key] for key in light}
+        else:
+            for key in light:
+                channels[key] += count / total * read[key]
+    return channels
+
+
+def show_finished(scene: Path, where: tuple, folder: Path, name: str, *, progress: Progress | None = None) -> None:
+    """Write `combined.npy` of `folder` as the PNG `name` there, through the view transform of a scene of the file at a
+    frame, `where` (None: those of the file)."""
+    job = {"task": "show", "scene": str(Path(scene).absolute()), "pixels": str(folder / "combined.npy"), "name": name}
+    run_child({**job, "scene_name": where[0], "frame": where[1]}, folder, progress)
 
 
 @dataclass(frozen=True)

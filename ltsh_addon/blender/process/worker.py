@@ -10,6 +10,7 @@ import json
 import os
 import queue
 import sys
+import time
 import traceback
 from pathlib import Path
 
@@ -41,11 +42,17 @@ def main() -> None:
         path = Path(jobs.get())
 
 
+_told = [0.0]
+
+
 def _answer(job: dict, folder: Path, progress) -> dict:
     """Do `job` and write the manifest; the message that says so, or what is wrong."""
     files = _module("files")
     try:
         manifest = _perform(job, folder, progress)
+        # Of this job and of what was before it since the last manifest, the start of Blender included.
+        manifest["processor_seconds"] = time.process_time() - _told[0]
+        _told[0] = time.process_time()
         (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
         return {"done": True}
     except _module("scene").SceneError as error:
@@ -68,6 +75,10 @@ def _perform(job: dict, folder: Path, progress) -> dict:
         return _module("blender.extract.bake").extract_bake(job, folder, progress)
     if job["task"] == "facts":
         return _module("blender.extract.bake").scene_facts(job, progress)
+    if job["task"] == "finished":
+        return _module("blender.extract.finished").render_finished(job, folder, progress)
+    if job["task"] == "show":
+        return _module("blender.extract.finished").show_finished(job, folder, progress)
     if job["task"] == "view":
         return _module("blender.viewport.still").draw_view(job, folder, progress)
     if job["task"] == "apply":

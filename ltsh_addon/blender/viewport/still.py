@@ -47,7 +47,7 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
     for number, pixels in enumerate(drawn["pictures"]):
         technique, index = divmod(number, len(VIEW_PASSES))
         save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
-    _save_png(scene, drawn["pictures"][0], folder / VIEW_PNG)
+    render_settings.save_png(scene, drawn["pictures"][0], folder / VIEW_PNG)
     return {
         "blender_version": bpy.app.version_string,
         "graphics": drawn["graphics"],
@@ -242,21 +242,3 @@ class _Canvas:
             _renderer[:] = [self._renderer]
         else:
             self._renderer.free()
-
-
-def _save_png(scene, pixels: np.ndarray, path: Path) -> None:
-    """Save `pixels` (H, W, 4), row 0 on top, as Blender shows them: through the view transform of the scene."""
-    height, width = pixels.shape[:2]
-    image = bpy.data.images.new("LTSH view", width, height, alpha=True, float_buffer=True)
-    if bpy.app.version >= (5, 0, 0):
-        image.colorspace_settings.name = bpy.data.colorspace.working_space
-    # Blender takes color for multiplied by alpha, as it is.
-    image.alpha_mode = "PREMUL"
-    image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1], np.float32).ravel())
-    settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0, 0):
-        settings.media_type = "IMAGE"
-    settings.file_format, settings.color_depth = "PNG", "8"
-    settings.color_mode = "RGBA" if scene.render.film_transparent else "RGB"
-    image.save_render(str(path), scene=scene)
-    bpy.data.images.remove(image)

@@ -1,0 +1,163 @@
+"""The untouched scene as Cycles renders it, for finished pictures (runs in the child)."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .. import render_settings
+from ..evaluated import SURFACE_TYPES
+from ..materials.graph import tree_in_use
+from ..render_settings import render_exr, working_space
+from .pixels import open_scene, scene_named
+
+# Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
+# the others.
+FIRST, PROBE, CHUNK_SECONDS, MOST_CHUNKS = 16, 2, 6.0, 6
+# Of a budget: so much of it is left for what comes after the last sample.
+SPENT = 0.97
+# Passes that a finished picture takes its parts from, those that artists put together, and what the denoiser wants.
+LIGHT_PASSES = tuple(
+    f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")
+)
+PASSES = (*LIGHT_PASSES, "emit", "environment")
+GUIDES = ("Denoising Albedo", "Denoising Normal")
+NOT_WRITTEN = (*GUIDES, "Denoising Depth", "Denoising Specular Albedo", "Denoising Roughness")
+
+
+def render_finished(job: dict, folder: Path, progress) -> dict:
+    """Do the `job` (see `client.FinishedJob`), write EXRs into `folder`; the manifest as a dictionary."""
+    warnings: list[str] = []
+    progress("open scene", 0.0)
+    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    scene = scene_named(job["scene_name"])
+    render_settings.go_to_frame(scene, job["frame"])
+    camera = render_settings.choose_camera(scene, job["camera"])
+    layer = _only_layer(scene, job["view_layer"], warnings)
+    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    everything = _kept_by_cycles(scene, layer, camera)
+    dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
+    _prepare(scene, layer, warnings)
+    files = _render_chunks(scene, layer, folder, job, progress)
+    border = render_settings.render_border(scene)
+    return {
+        "blender_version": bpy.app.version_string,
+        "frame": scene.frame_current,
+        "camera": camera.name,
+        "width": width,
+        "height": height,
+        "border": None if border is None else vars(border),
+        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
+        "pixel_filter": render_settings.filter_name(scene),
+        "exposure": scene.cycles.film_exposure,
+        "color_space": working_space(),
+        "layer": layer.name,
+        "files": files,
+        "dropped": dropped,
+        "passes": render_settings.pass_names(),
+        "everything": everything,
+        "warnings": warnings,
+    }
+
+
+def show_finished(job: dict, folder: Path, progress) -> dict:
+    """Write a PNG of pixels (H, W, 4) through the view transform of the scene."""
+    progress("view transform", 0.0)
+    if Path(bpy.data.filepath) != Path(job["scene"]):
+        open_scene(Path(job["scene"]), [], False)
+    scene = scene_named(job["scene_name"])
+    render_settings.go_to_frame(scene, job["frame"])
+    render_settings.save_png(scene, np.load(job["pixels"]), folder / job["name"])
+    return {}
+
+
+def _only_layer(scene, name: str | None, warnings: list[str]):
+    """The only view layer that is rendered from now on, the one called `name` or the first in use; else untouched."""
+    used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
+    if name is not None:
+        used = [scene.view_layers[name]]
+    if len(used) > 1:
+        warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is rendered")
+    for layer in scene.view_layers:
+        layer.use = layer == used[0]
+    return used[0]
+
+
+def _kept_by_cycles(scene, layer, camera) -> list[str]:
+    """Why all direct light of the picture is left to Cycles."""
+    world = layer.world_override or scene.world
+    outputs = [] if world is None or tree_in_use(world) is None else tree_in_use(world).nodes
+    rendered = [ob for ob in scene.objects if not ob.hide_render]
+    found = {
+        f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
+        "motion blur": scene.render.use_motion_blur,
+        "the volume of the world": any(
+            node.bl_idname == "ShaderNodeOutputWorld" and node.inputs["Volume"].is_linked for node in outputs
+        ),
+    }
+    for ob in rendered:
+        found[f"volume {ob.name!r}"] = ob.type == "VOLUME"
+        found[f"shadow catcher {ob.name!r}"] = ob.type in SURFACE_TYPES and ob.is_shadow_catcher
+    return [reason for reason, is_there in found.items() if is_there]
+
+
+def _prepare(scene, layer, warnings: list[str]) -> None:
+    """Let Cycles write all passes; nothing changes what it renders."""
+    render, cycles = scene.render, scene.cycles
+    warnings.extend(render_settings.steps_after_rendering(scene))
+    if render.use_multiview:
+        warnings.append("stereoscopy is switched off")
+    # A render evaluates its animation again, and would undo what is set.
+    if scene.animation_data is not None:
+        scene.animation_data_clear()
+    render.engine = "CYCLES"
+    render.threads_mode, render.threads = "FIXED", render_settings.cores()
+    render.use_compositing = render.use_sequencer = render.use_multiview = False
+    render.use_file_extension = render.use_overwrite = True
+    # The second and further files need no second look at the scene.
+    render.use_persistent_data = True
+    if cycles.device != "CPU":
+        warnings.append("Cycles renders on the processor, the file asks for a graphics card")
+    cycles.device = "CPU"
+    # We denoise what remains without our light. The same noise in each frame does not flicker.
+    cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = False
+    for name in PASSES:
+        setattr(layer, f"use_pass_{name}", True)
+    layer.cycles.denoising_store_passes = True
+
+
+def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list]:
+    """[file name in `folder`, samples in it]: the samples of the job, or as many as its seconds allow, or those of the
+    file in one go with all that it says of them."""
+    cycles, files, done = scene.cycles, [], 0
+    samples, seconds = job["cycles_samples"], job["seconds"]
+    if samples is None and seconds is None:
+        render_exr(scene, folder / "cycles_0.exr")
+        return [["cycles_0.exr", layer.samples or cycles.samples]]
+    layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
+    cycles.use_sample_subset = True
+    end = None if seconds is None else time.process_time() + SPENT * seconds
+    chunk = min(FIRST, samples) if end is None else PROBE
+    while samples is None or done < samples:
+        progress("Cycles", done / samples if samples else len(files) / 3)
+        clock = time.process_time if end is not None else time.monotonic
+        started = clock()
+        cycles.samples = done + chunk if samples is None else samples
+        cycles.sample_offset, cycles.sample_subset_length = done, chunk
+        files.append([f"cycles_{len(files)}.exr", chunk])
+        render_exr(scene, folder / files[-1][0])
+        done += chunk
+        each = (clock() - started) / chunk
+        if end is not None:
+            # The first time holds the look at the scene, so the next one tells better what a sample takes.
+            left = int((end - time.process_time()) / each)
+            chunk = left if len(files) > 1 else min(left, 4 * PROBE)
+            if chunk < 1 or len(files) == 3:
+                break
+        else:
+            chunks = min(MOST_CHUNKS, max(1, round(each * (samples - done) / CHUNK_SECONDS)))
+            chunk = max(1, min(-(-(samples - done) // chunks), samples - done))
+    return files

@@ -1,0 +1,316 @@
+"""Finished pictures: our direct light, and everything else by Cycles, denoised.
+
+    combined = ours + rest,  rest = denoised(Combined of Cycles - its direct light where ours takes its place)
+
+Ours, a specular and a diffuse picture, takes the place of Cycles' direct light pixel by pixel. Where something is not
+shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .. import imaging
+from ..cycles.lobes import read_layer
+from ..files import save_array, temporary_folder, write_bytes
+from ..imaging.denoise import NoDenoiser, open_denoiser
+from ..imaging.exr import write_channels
+from ..scene import PASSES, Cancelled, Progress, listed
+from ..shading.parallel import cores
+from . import lighting, picture
+from .options import PictureOptions, RenderOptions, child_job
+
+# Names of the passes of Cycles in `pass_names`: light and color of each pass of ours.
+DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
+ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
+COMBINED, REST = "combined", "rest"
+SHOWN = "shown.png"
+# Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
+SUB_SAMPLES, LAST_SECONDS = 8, 6.0
+NAMED = 8  # of what Cycles keeps, in a warning
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished picture, row 0 on top, in scene-referred radiance times the exposure."""
+
+    combined: np.ndarray  # (H, W, 4)
+    rest: np.ndarray  # (H, W, 4), what is not ours
+    ours: dict[str, np.ndarray]  # (H, W, 3) by layer: ltsh4.specular, ltsh4.specular@Key, ...
+    channels: dict[str, np.ndarray]  # (H, W) of Cycles, with ours in place of its direct light
+    report: dict
+    seconds: dict[str, Any]
+    comparison: picture.Comparison
+    cycles: Any  # blender.process.client.CyclesPicture
+
+
+def render_scene(options: RenderOptions, progress: Progress | None = None) -> dict:
+    """Write render.exr, render.png, report.json and timing.json of a scene; the report with times as "seconds".
+
+    Raises SceneError, TableError, OSError, Cancelled.
+    """
+    made = make_finished(options, progress)
+    imaging.write_json(Path(options.output) / "report.json", made.report)
+    imaging.write_json(Path(options.output) / "timing.json", {"seconds": made.seconds})
+    return {**made.report, "seconds": made.seconds}
+
+
+def make_finished(options: RenderOptions, progress: Progress | None = None) -> picture.TaskResult:
+    """Finish one picture and write its files but report.json. Raises as `render_scene` does."""
+    from ..blender.process import client
+    from ..blender.process.blender_process import kept_blender
+
+    with temporary_folder() as folder, kept_blender(folder):
+        made = finish(options, progress)
+        save_array(folder / "combined.npy", made.combined.astype(np.float32))
+        client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
+        shown = (folder / SHOWN).read_bytes()
+    if progress is not None and progress("write", 0.0) is False:
+        raise Cancelled("stopped before the files were written")
+    name = options.name or "render"
+    path = Path(options.output) / f"{name}.exr"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write_exr(path, made, options)
+    write_bytes(path.with_suffix(".png"), shown)
+    files = [f"{name}.exr", f"{name}.png"]
+    if options.keep_visibility:
+        files.append(f"{name}{lighting.KEPT_SUFFIX}")
+        comparison = made.comparison
+        lighting.keep_picture(
+            comparison.extraction, comparison.shadows, comparison.options, Path(options.output) / files[-1]
+        )
+    return picture.TaskResult(made.report, made.seconds, tuple(files))
+
+
+def finish(
+    options: RenderOptions,
+    progress: Progress | None = None,
+    *,
+    scene_name: str | None = None,
+    view_layer: str | None = None,
+) -> Finished:
+    """The finished picture of a scene and view layer, by default those of the file. Raises as `render_scene` does."""
+    from ..blender.process import client
+    from ..blender.process.blender_process import kept_blender
+
+    start, clock = time.perf_counter(), _ProcessorClock()
+    where = {"scene_name": scene_name, "view_layer": view_layer}
+    with temporary_folder() as folder, kept_blender(folder):
+        comparison = _ours(options, where, clock, progress)
+        spent = clock.seconds()
+        film = comparison.film
+        reserve = LAST_SECONDS * film.width * film.height / 1e6
+        seconds = None if options.budget is None else max(options.budget - spent - reserve, 0.0)
+        width, height = options.resolution or (None, None)
+        job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)
+        cycles = client.render_finished(job, folder, progress=progress)
+        clock.end("cycles", cycles.processor_seconds)
+    ours = _taken(comparison, cycles)
+    rest, denoiser, problems = _rest(cycles, ours, options, progress)
+    combined = rest.copy()
+    for part in ours.values():
+        combined[..., :3] += part.image
+    clock.end("denoise")
+    report = _report(comparison, cycles, ours, problems)
+    report["finished"] |= {"denoiser": denoiser, "budget_s": options.budget}
+    seconds = {
+        **comparison.extraction.seconds,
+        "techniques": {name: result.seconds for name, result in comparison.results.items()},
+        "processor": {**clock.stages, "total": clock.seconds()},
+        "total": time.perf_counter() - start,
+    }
+    if comparison.shadows is not None:
+        seconds["shadows"] = comparison.shadows.seconds
+    layers, channels = _layers(comparison, ours), _replaced(cycles, ours)
+    return Finished(combined, rest, layers, channels, report, seconds, comparison, cycles)
+
+
+class _ProcessorClock:
+    """Processor seconds of this process and of children that have ended, from now on."""
+
+    def __init__(self):
+        self._start, self._others, self.stages = self._now(), 0.0, {}
+
+    @staticmethod
+    def _now() -> float:
+        seconds = time.process_time()
+        with suppress(ImportError):
+            import resource
+
+            usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+            seconds += usage.ru_utime + usage.ru_stime
+        return seconds
+
+    def end(self, stage: str, of_child: float = 0.0) -> None:
+        """A stage has ended, for which a child, which has not, took so many seconds."""
+        self._others += of_child
+        self.stages[stage] = self.seconds() - sum(self.stages.values())
+
+    def seconds(self) -> float:
+        return self._now() - self._start + self._others
+
+
+def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress) -> picture.Comparison:
+    """The direct light by the technique, with shadows."""
+    from ..blender.process import client
+
+    tables = picture.load_tables(options.techniques)
+    width, height = options.resolution or (None, None)
+    own = child_job(
+        *(PictureOptions, options), passes=PASSES, sub_samples=options.sub_samples or SUB_SAMPLES, shadows="on",
+        cycles_samples=2,
+    )  # fmt: skip
+    job = child_job(
+        client.ExtractOptions, own, **where, width=width, height=height, cycles_samples=0, for_finished=True
+    )
+    extraction = client.extract(job, progress=progress)
+    clock.end("extraction", extraction.processor_seconds)
+    if not extraction.lights or extraction.kept.everything:
+        return picture.Comparison(own, extraction, {}, None)
+    shadows = lighting.trace_shadows(extraction, PASSES, options.shadow_rays, progress)
+    clock.end("shadows")
+    results = picture.evaluated(tables, extraction, shadows, own, progress)
+    clock.end("shading")
+    return picture.Comparison(own, extraction, results, shadows)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One pass of ours, and where it takes the place of Cycles' direct light, which is `light` times `color`."""
+
+    image: np.ndarray  # (H, W, 3), black elsewhere
+    is_taken: np.ndarray  # (H, W) bool
+    light: np.ndarray  # (H, W, 3)
+    color: np.ndarray  # (H, W, 3)
+
+
+def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
+    """Ours by pass."""
+    kept, found = comparison.extraction.kept, {}
+    shape = comparison.film.height, comparison.film.width
+    keeps_all = bool(cycles.everything or kept.everything)
+    result = next(iter(comparison.results.values()), None)
+    for name, (light, color) in DIRECT.items():
+        image = np.zeros((*shape, 3))
+        is_taken = np.zeros(shape, bool)
+        if result is not None and not keeps_all:
+            is_taken = ~kept.by_pass[name]
+            image = comparison.images[next(iter(comparison.results)), name]
+        light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
+        found[name] = _Part(np.where(is_taken[..., None], image, 0.0), is_taken, light, color)
+    return found
+
+
+def _rest(cycles, ours: dict[str, _Part], options, progress) -> tuple[np.ndarray, str, list[str]]:
+    """What is not ours (H, W, 4), denoised, the name of the denoiser ("" for none), and what was wrong with it."""
+    from ..blender.process.blender_process import denoiser_libraries
+
+    if progress is not None and progress("denoise", 0.0) is False:
+        raise Cancelled("stopped before the picture was denoised")
+    rest = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64)
+    for part in ours.values():
+        rest[..., :3] -= np.where(part.is_taken[..., None], part.light.astype(np.float64) * part.color, 0.0)
+    if options.denoise == "off":
+        return rest, "", []
+    albedo, normal = (read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL))
+    try:
+        with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+            rest[..., :3] = denoiser.denoised(rest[..., :3], albedo, normal)
+            return rest, denoiser.name, []
+    except NoDenoiser as error:
+        return rest, "", [f"{error}; the picture is not denoised"]
+
+
+def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
+    """Ours by the names of layers, also by light group where there are several."""
+    if not comparison.results:
+        return {}
+    (name, result), layers = next(iter(comparison.results.items())), {}
+    groups = result.shading.groups
+    for pass_name, part in ours.items():
+        layers[f"{name}.{pass_name}"] = part.image
+        values = comparison.extraction.exposure * getattr(result.shading, pass_name)
+        for group, own in zip(lighting.group_names(groups), values if len(groups) > 1 else (), strict=False):
+            image = comparison.film.image(own)
+            layers[f"{name}.{pass_name}@{group}"] = np.where(part.is_taken[..., None], image, 0.0)
+    return layers
+
+
+def _replaced(cycles, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
+    """The channels of Cycles, but for its noisy Combined, with ours in place of its direct light."""
+    channels = {name: plane for name, plane in cycles.channels.items() if not name.startswith("Combined.")}
+    for name, (light, _) in DIRECT.items():
+        part = ours[name]
+        own = np.divide(part.image, part.color, out=np.zeros_like(part.image), where=part.color > 0.0)
+        for index, letter in enumerate("RGB"):
+            key = f"{cycles.names[light]}.{letter}"
+            channels[key] = np.where(part.is_taken, own[..., index], channels[key])
+    return channels
+
+
+def _report(comparison: picture.Comparison, cycles, ours: dict[str, _Part], problems: list[str]) -> dict:
+    """That of a picture, and under "finished" what came from where."""
+    kept = comparison.extraction.kept
+    everything = [*cycles.everything, *kept.everything]
+    warnings = [*cycles.warnings, *kept.warnings, *problems]
+    if comparison.shadows is not None:
+        warnings += comparison.shadows.warnings
+    if everything:
+        why = listed(everything, NAMED, "; ")
+        warnings.append(f"all direct light is Cycles' own and denoised, because LTSH does not shade: {why}")
+    if kept.materials and not everything:
+        why = listed(kept.materials, NAMED, "; ")
+        warnings.append(f"direct light on some surfaces is Cycles' own and denoised: {why}")
+    return {
+        **comparison.report(),
+        "camera": cycles.camera,
+        "cycles_samples": cycles.samples,
+        "problems": [],
+        "warnings": list(dict.fromkeys(warnings)),
+        "finished": {
+            "share_of_ours": {name: float(part.is_taken.mean()) for name, part in ours.items()},
+            "all_by_cycles": everything,
+            "materials_by_cycles": list(kept.materials),
+        },
+    }
+
+
+def _write_exr(path: Path, made: Finished, options: RenderOptions) -> None:
+    extraction = made.comparison.extraction
+    metadata = {
+        "ltsh:scene": Path(options.scene).name,
+        "ltsh:frame": str(extraction.frame),
+        "ltsh:camera": extraction.camera,
+        "ltsh:version": made.report["versions"]["ltsh"],
+        "ltsh:exposure": repr(extraction.exposure),
+        "ltsh:color_space": extraction.color_space.name,
+    }
+    planes = {}
+    for name, pixels in {COMBINED: made.combined, **made.ours, REST: made.rest}.items():
+        planes |= imaging.Layer(pixels).planes(name)
+    planes |= made.channels
+    write_channels(path, planes, metadata, imaging.chromaticities(extraction.color_space), extraction.pixel_aspect)
+
+
+def summary(report: dict, seconds: dict) -> list[str]:
+    """What one picture is made of, and how long it took."""
+    found, (width, height) = report["finished"], report["resolution"]
+    shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found["share_of_ours"].items())
+    took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
+    denoised = f"denoised by {found['denoiser']}" if found["denoiser"] else "not denoised"
+    return [
+        f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
+        f"{denoised}{took}",
+        f"direct light by LTSH on: {shares} of the pixels",
+    ]
+
+
+def brief(report: dict) -> list[str]:
+    """A line for one picture of several."""
+    return [f"{report['name']:<32} frame {report['frame']}, camera {report['camera']}"]

@@ -452,7 +452,7 @@ class RenderOptions:
     name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
     output: Path = _output()
     techniques: tuple[str, ...] = option(
-        "--technique", default=("ltsh4",), type=one_table, metavar="T",
+        "--techniques", default=("ltsh4",), type=one_table, metavar="T",
         help=f"of the direct light: {', '.join(SHIPPED_TABLES)} or the path of a table (.npz) (default: ltsh4)",
     )  # fmt: skip
     resolution: tuple[int, int] | None = _resolution()

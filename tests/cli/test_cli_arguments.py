@@ -53,12 +53,12 @@ def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint)
         (["tables"], "action"),
         (["tables", "burn"], "'burn'"),
         ("shad room.blend -o out".split(), "ltsh: command 'shad' is unknown (expected one of demo, compare, "
-         "shade, bake, view, relight, run, merge, tables); see ltsh --help"),
+         "shade, bake, view, render, relight, run, merge, tables); see ltsh --help"),
         ("shade room.blend -o out --techniqes ltc".split(), "ltsh shade: option --techniqes is unknown here; see ltsh "
          "shade --help"),
         ("shade room.blend -o out --techniqes=ltc".split(), "option --techniqes is unknown here"),
         ("shade room.blend -o out --cycles-samples 8".split(),
-         "--cycles-samples is unknown here (an option of demo, compare, bake)"),
+         "--cycles-samples is unknown here (an option of demo, compare, bake, render)"),
         ("shade room.blend -o out hall.blend".split(),
          "'hall.blend' is not expected here (name all files one after another); see"),
         ("demo room.blend -o out".split(), "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
@@ -97,7 +97,7 @@ def test_left_out_options_mean_as_in_the_file(capsys, child, room, out):
     assert (asked.width, asked.height, asked.sub_samples, asked.frame, asked.camera) == (None, None, 1, None, None)
 
 
-@pytest.mark.parametrize("command", ["demo", "compare", "shade", "bake", "run", "merge", "tables", "tables export"])
+@pytest.mark.parametrize("command", "demo compare shade bake render run merge tables".split() + ["tables export"])
 def test_help_says_what_a_command_does_with_its_options_defaults_and_examples(capsys, command):
     code, stdout, stderr = run(capsys, *command.split(), "--help")
     description = stdout.split("\n\n")[1]

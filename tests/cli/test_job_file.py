@@ -86,7 +86,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
     [
         ("", ["night.toml: no job is there, expected at least one [[job]]"]),
         ("[[job]]\n", ["job 1: command is None, expected one of shade, compare, bake"]),
-        ('\n[[job]]\ncommand = "render"\n', ["job 1: command is 'render'"]),
+        ('\n[[job]]\ncommand = "rend"\n', ["job 1: command is 'rend'"]),
         (SHADE + "frams = 3\n", ["job 1: option 'frams' is unknown here; expected some of", "frames", "scene"]),
         (SHADE + 'frames = "1-"\n', ["job 1: frames: frame is '1-', expected a whole number"]),
         (SHADE + "frames = 1.5\n", ["job 1: frames: frame is '1.5'"]),

@@ -119,6 +119,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
+        kept = _read_kept(manifest, folder, film, shows_patches(samples, lights)) if options.for_finished else None
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
@@ -133,7 +134,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
             emission=_read_emission(manifest, folder) if options.emission else None,
-            kept=_read_kept(manifest, folder),
+            kept=kept,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
@@ -202,14 +203,21 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
 
 def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
     """The warning about reflections so sharp that they show the patches of a world."""
-    skies = [light for light in lights if light.is_distant and light.detail and light.affects_specular]
-    sharp = has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
-    if not skies or not sharp.any():
+    sharp = shows_patches(samples, lights)
+    if not sharp.any():
         return []
+    sky = next(light for light in lights if light.is_distant and light.detail and light.affects_specular)
     return [
-        f"world {skies[0].name!r}: its patches show as facets of a degree or more in reflections sharper than "
+        f"world {sky.name!r}: its patches show as facets of a degree or more in reflections sharper than "
         f"roughness {SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have"
     ]
+
+
+def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.ndarray:
+    """Mask (P,) of the samples with reflections so sharp that they show the patches of a world."""
+    if not any(light.is_distant and light.detail and light.affects_specular for light in lights):
+        return np.zeros(len(samples), bool)
+    return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 
 
 def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
@@ -219,14 +227,14 @@ def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
     return np.mean(images, axis=0, dtype=np.float64)
 
 
-def _read_kept(manifest: dict, folder: Path) -> KeptByCycles | None:
+def _read_kept(manifest: dict, folder: Path, film: Film, is_faceted: np.ndarray) -> KeptByCycles:
     """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
-    found = manifest.get("kept")
-    if found is None:
-        return None
+    found = manifest["kept"]
     bits = [gbuffer.kept_by_cycles(_rendered(folder / file)) for file in manifest["samples"]]
     by_pass = {name: np.any([(number & bit) > 0 for number in bits], axis=0) for name, bit in lobes.KEPT_BITS.items()}
-    return KeptByCycles(by_pass, *(tuple(found[name]) for name in ("materials", "everything", "warnings")))
+    by_pass["specular"] |= film.image(is_faceted) > 0.0
+    materials = found["materials"] + ["sharp reflections of the world (specular)"] * bool(is_faceted.any())
+    return KeptByCycles(by_pass, *map(tuple, (materials, found["everything"], found["warnings"])))
 
 
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:

@@ -1,0 +1,180 @@
+"""A finished picture is what Cycles renders: each kind of path alone, nothing twice, nothing lost."""
+
+import json
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from material_scenes import Build
+
+from ltsh_addon import imaging
+from ltsh_addon.blender.process import client
+from ltsh_addon.cli import main
+from ltsh_addon.cycles.lobes import read_layer
+from ltsh_addon.pipeline import RenderOptions, render
+from ltsh_addon.scene import PASSES
+
+SIZE, BLOCK = 32, 8  # pixels
+SAMPLES, TRUE_SAMPLES = 64, 1024
+# Relative error of the closed form in a block. Of the largest radiance: the points place an edge to 3 / POINTS of a
+# pixel, and it crosses some 12 of the 64 pixels of a block.
+POINTS = 32
+OWN_ERROR, EDGE_ERROR = 0.015, 3.0 / POINTS * 12.0 / BLOCK**2
+
+
+def floor_and_ball(material, bounces=0):
+    """A ball of what `material()` gives on a gray floor under an area light."""
+    scene = parts.empty_scene(SIZE, SIZE)
+    scene.cycles.max_bounces = bounces
+    scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = False
+    scene.cycles.transmission_bounces = scene.cycles.diffuse_bounces = scene.cycles.glossy_bounces = bounces
+    parts.add_plane(parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor")[0])
+    parts.add_sphere(material(), radius=0.7, location=(0.0, 0.0, 0.7))
+    parts.add_camera((0.0, -4.5, 2.2), (1.18, 0.0, 0.0))
+    parts.add_area_light(location=(0.8, -1.0, 3.0))
+    return scene
+
+
+def gray(**inputs):
+    return lambda: parts.principled(Base_Color=(0.6, 0.5, 0.3, 1.0), Roughness=0.35, **inputs)[0]
+
+
+def bsdf(kind, **inputs):
+    return lambda: parts.bsdf_material(f"ShaderNode{kind}", **inputs)[0]
+
+
+def fog():
+    material, tree, output = parts.new_material("Fog")
+    scatter = parts.add_node(tree, "ShaderNodeVolumeScatter", Density=1.5)
+    tree.links.new(scatter.outputs[0], output.inputs["Volume"])
+    return material
+
+
+def toon_and_alpha():
+    scene = floor_and_ball(gray(Alpha=0.5))
+    made = Build("Toon")
+    made.show(made.shader("BsdfToon"))
+    scene.objects["Plane"].data.materials[0] = made.material
+
+
+def volume():
+    floor_and_ball(fog, 2).cycles.volume_bounces = 2
+
+
+def furnace():
+    scene = parts.empty_scene(SIZE, SIZE)
+    scene.cycles.max_bounces = scene.cycles.diffuse_bounces = 32
+    parts.add_sphere(parts.bsdf_material("ShaderNodeBsdfDiffuse", Color=(1.0, 1.0, 1.0, 1.0))[0])
+    parts.add_camera((0.0, -4.0, 0.0), (np.pi / 2.0, 0.0, 0.0))
+    parts.add_white_world()
+
+
+def shown_lamp():
+    """The light itself, a glowing ball, and a light that is left out."""
+    floor_and_ball(bsdf("Emission", Strength=3.0), 1)
+    bpy.data.objects["Light"].visible_camera = True
+    bpy.data.objects["Sphere"].location.z = 1.0
+
+
+def narrow_lamp():
+    floor_and_ball(gray(), 1)
+    parts.add_area_light("Beam", (-0.5, 0.0, 3.0), (0.0, 0.0, 0.0), spread=1e-4, energy=5.0)
+
+
+def transparent_film():
+    scene = floor_and_ball(gray(), 1)
+    scene.render.film_transparent = True
+    bpy.data.objects.remove(scene.objects["Plane"])
+
+
+# What is built, and the share of the pixels on which each pass is ours.
+SCENES = {
+    "direct diffuse": (lambda: floor_and_ball(bsdf("BsdfDiffuse")), (1, 1)),
+    "direct specular": (lambda: floor_and_ball(gray(Metallic=1.0)), (1, 1)),
+    "one bounce": (lambda: floor_and_ball(gray(), 1), (1, 1)),
+    "glass": (lambda: floor_and_ball(bsdf("BsdfGlass", Roughness=0.3), 4), (1, 1)),
+    "subsurface": (lambda: floor_and_ball(gray(Subsurface_Weight=1.0, Subsurface_Scale=0.3), 1), (1, None)),
+    "toon and alpha": (toon_and_alpha, (None, None)),
+    "volume": (volume, (0, 0)),
+    "white furnace": (furnace, (1, 1)),
+    "lamp in sight": (shown_lamp, (1, 1)),
+    "left out light": (narrow_lamp, (0, 0)),
+    "transparent film": (transparent_film, (1, 1)),
+}
+
+
+def blocks(image):
+    """Means (B, B, C) of square blocks."""
+    return image.reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK, -1).mean(axis=(1, 3))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_finished_picture_is_what_cycles_renders(name, tmp_path):
+    build, shares = SCENES[name]
+    build()
+    bpy.context.scene.cycles.seed = 1
+    path = parts.save(tmp_path / "scene.blend")
+    options = RenderOptions(path, output=tmp_path, sub_samples=POINTS, cycles_samples=SAMPLES, denoise="off")
+    made = render.finish(options)
+    bpy.context.scene.cycles.seed = 2
+    job = client.FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
+    (tmp_path / "true").mkdir()
+    true = read_layer(client.render_finished(job, tmp_path / "true").channels, "Combined", "RGBA")
+
+    for pass_name, share in zip(PASSES, shares, strict=True):
+        found = made.report["finished"]["share_of_ours"][pass_name]
+        assert found == share if share is not None else 0.2 < found < 0.98, pass_name
+    ours, expected = blocks(made.combined)[..., :3], blocks(true)[..., :3]
+    # Both pictures have noise of their own: that of a mean is an eighth of what their pixels differ by.
+    noise = blocks(np.abs(made.combined - true))[..., :3] / BLOCK
+    tolerance = OWN_ERROR * np.abs(expected) + EDGE_ERROR * expected.max() + 4.0 * noise
+    assert noise.mean() < 0.02 * expected.mean(), "so much noise hides what is looked for"
+    worst = (np.abs(ours - expected) / tolerance).max()
+    assert worst < 1.0, f"{name}: {worst:.2f} times what is tolerated"
+    assert np.abs(blocks(made.combined) - blocks(true))[..., 3].max() < EDGE_ERROR
+
+
+def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path, capsys):
+    floor_and_ball(gray(), 1)
+    path = parts.save(tmp_path / "room.blend")
+    words = ["render", str(path), "-o", str(out), "--cycles-samples", "4", "--aa", "2", "--json", "--quiet"]
+    capsys.readouterr()
+    assert main(words) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["cycles_samples"] == 4
+    assert report["finished"]["denoiser"].startswith("Open Image Denoise")
+    layers = imaging.read_layers(out / "render.exr")
+    whole = layers["ltsh4.specular"] + layers["ltsh4.diffuse"] + layers["rest"][..., :3]
+    np.testing.assert_allclose(layers["combined"][..., :3], whole, rtol=1e-6, atol=1e-6)
+    direct, color, kinds = ("Dir", "Col", "Diff Gloss") if bpy.app.version < (5, 0, 0) else (
+        " Direct", " Color", "Diffuse Glossy")  # fmt: skip
+    for kind, name in zip(kinds.split(), ("diffuse", "specular"), strict=True):
+        # What the few samples of Cycles have not seen at an edge has no color.
+        seen, own = layers[kind + color] > 0.0, layers[f"ltsh4.{name}"]
+        assert seen.mean() > 0.1
+        np.testing.assert_allclose(
+            (layers[kind + direct] * layers[kind + color])[seen], own[seen], rtol=1e-5, atol=1e-6
+        )
+    assert (out / "render.png").stat().st_size > 500
+    assert main([*words, "--resume"]) == 0
+
+
+def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path):
+    floor_and_ball(gray(), 2)
+    path = parts.save(tmp_path / "room.blend")
+    rest = {
+        (samples, denoise): render.finish(
+            RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=samples, denoise=denoise)
+        ).rest[..., :3]
+        for samples, denoise in ((8, "on"), (8, "off"), (512, "off"))
+    }
+    true = rest[512, "off"]
+    noisy, clean = (np.linalg.norm(rest[8, denoise] - true) for denoise in ("off", "on"))
+    assert clean < 0.6 * noisy
+    assert abs(rest[8, "on"].mean() / true.mean() - 1.0) < 0.05
+
+
+def test_a_budget_excludes_samples(tmp_path, capsys):
+    assert main(["render", "room.blend", "-o", str(tmp_path), "--budget", "3", "--cycles-samples", "4"]) == 2
+    assert "not both" in capsys.readouterr().err

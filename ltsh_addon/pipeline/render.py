@@ -46,6 +46,7 @@ class Finished:
     channels: dict[str, np.ndarray]  # (H, W) of Cycles, with ours in place of its direct light
     report: dict
     seconds: dict[str, Any]
+    taken: dict[str, np.ndarray]  # (H, W) by pass: 1 where ours takes the place of Cycles' direct light
     comparison: picture.Comparison
     cycles: Any  # blender.process.client.CyclesPicture
 
@@ -80,11 +81,10 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> p
     write_bytes(path.with_suffix(".png"), shown)
     files = [f"{name}.exr", f"{name}.png"]
     if options.keep_visibility:
-        files.append(f"{name}{lighting.KEPT_SUFFIX}")
-        comparison = made.comparison
-        lighting.keep_picture(
-            comparison.extraction, comparison.shadows, comparison.options, Path(options.output) / files[-1]
-        )
+        path, parts = path.with_name(f"{path.stem}{lighting.KEPT_SUFFIX}"), made.comparison
+        kept = parts.extraction, parts.shadows, parts.options, path
+        written = lighting.keep_picture(*kept, rest={"": made.rest}, taken=made.taken)
+        files += [one.relative_to(options.output).as_posix() for one in written]
     return picture.TaskResult(made.report, made.seconds, tuple(files))
 
 
@@ -128,7 +128,8 @@ def finish(
     if comparison.shadows is not None:
         seconds["shadows"] = comparison.shadows.seconds
     layers, channels = _layers(comparison, ours), _replaced(cycles, ours)
-    return Finished(combined, rest, layers, channels, report, seconds, comparison, cycles)
+    taken = {name: part.is_taken.astype(np.float32) for name, part in ours.items()}
+    return Finished(combined, rest, layers, channels, report, seconds, taken, comparison, cycles)
 
 
 class _ProcessorClock:

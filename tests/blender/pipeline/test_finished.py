@@ -13,6 +13,8 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import RenderOptions, render
+from ltsh_addon.pipeline.lighting import KeptPicture
+from ltsh_addon.pipeline.relight import light_pictures
 from ltsh_addon.scene import PASSES
 
 SIZE, BLOCK = 32, 8  # pixels
@@ -173,6 +175,17 @@ def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path):
     noisy, clean = (np.linalg.norm(rest[8, denoise] - true) for denoise in ("off", "on"))
     assert clean < 0.6 * noisy
     assert abs(rest[8, "on"].mean() / true.mean() - 1.0) < 0.05
+
+
+def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_path):
+    floor_and_ball(gray(Subsurface_Weight=1.0), 1)
+    path = parts.save(tmp_path / "room.blend")
+    options = RenderOptions(path, output=out, sub_samples=2, cycles_samples=8, keep_visibility=True)
+    assert {"render.samples.npz", "render.occluders.npz"} < set(render.make_finished(options).files)
+    combined = imaging.read_layers(out / "render.exr")["combined"]
+    mixed = light_pictures(KeptPicture.load(out / "render.samples.npz"))
+    assert len(mixed.layers) == 2
+    np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
 
 
 def test_a_budget_excludes_samples(tmp_path, capsys):

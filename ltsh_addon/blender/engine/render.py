@@ -15,6 +15,8 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ...pipeline.lighting import shade_lights, trace_shadows
+from ...pipeline.options import RenderOptions
+from ...pipeline.render import finish
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
@@ -71,8 +73,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     def update_render_passes(self, scene=None, renderlayer=None):
         """Tell Blender the passes, which the compositor then has as sockets."""
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
-        for name in pass_names(_prefixes(scene.ltsh_view)):
-            self.register_pass(scene, renderlayer, name, 3, "RGB", "COLOR")
+        for name, channels, kind in _passes_of(scene, renderlayer):
+            self.register_pass(scene, renderlayer, name, len(channels), channels, kind)
 
     def render(self, depsgraph):
         """Render one view layer of one frame."""
@@ -101,14 +103,15 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:
             self.report({"WARNING"}, warning)
-        for name in picture.passes:
-            self.add_pass(name, 3, "RGB", layer=job.view_layer)
+        for name, channels, _ in _passes_of(depsgraph.scene, depsgraph.view_layer):
+            self.add_pass(name, len(channels), channels, layer=job.view_layer)
         height, width = picture.combined.shape[:2]
         result = self.begin_result(0, 0, width, height, layer=job.view_layer)
         passes = result.layers[0].passes
         passes["Combined"].rect.foreach_set(blender_pixels(picture.combined))
         for name, image in picture.passes.items():
-            passes[name].rect.foreach_set(blender_pixels(image))
+            if name in passes:
+                passes[name].rect.foreach_set(blender_pixels(image))
         self.end_result(result)
 
     def _progress(self):
@@ -124,6 +127,25 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             return not self.test_break()
 
         return progress
+
+
+def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
+    """Name, channels and type of all passes but Combined."""
+    settings = scene.ltsh_view
+    if not settings.complete:
+        return [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
+    own = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
+    return own + [one for one in _passes_of_cycles(scene, layer) if one[0] != "Combined"]
+
+
+def _passes_of_cycles(scene, layer) -> list[tuple[str, str, str]]:
+    """The passes that `layer` has with Cycles; none where its add-on is off."""
+    try:
+        from cycles.engine import list_render_passes
+    except ImportError:
+        return []
+    unwritten = ("Noisy ", "Guiding ", "Render Time")
+    return [one for one in list_render_passes(scene, layer) if not one[0].startswith(unwritten)]
 
 
 def _prefixes(settings) -> list[str]:
@@ -145,6 +167,8 @@ def _job_of(engine, depsgraph) -> FinalJob:
         shadows="on" if scene.ltsh.shadows else "off",
         shadow_rays=scene.ltsh.shadow_rays,
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
+        cycles_samples=settings.cycles_samples if settings.complete else 0,
+        cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
     )
 
 
@@ -162,6 +186,8 @@ class FinalJob:
     shadows: str = "off"
     shadow_rays: int = 256  # see `PictureOptions`
     background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
+    cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
+    cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
 
     def shaded_as(self) -> dict[str, str]:
         """Names of passes start with -> technique."""
@@ -175,7 +201,7 @@ def pass_names(prefixes) -> list[str]:
 
 @dataclass(frozen=True)
 class FinalPicture:
-    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, 3) by name."""
+    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, C) by name."""
 
     combined: np.ndarray
     passes: dict[str, np.ndarray]
@@ -188,6 +214,8 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
 
     `progress(stage, fraction of the whole)` returns False to stop. Raises SceneError, TableError, Cancelled, OSError.
     """
+    if job.cycles_samples:
+        return _complete_picture(job, scene_file, progress)
     options = client.ExtractOptions(
         scene=scene_file,
         sub_samples=job.sub_samples,
@@ -222,6 +250,31 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     coverage = inside_border(extraction.film.coverage(), extraction.border)
     combined = _over_background(color, coverage, job, extraction.exposure)
     return FinalPicture(combined, passes, warnings, extraction.problems)
+
+
+def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
+    """The same with everything that Cycles renders, and its passes."""
+    options = RenderOptions(
+        scene_file,
+        frame=job.frame,
+        output=scene_file.parent,
+        techniques=(job.technique,),
+        sub_samples=job.sub_samples,
+        cycles_samples=job.cycles_samples,
+        shadow_rays=job.shadow_rays,
+    )
+    made = finish(options, progress, scene_name=job.scene, view_layer=job.view_layer)
+    border = made.comparison.extraction.border
+    zero = np.zeros_like(made.combined[..., :3])
+    passes = {f"LTSH {label}": made.ours.get(f"{job.technique}.{part}", zero) for part, label in PASS_LABELS.items()}
+    for name, channels in job.cycles_passes:
+        planes = {key[-1].upper(): plane for key, plane in made.channels.items() if key.rpartition(".")[0] == name}
+        # The only channel has one letter or another.
+        letters = channels.upper() if len(channels) > 1 else tuple(planes)
+        if planes and set(letters) <= set(planes):
+            passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
+    passes = {name: inside_border(image, border) for name, image in passes.items()}
+    return FinalPicture(inside_border(made.combined, border), passes, tuple(made.report["warnings"]))
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -62,6 +62,16 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         description="Points per pixel of final renders, drawn from the pixel filter; 1 takes pixel centers",
         min=1, soft_max=64, default=4,
     )  # fmt: skip
+    complete: bpy.props.BoolProperty(
+        name="Complete",
+        description="Final renders also have what is not direct light, by Cycles and denoised: bounces, glass, "
+        "subsurface, and all its passes",
+        default=False,
+    )
+    cycles_samples: bpy.props.IntProperty(
+        name="Cycles Samples", description="Samples of what Cycles renders in complete pictures",
+        min=1, soft_max=4096, default=64,
+    )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
         name="Passes of All Techniques",
         description="Final renders also have a specular and a diffuse pass of every technique",
@@ -121,7 +131,11 @@ class LTSH_PT_view(_View, bpy.types.Panel):
         super().draw(context)
         column = self.layout.column(heading="Final Render")
         column.prop(context.scene.ltsh_view, "render_samples", text="Samples")
-        column.prop(context.scene.ltsh_view, "technique_passes")
+        column.prop(context.scene.ltsh_view, "complete")
+        if context.scene.ltsh_view.complete:
+            column.prop(context.scene.ltsh_view, "cycles_samples")
+        else:
+            column.prop(context.scene.ltsh_view, "technique_passes")
 
 
 # Settings of Cycles' renders in these tabs mean nothing to other engines.

@@ -18,7 +18,8 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.pipeline import PictureOptions, shade_scene
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
+from ltsh_addon.pipeline.render import finish
 from ltsh_addon.scene import Cancelled
 
 SIZE = (28, 18)
@@ -96,6 +97,30 @@ def test_settings_of_cycles_own_renders_stay_hidden(addon):
         assert "LTSH" in getattr(getattr(bpy.types, name), "COMPAT_ENGINES", {"LTSH"}), name
     for name in ("CYCLES_RENDER_PT_sampling", "CYCLES_RENDER_PT_light_paths", "CYCLES_RENDER_PT_performance"):
         assert "LTSH" not in getattr(bpy.types, name).COMPAT_ENGINES, name
+
+
+def test_a_complete_render_is_the_picture_that_the_command_makes_with_the_passes_of_cycles(scene, tmp_path):
+    settings, layer = scene.ltsh_view, scene.view_layers[0]
+    settings.complete, settings.cycles_samples = True, 8
+    layer.use_pass_diffuse_indirect = layer.use_pass_diffuse_direct = layer.use_pass_z = layer.use_pass_uv = True
+    layer.use_pass_glossy_direct = layer.use_pass_cryptomatte_object = True
+    channels = render_passes(scene, tmp_path / "final.exr")
+    path = tmp_path / "scene.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    options = RenderOptions(path, output=tmp_path, techniques=("ltsh2",), sub_samples=1, cycles_samples=8)
+    made = finish(options)
+    np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), made.combined[..., :3], rtol=1e-4, atol=1e-5)
+    for name in shading.PASSES:
+        found, expected = picture(channels, f"ViewLayer.LTSH {name.capitalize()}."), made.ours[f"ltsh2.{name}"]
+        np.testing.assert_allclose(found, expected, **SAME)
+        assert expected.max() > 0.01
+    wanted = {
+        key for key in made.channels if key.startswith(("Diff", "Gloss", "Depth", "UV", "Crypto")) and "Col" not in key
+    }
+    wanted = {key for key in wanted if not key.startswith(("Glossy Ind", "GlossInd"))}
+    for key in wanted:
+        np.testing.assert_allclose(channels[f"ViewLayer.{key}"], made.channels[key], rtol=1e-4, atol=1e-5, err_msg=key)
+    assert {name.split(".")[0] for name in wanted} >= {"Depth", "UV", "CryptoObject00"}
 
 
 def test_final_render_is_the_picture_that_shade_makes(scene, tmp_path):

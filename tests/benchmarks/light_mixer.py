@@ -1,0 +1,80 @@
+"""What the light mixer takes at 960 x 540 with 8 lights; needs bpy.
+
+python tests/benchmarks/light_mixer.py [--folder DIR] [--lights N]
+
+Prints milliseconds of a change, all in this thread: of the light that was changed before, of another one, of all;
+seconds until a picture can be mixed, and of a light that has moved. The picture is made once and stays in --folder.
+"""
+
+import argparse
+import os
+import sys
+import time
+from pathlib import Path
+
+import many_lights
+import numpy as np
+
+from ltsh_addon.pipeline.lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture
+from ltsh_addon.pipeline.relight import LightPictures, Mixer, light_pictures, moved_picture
+from ltsh_addon.visibility import Occluders
+
+RESOLUTION = "960x540"
+
+
+def timed(work):
+    """What `work` returns, and the seconds and processor seconds that it took."""
+    start, before = time.perf_counter(), os.times()
+    found = work()
+    after = os.times()
+    return found, time.perf_counter() - start, sum(after[:4]) - sum(before[:4])
+
+
+def changes(mixer, rounds=20):
+    """Milliseconds of processor time, median and longest, by kind of change."""
+    random, factors, count = np.random.default_rng(1), np.ones((len(mixer.rows), 3)), len(mixer.rows)
+    mixer.mixed(factors)
+    found = {"of the same light": [], "of another light": [], "of all lights": []}
+    for number in range(rounds * 3):
+        kind = list(found)[number // rounds]
+        if kind == "of all lights":
+            factors = random.random((count, 3))
+        else:
+            factors[0 if kind == "of the same light" else number % count] = random.random(3)
+        start = time.thread_time()
+        mixer.mixed(factors)
+        found[kind].append(1e3 * (time.thread_time() - start))
+    return {kind: (np.median(times), max(times)) for kind, times in found.items()}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--folder", type=Path, default=Path("light-mixer"))
+    parser.add_argument("--lights", type=int, default=8)
+    options = parser.parse_args()
+    out = options.folder.resolve() / f"{options.lights}"
+    kept_file = out / f"shade{KEPT_SUFFIX}"
+    if not kept_file.exists():
+        out.mkdir(parents=True, exist_ok=True)
+        many_lights.build_scene(out / "room.blend", options.lights)
+        words = ("--keep-visibility", "--resolution", RESOLUTION, "--techniques", "ltsh4")
+        print("shade", many_lights.shade(out / "room.blend", out, *words))
+    print(f"kept {kept_file.stat().st_size / 2**20:.0f} MiB")
+    kept, *took = timed(lambda: KeptPicture.load(kept_file))
+    print("read what is kept: {:.2f} s, {:.2f} s of processor time".format(*took))
+    pictures, *took = timed(lambda: light_pictures(kept))
+    print("pictures of {} rows: {:.2f} s, {:.2f} s of processor time".format(len(pictures.rows), *took))
+    _, *took = timed(lambda: pictures.save(out / "lights.npz"))
+    print(f"write {(out / 'lights.npz').stat().st_size / 2**20:.0f} MiB: {took[0]:.2f} s")
+    mixer, *took = timed(lambda: Mixer(LightPictures.load(out / "lights.npz")))
+    print(f"open: {took[0]:.2f} s")
+    for kind, (median, longest) in changes(mixer).items():
+        print(f"change {kind}: {median:.1f} ms, at most {longest:.1f}")
+    occluders = Occluders.load(out / f"shade{OCCLUDERS_SUFFIX}")
+    light = kept.extraction.lights[0].moved(np.array([0.5, 0.2, 0.0]))
+    _, *took = timed(lambda: moved_picture(kept, occluders, light))
+    print("a moved light: {:.2f} s, {:.2f} s of processor time".format(*took))
+
+
+if __name__ == "__main__":
+    main()

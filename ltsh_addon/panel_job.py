@@ -34,7 +34,9 @@ def perform(job: dict) -> None:
             return
         progress("images", 0.0)
         try:
-            folder = display_layers.write(run["arguments"][0], Path(run["output"]), report, run["partial"])
+            output = Path(run["output"])
+            folder = display_layers.write(run["arguments"][0], output, report, run["partial"])
+            display_layers.write_lights(folder, run["arguments"], progress)
         except (OSError, ValueError, MemoryError) as error:
             send({"error": str(error) or type(error).__name__})
             return

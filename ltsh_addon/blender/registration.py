@@ -22,6 +22,7 @@ PARTS = (
     "ui.view_operators",
     "ui.comparison",
     "ui.panels",
+    "ui.mixer",
 )
 
 # Takes back what is registered, last first; one that fails does not keep the others from it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ from .. import imaging
 from ..imaging.exr import write_channels
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
-from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES
+from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
+from .lighting import KEPT_SUFFIX, KeptPicture
 from .picture import UNSHADOWED, against_cycles
+from .relight import MIXER_FILE, light_pictures
 
 FOLDER = "images"
 ERROR = "error_"
@@ -39,6 +42,17 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
     write_index(folder, index)
     _remove_others(folder, groups)
     return folder
+
+
+def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | None = None) -> None:
+    """Write what the light mixer needs into the `folder` of `write`, where the command with these `arguments` kept
+    samples; else remove it."""
+    path = folder / MIXER_FILE
+    if "--keep-visibility" in arguments:
+        kept = Path(FILES[arguments[0]]).with_suffix(KEPT_SUFFIX)
+        light_pictures(KeptPicture.load(folder.parent / kept), progress).save(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:

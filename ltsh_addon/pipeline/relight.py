@@ -19,7 +19,7 @@ from ..files import replacing
 from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
 from ..visibility import Occluders
 from . import picture
-from .lighting import KEPT_SUFFIX, KeptPicture, Shadows, ShadowTracer, rays_of_point, shade_lights
+from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, ShadowTracer, rays_of_point, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -392,6 +392,14 @@ class Mixer:
 
 
 # -- lights that have moved -------------------------------------------------------------------------------------------
+
+
+def load_kept(path: Path) -> tuple[KeptPicture, Occluders | None]:
+    """What was kept of a picture in `path`, and what stands in the way of its light. Raises OSError, ValueError."""
+    kept, occluders = KeptPicture.load(path), None
+    if kept.shadows is not None:
+        occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
+    return kept, occluders
 
 
 def moved_picture(kept: KeptPicture, occluders: Occluders | None, light: AreaLight) -> np.ndarray:

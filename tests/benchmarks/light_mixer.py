@@ -8,7 +8,6 @@ seconds until a picture can be mixed, and of a light that has moved. The picture
 
 import argparse
 import os
-import sys
 import time
 from pathlib import Path
 

@@ -29,6 +29,17 @@ def changed(settings, context) -> None:
         _warn(error)
 
 
+def mixed(item, context) -> None:
+    """Called by Blender when a value of the light mixer changes: the mix is shown at once."""
+    settings = item.id_data.ltsh
+    if results.is_silent():
+        return
+    if settings.mode == "MIX":
+        changed(settings, context)
+    else:
+        settings.mode = "MIX"
+
+
 def _warn(error: RuntimeError) -> None:
     """A picture is gone; the panels say so when the results are shown anew."""
     logging.getLogger(__name__).warning("%s", error_line(error))
@@ -39,6 +50,10 @@ def refresh(scene) -> bool:
     result = results.result_of(scene)
     if result is None:
         return False
+    mixture = results.mixed_pixels(scene) if scene.ltsh.mode == "MIX" else None
+    if mixture is not None:
+        _show(scene, mixture, True)
+        return True
     choice = results.choice_of(scene.ltsh, result)
     results.images_of_pass(scene, result, choice)
     group = result.groups[choice.group]
@@ -47,10 +62,14 @@ def refresh(scene) -> bool:
         return False
     mode = scene.ltsh.mode
     pixels = compose(*pictures, mode, split_of(scene), error_scale(scene.ltsh, group, choice))
-    _store(viewer_image(scene), pixels, mode != "ERROR")
+    _show(scene, pixels, mode != "ERROR")
+    return True
+
+
+def _show(scene, pixels: np.ndarray, as_render: bool) -> None:
+    _store(viewer_image(scene), pixels, as_render)
     _settle_later(scene)
     redraw_image_editors()
-    return True
 
 
 def _chosen_images(scene, result, choice) -> list:
@@ -88,7 +107,7 @@ def drag_split(scene, position: float | None) -> None:
 
 def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:
     """The picture (H, W', 4) of both (H, W, 4): linear colors; W' is 2 W side by side."""
-    if mode == "A":
+    if mode in ("A", "MIX"):
         return first
     if mode == "SIDE":
         return np.concatenate([first, second], axis=1)
@@ -415,6 +434,8 @@ def _draw() -> None:
     elif settings.mode == "SIDE":
         drawing.draw_label(left, below, first, scale)
         drawing.draw_label((left + right) / 2.0, below, second, scale)
+    elif settings.mode == "MIX":
+        drawing.draw_label(left, below, results.mix_label(context.scene), scale)
     elif settings.mode == "A":
         drawing.draw_label(left, below, first, scale)
     else:
@@ -449,7 +470,20 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
 
 
 _add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe))
-HANDLERS = (("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore))
+
+
+@bpy.app.handlers.persistent
+def _mix_again(*_):
+    """After undo: the mixer has other values."""
+    for scene in bpy.data.scenes:
+        if scene.ltsh.mode == "MIX":
+            refresh(scene)
+
+
+HANDLERS = (
+    ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),
+    ("undo_post", _mix_again), ("redo_post", _mix_again),
+)  # fmt: skip
 
 
 def register() -> None:

@@ -39,6 +39,7 @@ STAGE_TITLES = {
     **{technique.title: technique.label for technique in TECHNIQUES.values()},
     "write": "Write Files",
     "images": "Make Pictures",
+    "lights": "Light Mixer",
 }
 # Costs count as if so many seconds had been measured.
 PRIOR_SECONDS = 5.0
@@ -77,7 +78,7 @@ def runs_of(context, command: str, scene_file: Path) -> list[Run]:
     if command == "shade" or not first:
         return [Run(command, wanted)]
     # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
-    early = replace(picture_options(context.scene, "shade", scene_file), techniques=first)
+    early = replace(picture_options(context.scene, "shade", scene_file), techniques=first, keep_visibility=False)
     return [Run("shade", early, NO_CYCLES), Run(command, wanted)]
 
 
@@ -94,6 +95,7 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
         sub_samples=settings.anti_aliasing,
         shadows="on" if settings.shadows else "off",
         shadow_rays=settings.shadow_rays,
+        keep_visibility=settings.keep_lights,
         **samples,
     )
 
@@ -167,6 +169,7 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
         *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in options.techniques),
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
+        *([Step("lights", _shading("ltsh4", points))] if options.keep_visibility else []),
     ]
 
 

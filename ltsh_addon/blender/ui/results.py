@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...imaging.report import index_stamp, read_index
+from ...pipeline.display_layers import FILES
+from ...pipeline.lighting import KEPT_SUFFIX
+from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, Row, load_kept, moved_picture, tint
+from ...scene import AreaLight
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
 PREFIX = "LTSH "
@@ -96,6 +100,7 @@ def show(scene, folder: Path) -> None:
     for image in our_images(scene):
         if image[LAYER]:
             image.reload()
+    _take_rows(scene)
 
 
 def images_of_pass(scene, result: Result, choice: Choice) -> None:
@@ -199,3 +204,110 @@ def _stored(settings, key: str, value: str):
     """As `settings[key]` has it, which sets without calling what updates."""
     items = getattr(settings.bl_rna.properties[key], "enum_items", None)
     return value if items is None else items[value].value
+
+
+# -- the light mixer --------------------------------------------------------------------------------------------------
+
+# Of the picture that was asked for last, and what was kept of it to shade lights that have moved.
+_mixer: dict = {"stamp": None, "mixer": None, "kept": None, "is_silent": False}
+
+
+def mixer_of(scene) -> Mixer | None:
+    """The light mixer of the results of `scene`; None where they have no pictures of the lights."""
+    result = result_of(scene)
+    if result is None:
+        return None
+    path = result.folder / MIXER_FILE
+    try:
+        stamp = str(path), path.stat().st_mtime_ns
+        if _mixer["stamp"] != stamp:
+            _mixer.update(stamp=stamp, mixer=None, kept=None)
+            _mixer["mixer"] = Mixer(LightPictures.load(path))
+    except (OSError, ValueError):
+        _mixer.update(stamp=None, mixer=None, kept=None)
+    return _mixer["mixer"]
+
+
+def update_moved(scene, moved: dict[int, AreaLight]) -> None:
+    """Shade lights of the mixer anew, by the numbers of their rows, and write them to the picture's files.
+
+    Raises OSError, ValueError, SceneError.
+    """
+    result, mixer = result_of(scene), mixer_of(scene)
+    if _mixer["kept"] is None:
+        _mixer["kept"] = load_kept((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
+    for number, light in moved.items():
+        row = replace(mixer.rows[number], light=light.record())
+        mixer.replace(number, row, moved_picture(*_mixer["kept"], light))
+    path = result.folder / MIXER_FILE
+    mixer.pictures.save(path)
+    _mixer["stamp"] = str(path), path.stat().st_mtime_ns
+
+
+def mixer_pairs(scene) -> list:
+    """Each row of the mixer with its values in `scene` (Scene.ltsh.mixed), None where there are none."""
+    mixer, items = mixer_of(scene), {item.name: item for item in scene.ltsh.mixed}
+    return [(row, items.get(row.name)) for row in (mixer.rows if mixer is not None else ())]
+
+
+def mixed_pixels(scene) -> np.ndarray | None:
+    """The picture (H, W, 4) with the lights as the mixer of `scene` has them, row 0 below; None without a mixer."""
+    mixer = mixer_of(scene)
+    return None if mixer is None else mixer.mixed([_factor(scene, row, item) for row, item in mixer_pairs(scene)])
+
+
+def _factor(scene, row: Row, item) -> np.ndarray:
+    if item is None:
+        return np.ones(3)
+    if not is_on(scene, item):
+        return np.zeros(3)
+    return item.power * 2.0**item.exposure * _tint(row, item)
+
+
+def _tint(row: Row, item) -> np.ndarray:
+    # Blender holds colors in single precision.
+    same = np.allclose(item.color, row.color, rtol=1e-6, atol=1e-6)
+    return np.ones(3) if same else tint(np.array(row.color), item.color)
+
+
+def is_on(scene, item) -> bool:
+    """False for what is muted, and where others are solo."""
+    return not item.muted and (item.solo or not any(other.solo for other in scene.ltsh.mixed))
+
+
+def is_neutral(row: Row, item) -> bool:
+    """True where power, exposure and color are as rendered."""
+    return item.power == 1.0 and item.exposure == 0.0 and bool((_tint(row, item) == 1.0).all())
+
+
+def reset_mixer(scene) -> None:
+    """Show all lights as they were rendered, and forget those that are not in the picture."""
+    scene.ltsh.mixed.clear()
+    _take_rows(scene)
+
+
+def _take_rows(scene) -> None:
+    """Give each row of the mixer values: those that it has, unless its light was changed in the scene since."""
+    items, _mixer["is_silent"] = scene.ltsh.mixed, True
+    for row, item in mixer_pairs(scene):
+        settings = next(iter(row.settings.values()), [0.0] * 5)
+        if item is None:
+            item = items.add()
+            item.name = row.name
+        elif np.allclose(item.settings, settings, rtol=1e-5):
+            continue
+        item.power, item.exposure, item.color, item.settings = 1.0, 0.0, row.color, settings
+        item.muted = item.solo = item.applied = False
+    _mixer["is_silent"] = False
+
+
+def is_silent() -> bool:
+    """True while values of the mixer are set by this module."""
+    return _mixer["is_silent"]
+
+
+def mix_label(scene) -> str:
+    """What is written below the mixed picture."""
+    pairs = [(row, item) for row, item in mixer_pairs(scene) if item is not None]
+    changed = sum(not is_on(scene, item) or not is_neutral(row, item) for row, item in pairs)
+    return f"Mix: {changed} of {len(pairs)} changed" if pairs else "No lights were kept: shade again"

@@ -23,7 +23,7 @@ from bpy.props import (
 
 from ...scene import CYCLES, TECHNIQUES
 from ...shading.parallel import CORES_VARIABLE
-from .comparison import changed
+from .comparison import changed, mixed
 
 # "bl_ext.user_default.ltsh" in Blender, where add-ons are known by it; "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
@@ -147,6 +147,7 @@ MODES = (
     ("WIPE", "Wipe", "The first picture left of a line that can be dragged, the second right", "UV_SYNC_SELECT", 1),
     ("SIDE", "Side by Side", "Both pictures next to each other", "MOD_MIRROR", 2),
     ("ERROR", "Difference", "First minus second: red is too bright, blue too dark, white is equal", "IMAGE_ALPHA", 3),
+    ("MIX", "Mix", "The picture with its lights as the Light Mixer has them", "LIGHT", 4),
 )
 
 
@@ -156,6 +157,28 @@ def _redraw_views(settings, context) -> None:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
+
+
+class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
+    """What the light mixer makes of a light, by its name."""
+
+    power: FloatProperty(
+        name="Power", description="Factor of the power that the light had in the picture",
+        min=0.0, soft_max=10.0, step=5, precision=3, default=1.0, update=mixed,
+    )  # fmt: skip
+    exposure: FloatProperty(
+        name="Exposure", description="Each step doubles the power",
+        min=-32.0, max=32.0, soft_min=-5.0, soft_max=5.0, default=0.0, update=mixed,
+    )  # fmt: skip
+    color: FloatVectorProperty(
+        name="Color", description="Color in place of the light's own; its brightest channel counts as 1",
+        subtype="COLOR", size=3, min=0.0, soft_max=1.0, default=(1.0, 1.0, 1.0), update=mixed,
+    )  # fmt: skip
+    muted: BoolProperty(name="Mute", description="This light is dark", update=mixed)
+    solo: BoolProperty(name="Solo", description="All other lights are dark, unless they are solo too", update=mixed)
+    applied: BoolProperty(description="The scene has values of the mixer", options={"HIDDEN"})
+    # Of the light in Blender when the picture was made that the values above are for.
+    settings: FloatVectorProperty(size=5, options={"HIDDEN"})
 
 
 class LTSH_PG_scene(bpy.types.PropertyGroup):
@@ -221,6 +244,13 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
     )  # fmt: skip
+    keep_lights: BoolProperty(
+        name="Keep Lights",
+        description="Keep a picture of each light, so that the Light Mixer can change them in the finished picture",
+        default=True,
+    )  # fmt: skip
+    mixed: CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
+    mixed_active: IntProperty(name="Light", options={"HIDDEN"})
     result_folder: StringProperty(
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -259,7 +289,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "passes", "resolution_percentage", "anti_aliasing", "cycles_samples",
-        "shadows", "shadow_rays", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
+        "shadows", "shadow_rays", "keep_lights", "bake_size", "bake_margin", "bake_view",
+        "bake_passes", "bake_error")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):
@@ -282,7 +313,7 @@ class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
     preset_add_operator = "ltsh.add_preset"
 
 
-CLASSES = (LTSH_AddonPreferences, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
+CLASSES = (LTSH_AddonPreferences, LTSH_PG_mixed_light, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
 _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # Blender looks for a folder "presets" in it.
 PRESETS_PARENT = str(Path(__file__).parent)

@@ -1,0 +1,268 @@
+"""The light mixer: power, exposure and color of each light in a finished picture, changed while one looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import bpy
+import numpy as np
+
+from ...pipeline.relight import Row, tint
+from ...scene import AreaLight, SceneError, error_line, listed
+from ..evaluated import EmitterTraits
+from ..lights.area import area_light, reason_to_leave_out
+from ..lights.linking import Receivers
+from . import comparison, results
+from .panels import draw_text, gray, in_both_places, split_names
+
+# By what share of its distance and size a light may be elsewhere that has not moved.
+UNMOVED = 1e-5
+
+
+def plain_lights(depsgraph) -> dict[str, AreaLight]:
+    """The lights that the scene has now, without what node trees make of them, by the names of objects that are one
+    light each."""
+    receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
+    found: dict[str, list[AreaLight]] = {}
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if ob.type == "LIGHT" and instance.show_self:
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            if not reason_to_leave_out(ob, matrix):
+                light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
+                found.setdefault(light.name, []).append(light)
+    return {name: lights[0] for name, lights in found.items() if len(lights) == 1}
+
+
+def has_moved(kept: AreaLight, now: AreaLight) -> bool:
+    """True where a light has another place, direction, size or shape."""
+    size = np.abs(kept.center).max() + kept.radius
+    near = all(
+        np.allclose(getattr(kept, name), getattr(now, name), rtol=0.0, atol=UNMOVED * most)
+        for name, most in (("center", size), ("half_u", size), ("half_v", size), ("direction", 1.0))
+    )
+    cones = [(np.inf, np.inf) if one.cone is None else (one.cone.cosine, one.cone.sharpness) for one in (kept, now)]
+    return not (near and np.allclose(*cones, rtol=UNMOVED) and abs(kept.spread - now.spread) < UNMOVED)
+
+
+def light_where_it_is(kept: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
+    """The light `kept`, with its own power, linking and light group, where it is `now`."""
+    before, area = (np.linalg.norm(light.area_vector) for light in (kept, now))
+    names = "group", "receivers", "affects_diffuse", "affects_specular", "falloff", "smooth"
+    own = {name: getattr(kept, name) for name in names}
+    return replace(now, radiance=kept.radiance * (before / area if normalized else 1.0), **own)
+
+
+def moved_rows(context, rows) -> dict[int, AreaLight]:
+    """The rows whose light has moved, by their number, and where it is now."""
+    found, lights = {}, plain_lights(context.evaluated_depsgraph_get())
+    for number, row in enumerate(rows):
+        if row.light is not None and row.name in lights:
+            kept, now = AreaLight(**row.light), lights[row.name]
+            if has_moved(kept, now):
+                found[number] = light_where_it_is(kept, now, bpy.data.objects[row.name].data.normalize)
+    return found
+
+
+def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
+    """Power, exposure and color of each light object of a row that give what the mixer shows."""
+    found, factor = {}, tint(np.array(row.color), item.color)
+    for name, (power, exposure, *color) in row.settings.items():
+        mixed = factor * color
+        # Colors stay within what Blender's color fields show.
+        bright = max(1.0, mixed.max()) if not np.allclose(factor, 1.0) else 1.0
+        found[name] = power * item.power * bright, exposure + item.exposure, tuple((mixed / bright).tolist())
+    return found
+
+
+def state_of(row: Row, item) -> tuple[str, str]:
+    """An icon, and a sentence where the light in the scene is not that of the picture."""
+    if not row.lights:
+        return "INFO", row.note
+    lost = [name for name in row.lights if name not in bpy.data.objects]
+    if lost and row.settings:
+        return "ERROR", f"{listed(lost, 3)}: not in the scene any more"
+    for name, (power, exposure, color) in targets(row, item).items():
+        ob = bpy.data.objects[name]
+        now = (ob.data.energy, ob.data.exposure, *ob.data.color) if ob.type == "LIGHT" else ()
+        known = (row.settings[name], (power, exposure, *color))
+        if not any(len(now) == 5 and np.allclose(now, values, rtol=1e-4, atol=1e-6) for values in known):
+            return "ERROR", f"{name}: its power or color was changed in the scene since this picture"
+    return "LIGHT", row.note
+
+
+class LTSH_UL_mixer(bpy.types.UIList):
+    """Lights of a finished picture"""
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
+        rows = {row.name: row for row, _ in results.mixer_pairs(context.scene)}
+        line, row = layout.row(align=True), rows.get(item.name)
+        line.enabled = row is not None
+        line.prop(item, "muted", text="", icon="HIDE_ON" if item.muted else "HIDE_OFF", emboss=False)
+        line.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)
+        state = "ERROR" if row is None else state_of(row, item)[0]
+        line.label(text=item.name, icon=state, translate=False)
+        values = line.row(align=True)
+        values.scale_x = 0.9
+        values.prop(item, "power", text="")
+        swatch = line.row(align=True)
+        swatch.scale_x = 0.4
+        swatch.prop(item, "color", text="")
+
+
+class _Mixer:
+    bl_label = "Light Mixer"
+
+    def draw(self, context):
+        layout, settings = self.layout, context.scene.ltsh
+        rows = [row for row, _ in results.mixer_pairs(context.scene)]
+        split_names(layout, context)
+        if not rows:
+            layout.prop(settings, "keep_lights")
+            draw_text(layout, context, "Shade the picture with it: then its lights can be changed here", "INFO")
+            return
+        layout.template_list("LTSH_UL_mixer", "", settings, "mixed", settings, "mixed_active", rows=min(len(rows), 8))
+        item = settings.mixed[settings.mixed_active] if settings.mixed_active < len(settings.mixed) else None
+        row = next((row for row in rows if item is not None and row.name == item.name), None)
+        if row is not None:
+            column = layout.column()
+            for name in ("power", "exposure", "color"):
+                column.prop(item, name)
+            icon, note = state_of(row, item)
+            if note:
+                draw_text(gray(column), context, note, icon if icon == "ERROR" else "INFO")
+        elif item is not None:
+            draw_text(gray(layout), context, f"{item.name} is not in this picture; its values wait here", "INFO")
+        row = layout.row(align=True)
+        row.operator("ltsh.reset_mixer", icon="LOOP_BACK")
+        row.operator("ltsh.apply_mixer", icon="CHECKMARK")
+        layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
+        for note in notes(context.scene):
+            draw_text(gray(layout), context, note, "INFO")
+
+
+def notes(scene) -> list[str]:
+    """What to know about the mix as a whole."""
+    facts = results.mixer_of(scene).facts
+    found, camera = list(facts["notes"]), scene.camera
+    if facts["frame"] != scene.frame_current:
+        found.append(f"The picture is of frame {facts['frame']}, the scene is at frame {scene.frame_current}")
+    if camera is None or facts["camera"] != camera.name:
+        found.append(f"The picture is of camera {facts['camera']}")
+    return found
+
+
+class LTSH_PT_IMAGE_mixer(_Mixer, bpy.types.Panel):
+    """Power, exposure and color of the lights in the picture, without rendering it again"""
+
+    bl_space_type = "IMAGE_EDITOR"
+    bl_region_type = "UI"
+    bl_category = "LTSH"
+
+
+class _NeedsMixer:
+    @classmethod
+    def poll(cls, context):
+        if results.mixer_of(context.scene) is None:
+            cls.poll_message_set("Shade a picture first, with Keep Lights")
+            return False
+        return True
+
+
+class LTSH_OT_reset_mixer(_NeedsMixer, bpy.types.Operator):
+    """Show all lights as they were rendered"""
+
+    bl_idname = "ltsh.reset_mixer"
+    bl_label = "Reset"
+    bl_options = {"UNDO"}
+
+    def execute(self, context):
+        results.reset_mixer(context.scene)
+        comparison.refresh(context.scene)
+        return {"FINISHED"}
+
+
+class LTSH_OT_apply_mixer(_NeedsMixer, bpy.types.Operator):
+    """Give the lights of the scene the values that the mixer shows, and hide muted ones in renders"""
+
+    bl_idname = "ltsh.apply_mixer"
+    bl_label = "Apply to Scene"
+    bl_options = {"UNDO"}
+
+    def execute(self, context):
+        problems = applied(context.scene)
+        for problem in problems:
+            self.report({"WARNING"}, problem)
+        if not problems:
+            self.report({"INFO"}, "The lights of the scene are as the mixer shows them")
+        return {"FINISHED"}
+
+
+def applied(scene) -> list[str]:
+    """Write what the mixer shows to the lights of the scene; what could not be written.
+
+    Lights that the mixer never changed stay as they are.
+    """
+    problems, given = [], {}
+    for row, item in results.mixer_pairs(scene):
+        dark = not results.is_on(scene, item)
+        if not dark and not item.applied and results.is_neutral(row, item):
+            continue
+        if not row.settings:
+            problems.append(f"{row.name}: no light object, so it is as it was; change its material or the world")
+            continue
+        for name, values in targets(row, item).items():
+            ob = bpy.data.objects.get(name)
+            problem = _reason_not_to_apply(ob, values, given)
+            if problem:
+                problems.append(f"{name}: {problem}")
+                continue
+            ob.hide_render = dark
+            ob.data.energy, ob.data.exposure, ob.data.color = values
+            item.applied = True
+    return problems
+
+
+def _reason_not_to_apply(ob, values, given: dict) -> str:
+    """Why a light cannot get `values`; "" where it can. `given` are those of the data of lights before it."""
+    if ob is None or ob.type != "LIGHT":
+        return "not in the scene any more"
+    if ob.library is not None or ob.data.library is not None:
+        return "it is linked from another file"
+    animation = ob.data.animation_data
+    if animation is not None and (animation.action or len(animation.drivers)):
+        return "its settings are animated or driven"
+    if given.setdefault(ob.data.name, values) != values:
+        return "it shares its data with a light that got other values; make it a single user"
+    return ""
+
+
+class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
+    """Shade lights that have been moved or resized since the picture where they are now; the others stay"""
+
+    bl_idname = "ltsh.update_moved_lights"
+    bl_label = "Update Moved Lights"
+
+    def execute(self, context):
+        moved = moved_rows(context, results.mixer_of(context.scene).rows)
+        if not moved:
+            self.report({"INFO"}, "No light of the picture has moved")
+            return {"CANCELLED"}
+        try:
+            results.update_moved(context.scene, moved)
+        except (OSError, ValueError, SceneError) as error:
+            self.report({"ERROR"}, error_line(error))
+            return {"CANCELLED"}
+        comparison.refresh(context.scene)
+        return {"FINISHED"}
+
+
+CLASSES = (
+    LTSH_UL_mixer,
+    *in_both_places(_Mixer, "mixer", "main"),
+    LTSH_PT_IMAGE_mixer,
+    LTSH_OT_reset_mixer,
+    LTSH_OT_apply_mixer,
+    LTSH_OT_update_moved_lights,
+)
+register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -1,0 +1,217 @@
+"""The light mixer in Blender: what it shows, what it writes to the lights of the scene, lights that have moved."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from job_window import image_pixels
+
+from ltsh_addon import imaging
+from ltsh_addon.blender.ui import mixer, results
+from ltsh_addon.pipeline.relight import REST, LightPictures, Row
+
+HEIGHT, WIDTH = 6, 10
+NAMES = ("Key", "Fill", "Lamp", REST)
+
+
+def shown():
+    return image_pixels("LTSH Comparison")
+
+
+@pytest.fixture
+def pictures(addon, tmp_path, show_results):
+    """Layers (R, H, W, 3) of two lights of the scene, of a lamp that is none, and of the rest."""
+    key = parts.add_area_light("Key", color=(1.0, 0.5, 0.25), energy=50.0)
+    fill = parts.add_area_light("Fill", energy=20.0, exposure=1.0)
+    parts.save(tmp_path / "room.blend")
+    show_results(addon, tmp_path)
+    layers = np.random.default_rng(5).random((4, HEIGHT, WIDTH, 3), np.float32)
+    rows = [
+        Row(ob.name, (ob.name,), tuple(ob.data.color),
+            {ob.name: [ob.data.energy, ob.data.exposure, *ob.data.color]}) for ob in (key, fill)
+    ]  # fmt: skip
+    rows += [Row("Lamp", ("Lamp",)), Row(REST, ())]
+    show(addon, rows, layers)
+    return layers
+
+
+def show(scene, rows, layers):
+    """Put pictures of lights beside the results, and show these anew."""
+    folder = results.result_of(scene).folder
+    facts = {"camera": "Camera", "frame": 1, "technique": "ltsh4", "notes": []}
+    LightPictures(tuple(rows), layers, np.ones((HEIGHT, WIDTH), np.float32), facts).save(folder / "lights.npz")
+    results._mixer["stamp"] = None
+    results.show(scene, folder)
+
+
+@pytest.fixture
+def scene(addon, pictures):
+    return addon
+
+
+def items(scene):
+    return {item.name: item for item in scene.ltsh.mixed}
+
+
+def test_values_change_the_picture_at_once(scene, pictures):
+    assert scene.ltsh.mode != "MIX" and set(items(scene)) == set(NAMES)
+    factors = np.ones((4, 3))
+
+    def check():
+        assert scene.ltsh.mode == "MIX"
+        np.testing.assert_allclose(shown(), np.einsum("rc,rhwc->hwc", factors, pictures), rtol=1e-5, atol=1e-6)
+
+    own = items(scene)
+    own["Key"].power, factors[0] = 2.5, 2.5
+    check()
+    own["Fill"].exposure, factors[1] = -1.5, 2.0**-1.5
+    check()
+    own["Key"].color = (1.0, 1.0, 0.0)
+    factors[0] = (2.5, 5.0, 0.0)
+    check()
+    own["Lamp"].muted, factors[2] = True, 0.0
+    check()
+    before, own["Key"].solo = factors.copy(), True
+    factors[1:] = 0.0
+    check()
+    own["Lamp"].solo = True  # which is muted all the same
+    check()
+    own["Key"].solo = own["Lamp"].solo = False
+    factors[:] = before
+    check()
+    assert bpy.ops.ltsh.reset_mixer() == {"FINISHED"}
+    factors[:] = 1.0
+    check()
+
+
+def test_apply_writes_what_is_shown_and_only_that(scene):
+    key, fill = (bpy.data.objects[name] for name in ("Key", "Fill"))
+    own = items(scene)
+    own["Key"].power, own["Key"].exposure, own["Key"].color = 2.0, 0.5, (0.5, 1.0, 0.5)
+    fill.data.energy = 33.0  # by the artist, meanwhile
+    assert mixer.applied(scene) == []
+    assert key.data.exposure == 0.5 and fill.data.energy == 33.0 and not key.hide_render
+    np.testing.assert_allclose(key.data.energy * np.array(key.data.color), 100.0 * np.array([0.5, 1.0, 0.5]), rtol=1e-6)
+    # Again it changes nothing; back at the picture's values it writes those.
+    values = key.data.energy, tuple(key.data.color)
+    mixer.applied(scene)
+    assert (key.data.energy, tuple(key.data.color)) == values
+    own["Key"].power, own["Key"].exposure, own["Key"].color = 1.0, 0.0, (1.0, 0.5, 0.25)
+    mixer.applied(scene)
+    assert key.data.energy == pytest.approx(50.0) and tuple(key.data.color) == pytest.approx((1.0, 0.5, 0.25))
+    own["Fill"].muted = True
+    mixer.applied(scene)
+    assert fill.hide_render and not key.hide_render
+    own["Fill"].muted = False
+    mixer.applied(scene)
+    assert not fill.hide_render
+
+
+def test_colors_beyond_white_go_into_the_power(scene):
+    key = bpy.data.objects["Key"]
+    items(scene)["Key"].color = (4.0, 1.0, 1.0)
+    mixer.applied(scene)
+    assert max(key.data.color) <= 1.0 + 1e-6
+    np.testing.assert_allclose(key.data.energy * np.array(key.data.color), (200.0, 50.0, 50.0), rtol=1e-6)
+
+
+def test_what_cannot_be_written_is_named(scene):
+    for item in scene.ltsh.mixed:
+        item.power = 0.5
+    asis = "no light object, so it is as it was; change its material or the world"
+    assert mixer.applied(scene) == [f"Lamp: {asis}", f"{REST}: {asis}"]
+    bpy.data.objects["Key"].data.keyframe_insert("energy", frame=1)
+    copy = bpy.data.objects.new("Lamp", bpy.data.objects["Fill"].data)
+    scene.collection.objects.link(copy)
+    bpy.data.objects["Fill"].name = "Elsewhere"
+    problems = mixer.applied(scene)
+    assert problems[0].startswith("Key: its settings are animated") and problems[1] == "Fill: not in the scene any more"
+
+
+def test_lights_that_share_data_must_get_the_same(scene):
+    bpy.data.objects["Fill"].data = bpy.data.objects["Key"].data
+    items(scene)["Key"].power = 2.0
+    items(scene)["Fill"].power = 3.0
+    (problem,) = mixer.applied(scene)
+    assert problem.startswith("Fill: it shares its data") and bpy.data.objects["Key"].data.energy == 100.0
+
+
+def test_changed_and_lost_lights_are_named_where_the_list_is(scene):
+    rows = {row.name: (row, item) for row, item in results.mixer_pairs(scene)}
+    assert [mixer.state_of(*rows[name])[1] for name in ("Key", "Fill", "Lamp")] == ["", "", ""]
+    bpy.data.objects["Key"].data.energy = 51.0
+    assert "changed in the scene since" in mixer.state_of(*rows["Key"])[1]
+    items(scene)["Key"].power = 51.0 / 50.0  # which is what the scene has now
+    assert mixer.state_of(*rows["Key"]) == ("LIGHT", "")
+    bpy.data.objects.remove(bpy.data.objects["Fill"])
+    assert mixer.state_of(*rows["Fill"]) == ("ERROR", "Fill: not in the scene any more")
+
+
+def test_values_outlast_a_new_picture_but_not_of_lights_that_have_them_now(scene, pictures):
+    for item in scene.ltsh.mixed:
+        item.power = 3.0
+    bpy.data.objects["Key"].data.energy = 150.0
+    rows = [row for row, _ in results.mixer_pairs(scene)]
+    rows[0].settings["Key"][0] = 150.0
+    show(scene, rows[:3], pictures[:3])
+    powers = {name: item.power for name, item in items(scene).items()}
+    assert powers == {"Key": 1.0, "Fill": 3.0, "Lamp": 3.0, REST: 3.0}
+
+
+def test_values_are_in_the_file_and_the_mix_is_shown_after_loading(scene, pictures, tmp_path):
+    items(scene)["Fill"].power = 2.0
+    before = shown()
+    bpy.ops.wm.save_mainfile()
+    assert np.array_equal(shown(), before)
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "room.blend"))
+    assert items(bpy.context.scene)["Fill"].power == 2.0 and bpy.context.scene.ltsh.mode == "MIX"
+    np.testing.assert_array_equal(shown(), before)
+
+
+@pytest.fixture
+def shaded(tmp_path):
+    """The scene of a room that was shaded with its lights kept."""
+    from job_window import add_on_in_room
+
+    with add_on_in_room(tmp_path / "room.blend") as scene:
+        scene.ltsh.techniques = {"ltsh4"}
+        fill = parts.add_area_light("Fill", location=(-1.0, 0.5, 1.5), size=0.5)
+        parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), rotation=(0.5, 0.0, 0.0))
+        parts.add_sphere(parts.principled("Ball")[0], smooth=False, radius=0.3, location=(0.0, 0.0, 0.6))
+        assert bpy.ops.ltsh.shade() == {"FINISHED"}
+        yield scene, fill
+
+
+def picture_of(scene):
+    layers = imaging.read_layers(results.result_of(scene).folder.parent / "shade.exr")
+    return layers["ltsh4.specular"] + layers["ltsh4.diffuse"]
+
+
+def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
+    scene, fill = shaded
+    before = picture_of(scene)
+    scene.ltsh.mode = "MIX"
+    np.testing.assert_allclose(shown(), before, rtol=1e-5, atol=1e-5)
+    assert set(items(scene)) == {"Light", "Fill", "Sun"}
+    assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
+    fill.location.x, fill.rotation_euler.y, fill.data.size = -0.2, 0.6, 0.8
+    bpy.context.view_layer.update()
+    assert bpy.ops.ltsh.update_moved_lights() == {"FINISHED"}
+    found = shown()
+    assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
+    # The file has it too.
+    results._mixer["stamp"] = None
+    np.testing.assert_array_equal(results.mixed_pixels(scene)[::-1, :, :3], found)
+    assert bpy.ops.ltsh.shade() == {"FINISHED"}
+    expected = picture_of(scene)
+    # Noise at the edges of shadows is of other rays.
+    assert np.sqrt(np.square(found - expected).sum() / np.square(expected).sum()) < 0.01
+    assert np.sqrt(np.square(before - expected).sum() / np.square(expected).sum()) > 0.05
+
+
+def test_pictures_without_kept_lights_say_so(shaded):
+    scene, _ = shaded
+    scene.ltsh.keep_lights = False
+    assert bpy.ops.ltsh.shade() == {"FINISHED"}
+    assert results.mixer_of(scene) is None and results.mix_label(scene) == "No lights were kept: shade again"
+    assert not bpy.ops.ltsh.reset_mixer.poll()

@@ -112,6 +112,7 @@ class LTSH_UL_mixer(bpy.types.UIList):
 
 class _Mixer:
     bl_label = "Light Mixer"
+    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
         layout, settings = self.layout, context.scene.ltsh
@@ -158,6 +159,7 @@ class LTSH_PT_IMAGE_mixer(_Mixer, bpy.types.Panel):
     bl_space_type = "IMAGE_EDITOR"
     bl_region_type = "UI"
     bl_category = "LTSH"
+    bl_options = set()
 
 
 class _NeedsMixer:

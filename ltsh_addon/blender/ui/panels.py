@@ -371,7 +371,10 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
         if not comparison.is_viewer(context.space_data.image):
             layout.operator("ltsh.open_results", text="Show Comparison", icon="IMAGE_DATA")
         column = layout.column()
-        toggles(column, context, 4).prop(settings, "mode", expand=True)
+        toggles(column, context, 5).prop(settings, "mode", expand=True)
+        if settings.mode == "MIX":
+            column.prop(context.scene.view_settings, "exposure", text="Exposure of the Scene")
+            return
         group = result.groups[results.choice_of(settings, result).group]
         self._draw_names(column, settings, "first", "A", group)
         if settings.mode != "A":

@@ -1,0 +1,78 @@
+"""The light mixer by the mouse: a light muted, dragged, undone; applied to the scene, undone; a light moved."""
+
+import statistics
+import time
+
+import bpy
+import hands
+
+SIZE = "1600x900"
+SECONDS = 900
+
+
+def main(rig):
+    yield from hands.open_panel(rig)
+    yield 1
+    settings = hands.settings()
+    settings.techniques, settings.resolution_percentage = {"ltsh4"}, 100
+    hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
+    yield from hands.job_started(rig, "shading starts")
+    yield from hands.wait_for_job(rig, 600)
+    yield from hands.results_opened(rig)
+    yield 2
+    rig.shot("1_shaded.png")
+    yield from changed(rig)
+    yield from applied(rig)
+    yield from moved(rig)
+
+
+def items():
+    return {item.name: item for item in hands.settings().mixed}
+
+
+def changed(rig):
+    rig.check(len(items()) > 1, f"the mixer has the lights of the picture: {list(items())}")
+    first = hands.settings().mixed[0]
+    times = []
+    for number in range(24):
+        start = time.perf_counter()
+        first.power = 1.0 + 0.1 * number
+        times.append(time.perf_counter() - start)
+        yield 0.05
+    rig.fact("a change, from the value to the pixels of the image, ms", round(1e3 * statistics.median(times), 1))
+    rig.fact("size", tuple(bpy.data.images["LTSH Comparison"].size))
+    rig.check(hands.settings().mode == "MIX", "a changed value shows the mix")
+    yield 1
+    rig.shot("2_brighter.png")
+    first.solo = True
+    yield 1
+    rig.shot("3_solo.png")
+    first.solo = False
+    first.color = (1.0, 0.3, 0.1)
+    yield 1
+    rig.shot("4_color.png")
+
+
+def applied(rig):
+    name = hands.settings().mixed[0].name
+    energy = bpy.data.objects[name].data.energy
+    hands.operate(rig, bpy.ops.ltsh.apply_mixer, kind="IMAGE_EDITOR")
+    yield 1
+    rig.check(bpy.data.objects[name].data.energy > energy, "Apply to Scene makes the light brighter")
+    rig.shot("5_applied.png")
+
+
+def moved(rig):
+    name = hands.settings().mixed[0].name
+    bpy.data.objects[name].location.x += 1.0
+    yield 1
+    start = time.perf_counter()
+    hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
+    rig.fact("a moved light, the first time, s", round(time.perf_counter() - start, 2))
+    bpy.data.objects[name].location.x -= 0.5
+    yield 1
+    start = time.perf_counter()
+    hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
+    rig.fact("a moved light, once more, s", round(time.perf_counter() - start, 2))
+    yield 1
+    rig.shot("6_moved.png")

@@ -16,7 +16,7 @@ PACKAGE = ROOT / "ltsh_addon"
 MOST_FILES = 150
 FEWEST_LINES = 50  # of a file that only one other imports
 BLENDER_MODULES = frozenset(
-    "aud bl_operators bl_ui blf bmesh bpy bpy_extras gpu gpu_extras idprop imbuf mathutils".split()
+    "aud bl_operators bl_ui blf bmesh bpy bpy_extras cycles gpu gpu_extras idprop imbuf mathutils".split()
 )
 # A room imports only from itself and from rooms to its left. Rooms are files and folders of the package; what no line
 # names belongs to the room of its folder.

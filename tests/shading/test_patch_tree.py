@@ -1,5 +1,7 @@
 """Distant lights with a detail: patches chosen by the lobes give what the smallest ones do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from surface_scenes import random_samples
@@ -38,6 +40,20 @@ def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
     for name, most in (("specular", 0.01), ("diffuse", 2e-3)):
         own, exact = (getattr(shading, name).sum(axis=0) for shading in (found, expected))
         assert np.linalg.norm(own - exact) < most * np.linalg.norm(exact), name
+
+
+def test_mirrors_reflect_a_sky():
+    """A lobe without width meets the smallest patches, which have no parts."""
+    samples = random_samples(150, seed=2)
+    samples = replace(samples, roughness=np.zeros(len(samples)))
+    lights, _ = sky_lights(LIKE, pictures())
+    leaves = [leaf for light in lights for leaf in light.patches]
+    found, expected = (
+        shade(samples, given, "ltsh4", passes=("specular",), workers=1).specular.sum(axis=0)
+        for given in (lights, leaves)
+    )
+    assert np.linalg.norm(expected) > 1.0
+    assert np.linalg.norm(found - expected) < 5e-3 * np.linalg.norm(expected)
 
 
 def test_a_constant_sky_is_one_patch_a_side_and_reflects_the_albedo():

@@ -43,6 +43,10 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     shown: bpy.props.EnumProperty(
         name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw
     )
+    world: bpy.props.BoolProperty(
+        name="World", description="The world lights what is seen; its background is there in any case",
+        default=True, update=_redraw,
+    )  # fmt: skip
     mode: bpy.props.EnumProperty(
         name="Mode", description="One technique or two", items=MODES, default="single", update=_redraw
     )
@@ -89,6 +93,7 @@ def draw_view_settings(layout, scene) -> None:
         layout.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK")
     layout.prop(settings, "technique")
     layout.prop(settings, "shown")
+    layout.prop(settings, "world")
     layout.prop(settings, "mode")
     if settings.mode in ("split", "difference"):
         layout.prop(settings, "second_technique")

@@ -19,6 +19,7 @@ from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
 from ...scene import CYCLES, TECHNIQUES, error_line
 from ..extract.occluders import collect_occluders
+from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
@@ -27,6 +28,7 @@ from ..ui.preview import ENGINE
 from ..viewport.mirror import SceneMirror
 from ..viewport.renderer import ShownPicture, ViewRenderer
 from ..viewport.shadows import LiveShadows, too_many
+from ..viewport.sky import LiveWorld
 from ..viewport.surfaces import View
 from ..viewport.textures import float_texture, look_values
 
@@ -57,7 +59,8 @@ class EngineView:
     """One 3D view with the engine."""
 
     def __init__(self):
-        self.mirror = SceneMirror()
+        self._world = LiveWorld()
+        self.mirror = SceneMirror(self._world.look)
         self._renderer: ViewRenderer | None = None
         self._reference = ReferenceTexture()
         self._error = ""
@@ -65,6 +68,7 @@ class EngineView:
         self._shadows = LiveShadows()
         self._shadow_notes: tuple[str, ...] = ()
         _at_work.add(self._shadows)
+        _views.add(self)
 
     def __del__(self):
         self._shadows.stop()
@@ -77,7 +81,23 @@ class EngineView:
         except Exception as error:
             self._note(error)
             # What was taken over half is read again as a whole.
-            self.mirror = SceneMirror()
+            self.mirror = SceneMirror(self._world.look)
+        if self._world.is_busy and not bpy.app.timers.is_registered(_look_at_worlds):
+            bpy.app.timers.register(_look_at_worlds, first_interval=LOOK_SECONDS)
+
+    def look_at_world(self) -> bool:
+        """Show what has been found out about the world; False: there is nothing new."""
+        found = self._world.step(bpy.context.scene.frame_current)
+        if found is None:
+            return False
+        sky, notes = found
+        self.mirror.take_sky(self.mirror.sky if sky is None else sky, *notes)
+        return True
+
+    @property
+    def waits_for_world(self) -> bool:
+        """Is anything of the world not known yet?"""
+        return self._world.is_busy
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
@@ -103,7 +123,7 @@ class EngineView:
             error = self._note(problem)
             with frame_buffer.bind():
                 frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
-        if not error and not self.mirror.lights:
+        if not error and not self.mirror.lights and not self.mirror.sky.sides:
             notes = [NO_LIGHTS, *notes]
         show(region, error, [*notes, *self.mirror.notes, *self._notes_of_shadows(size)], captions)
         if not error and self._renderer.samples < REFINEMENTS:
@@ -121,7 +141,7 @@ class EngineView:
             override = depsgraph.view_layer_eval.material_override
             occluders = collect_occluders(depsgraph, override, notes.append)
             self._shadow_notes = tuple(notes)
-            return occluders
+            return blocks_nothing(occluders, depsgraph.scene.world)
 
         self._shadows.follow((id(self.mirror), self.mirror.surfaces_version), collect)
 
@@ -173,6 +193,7 @@ def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:
         difference_scale=settings.difference_scale,
         exposure=cycles_setting(scene, "film_exposure"),
         transparent=scene.render.film_transparent,
+        world=settings.world,
         line_width=LINE_WIDTH * ui_scale,
         white=2.0**-scene.view_settings.exposure,
     )
@@ -356,6 +377,7 @@ def _redraw_later(start: float, samples: int) -> None:
 # When a view was drawn last, and the shadows of all views.
 _drawn = [0.0]
 _at_work: weakref.WeakSet = weakref.WeakSet()
+_views: weakref.WeakSet = weakref.WeakSet()
 
 
 def _look_for_shadows() -> float | None:
@@ -367,6 +389,14 @@ def _look_for_shadows() -> float | None:
         _tag_views()
         return None
     return LOOK_SECONDS if any(shadows.is_busy for shadows in _at_work) else None
+
+
+def _look_at_worlds() -> float | None:
+    """Show worlds in the views when Cycles has looked at them; look again while any is on its way."""
+    views = list(_views)
+    if any([view.look_at_world() for view in views]):
+        _tag_views()
+    return LOOK_SECONDS if any(view.waits_for_world for view in views) else None
 
 
 def _redraw() -> float | None:
@@ -481,7 +511,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Remove it."""
-    for timer in (_redraw, _look_for_shadows):
+    for timer in (_redraw, _look_for_shadows, _look_at_worlds):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     for shadows in _at_work:

@@ -59,12 +59,14 @@ def blocks_nothing(occluders, world):
     return replace(occluders, light_masks={**occluders.light_masks, world.name: 0})
 
 
-def world_lights(scene, world, warn) -> list[AreaLight]:
-    """The light of `world`, which is that of `scene`, as distant lights that have its name; [] of a dark one."""
+def light_of_world(world) -> AreaLight | None:
+    """A side of the cube with the name and the traits of the light of `world`; None where it gives no light."""
     if not may_shine(world):
-        return []
+        return None
     sees = world.cycles_visibility
-    like = AreaLight(
+    if not (sees.diffuse or sees.glossy):
+        return None
+    return AreaLight(
         name=world.name,
         shape="RECTANGLE",
         center=np.array([0.0, 0.0, 1.0]),
@@ -77,17 +79,14 @@ def world_lights(scene, world, warn) -> list[AreaLight]:
         affects_specular=sees.glossy,
         is_distant=True,
     )
-    if not (sees.diffuse or sees.glossy):
+
+
+def world_lights(scene, world, warn) -> list[AreaLight]:
+    """The light of `world`, which is that of `scene`, as distant lights that have its name; [] of a dark one."""
+    like = light_of_world(world)
+    if like is None:
         return []
-    with _observatory(scene, world, warn) as look:
-        pixels = _pixels(world)
-        pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
-        spots = bright_spots(pictures)
-        lights = []
-        for number, spot in enumerate(spots):
-            close = look(*spot_frame(spot), SPOT_PIXELS, SPOT_SAMPLES)
-            lights += spot_light(like, without_spots(close, spots[:number]), spot)
-    pictures = [without_spots(picture, spots) for picture in pictures]
+    pictures, lights = light_pictures(scene, world, like, warn)
     found, error = sky_lights(like, pictures)
     if error > COARSE:
         count = sum(len(light.patches) for light in found)
@@ -96,6 +95,27 @@ def world_lights(scene, world, warn) -> list[AreaLight]:
             f"{100.0 * error:.0f} % on average"
         )
     return found + lights
+
+
+def light_pictures(scene, world, like: AreaLight, warn) -> tuple[list[SkyPicture], list[AreaLight]]:
+    """A cube of what surfaces see of `world`, without what is small and bright; that as lights like `like`."""
+    with _observatory(scene, world, warn) as look:
+        pixels = _pixels(world)
+        pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+        spots = bright_spots(pictures)
+        lights = []
+        for number, spot in enumerate(spots):
+            close = look(*spot_frame(spot), SPOT_PIXELS, SPOT_SAMPLES)
+            lights += spot_light(like, without_spots(close, spots[:number]), spot)
+    return [without_spots(picture, spots) for picture in pictures], lights
+
+
+def background_pictures(scene, world, warn) -> list[SkyPicture]:
+    """A cube of what cameras see of `world`, which is that of `scene`."""
+    with _observatory(scene, world, warn, by_cameras=True) as look:
+        pixels = _pixels(world)
+        pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)
+        return [look(*axes, pixels, SAMPLES // 2) for axes in CUBE]
 
 
 def may_shine(world) -> bool:
@@ -136,14 +156,15 @@ def _nodes(world) -> list:
 
 
 @contextmanager
-def _observatory(scene, world, warn):
-    """look(ahead, right, up, pixels, samples): a `SkyPicture` of what surfaces see of `world`."""
+def _observatory(scene, world, warn, by_cameras: bool = False):
+    """look(ahead, right, up, pixels, samples): a `SkyPicture` of what surfaces see of `world`, or cameras."""
     own = world.copy()
     groups = []
     try:
         _store(own.cycles, "sampling_method", NOT_SAMPLED)
-        _store(own.cycles_visibility, "camera", True)
-        if tree_in_use(own) is not None:
+        if not by_cameras:
+            _store(own.cycles_visibility, "camera", True)
+        if tree_in_use(own) is not None and not by_cameras:
             groups = _own_groups(own.node_tree)
             _as_surfaces_see(own, world.name, warn)
         with open_studio(scene) as studio:

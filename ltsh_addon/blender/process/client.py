@@ -421,6 +421,23 @@ def draw_view(job: ViewJob, folder: Path, *, progress: Progress | None = None) -
         raise
 
 
+@dataclass(frozen=True)
+class SeenWorld:
+    """A world as Cycles renders it."""
+
+    light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty where it gives none
+    lights: tuple[AreaLight, ...]  # what is small and bright in it
+    background: np.ndarray  # (M, M, 3), see `viewport.sky`
+    warnings: list[str]
+
+
+def look_at_world(path: Path, world: str, frame: int, folder: Path) -> SeenWorld:
+    """The `world` of this name in the .blend `path`, at a frame; files go to `folder`. Raises as `extract` does."""
+    found = run_child({"task": "world", "path": str(path), "world": world, "frame": frame}, folder, None)
+    light, background = (np.load(folder / f"{name}.npy") for name in ("light", "background"))
+    return SeenWorld(light, tuple(AreaLight(**one) for one in found["lights"]), background, found["warnings"])
+
+
 def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
     """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
 

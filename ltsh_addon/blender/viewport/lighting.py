@@ -39,6 +39,8 @@ from .textures import (
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
+# By which the points at which lobes meet the world differ from one picture to the next: share of a step, and radians.
+GOLDEN, TURN = 0.618034, 2.0
 
 
 class HorizonPass:
@@ -110,14 +112,17 @@ class LightingPass:
         self.table = technique if isinstance(technique, LookupTable) else load_table(technique)
         self._shaders: dict[Features, tuple] = {}
         self._iors: tuple[float, ...] = ()
+        # Pictures that differ in it meet the world in other directions.
+        self.number = 0
         self._table = self._dielectrics = None
+        self._sky = None
         self.set_iors(iors)
         self.set_lights(())
 
     def free(self) -> None:
         """Let go of shaders and textures; the pass cannot draw any more."""
         self._shaders.clear()
-        self._table = self._dielectrics = self._lights = None
+        self._table = self._dielectrics = self._lights = self._sky = None
 
     def set_iors(self, iors: Sequence[float]) -> None:
         """The indices of refraction that most dielectrics have, as for the constructor."""
@@ -131,7 +136,7 @@ class LightingPass:
     def set_lights(self, lights: Iterable[AreaLight] | UploadedLights) -> None:
         """The lights from now on. Light groups are added up."""
         uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
-        self._lights = uploaded.texture
+        self._lights, self._sky = uploaded.texture, uploaded.sky
         self._shares = shares([_loops(light) for light in uploaded.lights])
         self._has_focused = any(light.is_profiled for light in uploaded.lights)
         self._has_facing = any(light.is_facing for light in uploaded.lights)
@@ -169,6 +174,7 @@ class LightingPass:
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
             shadowed=gbuffer.shares is not None,
             facing=self._has_facing,
+            sky=self._sky is not None,
         )
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
@@ -183,6 +189,8 @@ class LightingPass:
                     shader.uniform_sampler(name, self._texture(name, gbuffer))
                 if features.specular:
                     shader.uniform_float("view", view)
+                if features.sky and features.specular:
+                    shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
                 if features.shadowed:
                     shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
                 for first, end in self._shares:
@@ -194,7 +202,7 @@ class LightingPass:
                 gpu.state.blend_set(previous[1])
 
     def _texture(self, name, gbuffer):
-        own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics}
+        own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
         if name in own:
             return own[name]
         if name in SHARE_SAMPLERS:

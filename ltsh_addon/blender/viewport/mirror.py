@@ -31,11 +31,12 @@ from ..lights.emission import emission_of, factors_of
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import ShownTextures
-from ..lights.world import may_shine
+from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
 from ..materials.values import product, value_at
 from .meshes import MeshBatches, mesh_batches
+from .sky import ShownSky, constant_sky
 from .textures import look_values, uniform_buffer
 
 # Where nothing says on which side of closed emissive meshes the eye is, it is outside.
@@ -215,10 +216,13 @@ def _note_object(changes: Changes, block, update) -> None:
 class SceneMirror:
     """Meshes, looks, instances and lights of one view of a scene."""
 
-    def __init__(self):
+    def __init__(self, look: Callable = lambda world: None):
+        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known."""
         self.instances: list[ShownInstance] = []
-        self.lights: tuple[AreaLight, ...] = ()
-        self.background = np.zeros(3)
+        self.lights: tuple[AreaLight, ...] = ()  # those that are small and bright in the world included
+        self.sky = ShownSky()
+        self.own_lights: tuple[AreaLight, ...] = ()
+        self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
         self._looks: dict[str, ShownLook] = {}
@@ -251,9 +255,10 @@ class SceneMirror:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
         if changes.lights or changes.everything or changes.materials or changes.images:
-            self.lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures)
-        if changes.world or changes.everything:
-            self._read_world(depsgraph.scene)
+            self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures)
+            self.lights = (*self.own_lights, *self.sky.lights)
+        if changes.world or changes.everything or changes.images:
+            self._read_world(depsgraph.view_layer.world_override or depsgraph.scene.world)
         self._synced = True
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -304,12 +309,24 @@ class SceneMirror:
         self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
         self._meshes, self._looks = meshes, looks
 
-    def _read_world(self, scene) -> None:
-        self.background, whole = world_radiance(scene.world)
-        world = scene.world
-        self._world_note = (f"{world.name}: its light is not shown",) if may_shine(world) else ()
-        if not whole:
-            self._world_note += (f"{world.name}: its nodes are not resolved, its viewport color is shown",)
+    def _read_world(self, world) -> None:
+        radiance, whole = world_radiance(world)
+        like = None if world is None else light_of_world(world)
+        if whole:
+            is_seen = world is not None and world.cycles_visibility.camera
+            self.take_sky(constant_sky(like, radiance, radiance * is_seen))
+            return
+        sky = self._look(world.original)
+        if sky is None:
+            note = f"{world.name}: its viewport color is shown until Cycles has looked at it"
+            self.take_sky(constant_sky(like, radiance, radiance), note)
+        else:
+            self.take_sky(sky)
+
+    def take_sky(self, sky: ShownSky, *notes: str) -> None:
+        """Show this world from now on; `notes` say what is not as Cycles has it."""
+        self.sky, self._world_note = sky, notes
+        self.lights = (*self.own_lights, *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:

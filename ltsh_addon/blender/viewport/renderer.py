@@ -15,12 +15,15 @@ from .lighting import HorizonPass, LightingPass
 from .mirror import SceneMirror
 from .shaders import glsl, pixel_shader
 from .shadows import LiveShadows, ShadowRays
+from .sky import background_texels, sky_texels
 from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import GBufferTextures, UploadedLights, read_texture, upload_lights
+from .textures import GBufferTextures, UploadedLights, float_texture, read_texture, upload_lights
 
 MODES = ("single", "split", "difference")
 # The lighting pass is fast for so many indices of refraction, and exact for all.
 MOST_IORS = 6
+# Of pixels: right and up by half of the picture, and its center.
+RAYS = ("ray_x", "ray_y", "ray_center")
 # Of pixels: where they are seen, right and up of their centers.
 CENTERS = np.zeros((1, 2))
 
@@ -41,6 +44,7 @@ class ShownPicture:
     second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
     white: float = 1.0  # brightness of no difference, before the scene's own exposure
     also: tuple[tuple[str, str], ...] = ()  # techniques and passes that are drawn beside, for `read`
+    world: bool = True  # its light is shown
 
 
 def _origin_of(lights, view: View) -> np.ndarray:
@@ -55,14 +59,16 @@ class PicturePass:
     """Draws one or two pictures into what is bound; needs an active GPU context."""
 
     def __init__(self):
-        constants = {"mode": "INT", "scales": "VEC4", "background": "VEC4", "white": "FLOAT", "weights": "VEC2"}
+        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
+        constants |= dict.fromkeys(RAYS, "VEC4")
         modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
-        source = modes + glsl("picture")
-        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture"), constants)
+        source = modes + glsl("octahedron") + glsl("picture")
+        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture", "sky"), constants)
 
-    def draw(self, pictures, weights, size: tuple[int, int], shown: ShownPicture, background) -> None:
-        """Fill `size` pixels of what is bound, scene-linear, from one or two textures RGBA times their `weights`, whose
-        alpha then is the share of a pixel that shows a surface. `background` is a color (3,)."""
+    def draw(self, pictures, weights, view: View, shown: ShownPicture, background) -> None:
+        """Fill what is bound, scene-linear, from one or two textures RGBA times their `weights`, whose alpha then is
+        the share of a pixel that shows a surface. `background` is a picture of what is behind, as of `sky`."""
+        size = pictures[0].width, pictures[0].height
         gpu.state.viewport_set(0, 0, *size)
         gpu.state.blend_set("NONE")
         gpu.state.depth_test_set("NONE")
@@ -75,8 +81,11 @@ class PicturePass:
         shader.uniform_int("mode", MODES.index(shown.mode))
         scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
         shader.uniform_float("scales", scales)
-        behind = (0.0, 0.0, 0.0) if shown.transparent else [shown.exposure * float(value) for value in background]
-        shader.uniform_float("background", (*behind, 0.0 if shown.transparent else 1.0))
+        shader.uniform_sampler("sky", background)
+        shader.uniform_float("opacity", 0.0 if shown.transparent else 1.0)
+        is_behind = shown.passes == "combined" and not shown.transparent
+        for name, ray in zip(RAYS, view.rays, strict=True):
+            shader.uniform_float(name, (*ray, float(is_behind)))
         shader.uniform_float("white", shown.white)
         self._batch.draw(shader)
 
@@ -95,8 +104,9 @@ class ViewRenderer:
         self._lit_gbuffer: GBufferTextures | None = None
         self._smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
         self._lights: UploadedLights | None = None
-        self._drawn, self._uploaded = None, (None, None)
+        self._drawn, self._uploaded = None, (None, None, None)
         self._still, self.samples = None, 0
+        self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
 
     def draw(
@@ -113,31 +123,40 @@ class ViewRenderer:
             wanted.append((shown.second_technique, shown.passes))
         pictures = len(wanted)
         wanted += shown.also
-        asked = wanted, shown.second_picture is None
+        asked = wanted, shown.second_picture is None, shown.world
+        self._upload_sky(mirror)
         traced = None
         if self.shadows is not None:
             self.shadows.take_news()
             traced = self.shadows.version
-        still = (mirror, mirror.lights, self.shadows), (mirror.surfaces_version, *_key(view, size), asked, traced)
+        things = mirror, mirror.lights, mirror.sky, self.shadows
+        still = things, (mirror.surfaces_version, *_key(view, size), asked, traced)
         if not _same(still, self._still):
             self.samples = 0
         if self.samples < len(points):
             self._still = None  # until all of the sample is there
             self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
             self._still, self.samples = still, self.samples + 1
-        pictures = [self._targets[number][0] for number in range(pictures)]
+        self._show([self._targets[number][0] for number in range(pictures)], view, shown, frame_buffer)
+
+    def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
+        """Draw the picture of one of the techniques that were drawn last, as `draw` does; `shown` has its passes."""
+        self._show([self._targets[number][0]], view, shown, frame_buffer)
+
+    def _show(self, pictures, view, shown, frame_buffer) -> None:
         weights = [1.0 / self.samples] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
         with frame_buffer.bind():
-            background = mirror.background if shown.passes == "combined" else np.zeros(3)
-            self._picture.draw(pictures, weights, size, shown, background)
+            self._picture.draw(pictures, weights, view, shown, self._background)
 
-    def _draw_sample(self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool) -> None:
+    def _draw_sample(
+        self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool
+    ) -> None:
         """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all."""
         surfaces_changed = self._draw_surfaces(mirror, view, size)
-        lights_changed = self._upload_lights(mirror, view)
+        lights_changed = self._upload_lights(mirror, view, world)
         if surfaces_changed or lights_changed or self._lit_gbuffer is None:
             self._choose_horizons(mirror, view)
         buffers = self._light(wanted, mirror, view, size)
@@ -155,16 +174,24 @@ class ViewRenderer:
         self._drawn = drawn
         return True
 
-    def _upload_lights(self, mirror, view: View) -> bool:
+    def _upload_sky(self, mirror) -> None:
+        """Upload the world's light and background if they have changed."""
+        if self._sky is mirror.sky:
+            return
+        self._sky = sky = mirror.sky
+        self._sky_light = float_texture(sky_texels(sky)) if sky.sides else None
+        self._background = float_texture(background_texels(sky))
+
+    def _upload_lights(self, mirror, view: View, world: bool) -> bool:
         """Upload the lights if they, or the origin of the view, have changed, and tell that."""
-        lights, origin = self._uploaded
-        if lights is mirror.lights and np.array_equal(origin, view.origin):
+        lights = mirror.lights if world else mirror.own_lights
+        known, sky, origin = self._uploaded
+        wanted = self._sky_light if world else None
+        if known is lights and sky is wanted and np.array_equal(origin, view.origin):
             return False
         is_moved = view.origin.any()
-        self._lights = upload_lights(
-            [light.moved(-view.origin) for light in mirror.lights] if is_moved else mirror.lights
-        )
-        self._uploaded = mirror.lights, view.origin
+        self._lights = upload_lights([light.moved(-view.origin) for light in lights] if is_moved else lights, wanted)
+        self._uploaded = lights, wanted, view.origin
         return True
 
     def _choose_horizons(self, mirror, view: View) -> None:
@@ -191,8 +218,12 @@ class ViewRenderer:
             gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
             if self.shadows is not None:
                 whole = replace(gbuffer, smooth_normal=self._smooth_normal)
-                gbuffer = replace(gbuffer, shares=self.shadows.shares(whole, view, self._lights.lights, self.samples))
+                sides = () if self._lights.sky is None else mirror.sky.sides
+                shares = self.shadows.shares(whole, view, self._lights.lights, sides, self.samples)
+                gbuffer = replace(gbuffer, shares=shares)
             first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
+            for lighting in lightings:
+                lighting.number = self.samples
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
         return buffers
@@ -237,7 +268,8 @@ class ViewRenderer:
         self._smooth_normal = self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = (
             self._lobe_horizons
         ) = None
-        self._drawn, self._uploaded = None, (None, None)
+        self._drawn, self._uploaded = None, (None, None, None)
+        self._sky = self._sky_light = self._background = None
         self._still, self.samples = None, 0
 
 

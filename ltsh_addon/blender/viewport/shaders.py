@@ -22,7 +22,7 @@ from ...shading.header import core_text, definitions, filled, float_literal, mom
 from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
 from ...shading.lobes import LEAST_SHARE
 from ...shading.lookup_table import LookupTable
-from . import textures
+from . import sky, textures
 
 # Half diagonals of a light, as the lobe sees it, up to which it is sampled: there both that and the rounding of edges,
 # which grows with the inverse of the size, are below 2e-4 of the result.
@@ -71,6 +71,7 @@ class Features:
     turned: bool = False  # a diffuse normal of its own
     shadowed: bool = False  # a share of each light that is seen
     facing: bool = False  # lights that face every point
+    sky: bool = False  # the light of the world
 
     @property
     def samplers(self) -> tuple[str, ...]:
@@ -86,6 +87,8 @@ class Features:
             names.append("smooth_normals")
         if self.shadowed:
             names += ["shares", "grid_positions"]
+        if self.sky:
+            names.append("sky")
         return tuple(names)
 
 
@@ -94,6 +97,8 @@ def lighting_shader(table: LookupTable, features: Features):
     constants = {"place": "IVEC4", "view": "VEC4"} if features.specular else {"place": "IVEC4"}
     if features.shadowed:
         constants["grid"] = "MAT4"
+    if features.sky and features.specular:
+        constants["jitter"] = "VEC2"
     return pixel_shader(_lighting_source(table, features), features.samplers, constants)
 
 
@@ -118,6 +123,8 @@ def _lighting_source(table, features) -> str:
         parts.append(_specular_text(table, is_cosine, features))
     if features.diffuse:
         parts.append(_diffuse_text(features))
+    if features.sky:
+        parts += [glsl("octahedron"), glsl("sky")]
     return "\n".join([*parts, glsl("lighting")])
 
 
@@ -135,6 +142,11 @@ def _lighting_constants(table) -> dict:
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "PI": float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
+        "QUAD_FIRST": textures.QUAD_FIRST,
+        "SKY_SIZE": sky.SIZE,
+        "SKY_LEVELS": sky.LEVELS,
+        "SKY_POINTS": sky.POINTS,
+        "IRRADIANCE_SIZE": sky.IRRADIANCE_SIZE,
         "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
         "TINY": float_literal(TINY_LIGHT**2),
         "POINT": float_literal(POINT_LIGHT**2),

@@ -16,6 +16,7 @@ from ..process.blender_process import embree_libraries
 from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
 
+Lights = Sequence[AreaLight]
 # Of the shares of all lights, in half precision, on the card.
 MOST_BYTES = 1 << 30
 _SHARE_BYTES = 4
@@ -54,19 +55,22 @@ class ShadowRays:
         self._power = {name: np.zeros(2) for name in PASSES}
 
     def shares(
-        self, gbuffer: GBufferTextures, view: View, lights: Sequence[AreaLight], number: int = 0
+        self, gbuffer: GBufferTextures, view: View, lights: Lights, sides: Lights = (), number: int = 0
     ) -> ShareGrid | None:
-        """Those of `lights`, around the origin of `view`; None where there is nothing to see. Raises SceneError."""
+        """Those of `lights`, around the origin of `view`, then that of the `sides` of a sky, if there are any; None
+        where there is nothing to see. Raises SceneError."""
         start = time.perf_counter()
         samples, pixel = gbuffer_samples(gbuffer, view)
-        if not len(samples) or not lights:
+        if not len(samples) or not (lights or sides):
             return None
         width, height = gbuffer.size
         tracer = self._tracing.around(view.origin)
-        found = visible_shares(samples, lights, tracer, rays=self._rays, film=Film(width, height, pixel))
-        values = np.ones((len(lights), height * width, len(PASSES)), np.float32)
+        film = Film(width, height, pixel)
+        found = visible_shares(samples, (*lights, *sides), tracer, rays=self._rays, film=film)
+        count = len(lights) + bool(sides)
+        values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, pixel, index] = found.of_lights(name)
+            values[:, pixel, index] = found.of_lights(name)[:count]
             power = (np.square(part[name], dtype=np.float64).sum() for part in (found.radiance, found.deviation))
             self._power[name] += list(power)
         self.seconds += time.perf_counter() - start
@@ -97,13 +101,14 @@ QUICK_SECONDS = 0.03
 
 @dataclass(frozen=True)
 class _Request:
-    """What the thread is to trace: `lights`, which are those of some numbers, by `keys`, at points of a picture."""
+    """What the thread is to trace: `lights`, which are those of some numbers, by `keys`, at points of a picture. What
+    counts as one light are the sides of a sky."""
 
     state: tuple
     level: int
     numbers: tuple
     keys: tuple
-    lights: tuple
+    lights: tuple[Lights, ...]
     samples: SurfaceSamples
     film: Film
     rays: int
@@ -112,9 +117,10 @@ class _Request:
 
     def shares(self, progress: Callable) -> np.ndarray:
         """(L, H, W, 2), row 0 at the bottom."""
+        first = np.cumsum([0, *map(len, self.lights)])[:-1]
         found = visible_shares(
             self.samples,
-            self.lights,
+            [light for lights in self.lights for light in lights],
             self.tracing.around(self.origin),
             rays=self.rays,
             film=self.film,
@@ -123,7 +129,7 @@ class _Request:
         )
         values = np.ones((len(self.lights), self.film.height * self.film.width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, self.film.pixel, index] = found.of_lights(name)
+            values[:, self.film.pixel, index] = found.of_lights(name)[first]
         return values.reshape(len(self.lights), self.film.height, self.film.width, len(PASSES))
 
 
@@ -142,7 +148,8 @@ class LiveShadows:
         self._scene, self._collect, self._collected, self._scene_before = None, None, None, None
         self._tracing: _Tracing | None = None
         self._collect_seconds = 0.0
-        self._lights, self._keys = None, ()
+        # The lights, those of a sky as one, and what was given.
+        self._lights, self._keys, self._given = (), (), None
         self._wanted: tuple = ()
         # Of the state that was traced last: shares (H, W, 2) by the key of a light and level, and by whether they are
         # coarse the positions and the projection of their points.
@@ -194,12 +201,14 @@ class LiveShadows:
         self._show()
 
     def shares(
-        self, gbuffer: GBufferTextures, view: View, lights: Sequence[AreaLight], number: int
+        self, gbuffer: GBufferTextures, view: View, lights: Lights, sides: Lights = (), number: int = 0
     ) -> ShareGrid | None:
         """The shares as far as they are known, as of `ShadowRays.shares`; `number` counts the pictures of a view at
         rest."""
-        if lights is not self._lights:
-            self._lights, self._keys = lights, tuple(map(_shape_of, lights))
+        if self._given is None or lights is not self._given[0] or sides is not self._given[1]:
+            self._given = lights, sides
+            self._lights = (*((light,) for light in lights), *((sides,) if sides else ()))
+            self._keys = (*map(_shape_of, lights), *((_shape_of_sky(sides),) if sides else ()))
             if self._grid is not None and len(self._keys) != len(self._layers):
                 self._latest = {}
                 self._show()
@@ -293,6 +302,13 @@ def coarse_step(size: tuple[int, int]) -> int:
 def _shape_of(light: AreaLight) -> str:
     """What tells where and how `light` shines, but not how brightly."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
+
+
+def _shape_of_sky(sides: Lights) -> str:
+    """What tells how a sky shines, but not how brightly."""
+    values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
+    seen = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
+    return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
 
 
 def _every(step: int, gbuffer: GBufferTextures, view: View):

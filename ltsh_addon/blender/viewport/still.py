@@ -11,16 +11,20 @@ import bpy
 import gpu
 import numpy as np
 
+from ...cycles.environment import SkyPicture
 from ...files import save_array
-from ...scene import SceneError, error_line
+from ...scene import AreaLight, SceneError, error_line
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
+from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
+from ..materials.looks import world_radiance
 from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
 from .mirror import SceneMirror
 from .renderer import CENTERS, ShownPicture, ViewRenderer
 from .shadows import ShadowRays, too_many
+from .sky import ShownSky, background_of, coarse, varied_sky
 from .surfaces import View
 from .textures import read_texture
 
@@ -42,8 +46,9 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     size = render_settings.set_resolution(scene, job["width"], job["height"])
     warnings += _not_shown(scene, camera)
+    sky = _sky(scene, warnings)
     progress(GRAPHICS, 0.0)
-    drawn = with_graphics(lambda: _draw(job, scene, camera, size, progress))
+    drawn = with_graphics(lambda: _draw(job, (scene, camera, sky), size, progress))
     for number, pixels in enumerate(drawn["pictures"]):
         technique, index = divmod(number, len(VIEW_PASSES))
         save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
@@ -126,23 +131,62 @@ def _not_shown(scene, camera) -> list[str]:
     return found
 
 
-def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
+def _sky(scene, warnings: list[str]) -> ShownSky | None:
+    """What Cycles sees of the world of `scene`; None where that is one constant."""
+    world = _layer(scene).world_override or scene.world
+    if world_radiance(world)[1]:
+        return None
+    return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
+
+
+def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+    """The light of `world`, [] where it gives none, what is small and bright in it, and the background (N, N, 3), as
+    Cycles renders them; afterwards `scene` is as it was."""
+    like, light, lights = light_of_world(world), [], []
+    if like is not None:
+        light, lights = light_pictures(scene, world, like, warn)
+    return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
+
+
+def show_world(job: dict, folder: Path) -> dict:
+    """Do the `job` (see `client.look_at_world`): pictures as files in `folder`, the rest as a dictionary."""
+    warnings: list[str] = []
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    with bpy.data.libraries.load(job["path"]) as (_, wanted):
+        wanted.worlds = [job["world"]]
+    (scene.world,) = wanted.worlds
+    scene.frame_set(job["frame"])
+    light, lights, background = look_at_world(scene, scene.world, warnings.append)
+    save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
+    save_array(folder / "background.npy", background.astype(np.float32))
+    return {"lights": [one.record() for one in lights], "warnings": warnings}
+
+
+def _layer(scene):
+    return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+
+
+def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of every technique by pass, seconds of redraws, shadows, lights and notes."""
     progress("draw", 0.0)
-    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
-    with bpy.context.temp_override(scene=scene, view_layer=layer):
+    scene, camera, sky = seen
+    with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror = SceneMirror()
+    mirror = SceneMirror(lambda world: sky)
     mirror.sync(depsgraph)
-    if not mirror.lights:
+    if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes), None
     if job["shadows"] == "on":
         problem = too_many(len(mirror.lights), size)
         override = depsgraph.view_layer_eval.material_override
         rays = max(FEWEST_RAYS, job["shadow_rays"] // job["refine"])
-        shadows = None if problem else ShadowRays(collect_occluders(depsgraph, override, notes.append), rays)
-        notes += [problem] if problem else []
+        if problem:
+            notes.append(problem)
+        else:
+            occluders = blocks_nothing(collect_occluders(depsgraph, override, notes.append), scene.world)
+            shadows = ShadowRays(occluders, rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
     points = render_settings.sub_pixel_offsets(scene, job["refine"])
     first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)
@@ -160,7 +204,7 @@ def _draw(job: dict, scene, camera, size: tuple[int, int], progress) -> dict:
         "pictures": pictures,
         "seconds": seconds,
         "shadows": None if shadows is None else _facts(shadows, len(points)),
-        "lights": sorted({light.name for light in mirror.lights}),
+        "lights": sorted({light.name for light in (*mirror.lights, *mirror.sky.sides)}),
         "notes": notes,
         "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
     }
@@ -213,7 +257,7 @@ class _Canvas:
 
     def draw(self, shown: ShownPicture, points: np.ndarray, shadows: ShadowRays | None, progress: Callable) -> list:
         """The mean of `points` as of a view at rest: pictures (H, W, 4), row 0 on top, in the order of `shown`, times
-        the exposure. That of the first has the background, those of other techniques get it here."""
+        the exposure."""
         self._renderer.shadows = shadows
         try:
             for number in range(len(points)):
@@ -221,13 +265,14 @@ class _Canvas:
                 self._redraw(shown, self._view, points)
         finally:
             self._renderer.shadows = None
-        background = np.array([*shown.exposure * self._mirror.background, 1.0], np.float32)
         pictures = [read_texture(self._texture)]
         for number, (_, name) in enumerate(shown.also, 1):
-            lit = self._renderer.read(number)
-            lit[..., :3] *= np.float32(shown.exposure)
-            if name == "combined" and not shown.transparent:
-                lit += (1.0 - lit[..., 3:]) * background
+            if name == "combined":
+                self._renderer.show(number, self._view, shown, self._buffer)
+                lit = read_texture(self._texture)
+            else:
+                lit = self._renderer.read(number)
+                lit[..., :3] *= np.float32(shown.exposure)
             pictures.append(lit)
         return [picture[::-1] for picture in pictures]
 

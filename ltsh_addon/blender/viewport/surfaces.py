@@ -69,6 +69,16 @@ class View:
         return View(shift @ self.projection, self.eye, self.is_parallel, self.origin)
 
     @property
+    def rays(self) -> np.ndarray:
+        """(3, 3): what a ray of the eye, of any length, changes by from the center of the picture to its right end and
+        to its upper one, and that of the center."""
+        if self.is_parallel:
+            return np.stack([np.zeros(3), np.zeros(3), -self.eye])
+        back = np.linalg.inv(self.projection)
+        found = (back[:3] - self.eye[:, None] * back[3]).T
+        return np.stack([found[0], found[1], found[2] + found[3]]) / np.linalg.norm(found[2] + found[3])
+
+    @property
     def homogeneous_eye(self) -> tuple[float, ...]:
         """The eye's place and 1, or the way to it and 0."""
         return (*self.eye, 0.0 if self.is_parallel else 1.0)

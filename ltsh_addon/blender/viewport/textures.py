@@ -302,16 +302,17 @@ MOST_LOOPS = 40000
 
 @dataclass(frozen=True)
 class UploadedLights:
-    """Lights that have an area, and their texture."""
+    """Lights that have an area, their texture, and that of the world's light, if there is any."""
 
     lights: tuple[AreaLight, ...]
     texture: gpu.types.GPUTexture
+    sky: gpu.types.GPUTexture | None = None
 
 
-def upload_lights(lights: Iterable[AreaLight]) -> UploadedLights:
-    """`lights` on the card; needs an active GPU context."""
+def upload_lights(lights: Iterable[AreaLight], sky: gpu.types.GPUTexture | None = None) -> UploadedLights:
+    """`lights` on the card, beside the texture `sky`; needs an active GPU context."""
     visible = tuple(visible_lights(lights))
-    return UploadedLights(visible, float_texture(light_texels(visible)))
+    return UploadedLights(visible, float_texture(light_texels(visible)), sky)
 
 
 def shares(loops: Sequence[int]) -> list[tuple[int, int]]:

@@ -129,5 +129,26 @@ void main()
 #endif
         radiance += reflected * ltsh_light_texel(header + 4).xyz;
     }
+#ifdef LTSH_SKY
+    /* It comes with the first lights. */
+    vec4 mean = texelFetch(sky, ivec2(0, 0), 0);
+    vec4 traits = texelFetch(sky, ivec2(1, 0), 0);
+    if (here && place.z == 0) {
+        vec2 open = vec2(1.0);
+#ifdef LTSH_SHADOWED
+        open = ltsh_seen(near, textureSize(shares, 0).z - 1);
+#endif
+#ifdef LTSH_SPECULAR
+        if (glossy && traits.x > 0.0) {
+            radiance += open.x * ltsh_sky_specular(point, shine, weights, mean);
+        }
+#endif
+#ifdef LTSH_DIFFUSE
+        if (traits.y > 0.0) {
+            radiance += open.y * ltsh_sky_diffuse(matte, mean) * base.xyz;
+        }
+#endif
+    }
+#endif
     color = vec4(radiance, here ? 1.0 : 0.0);
 }

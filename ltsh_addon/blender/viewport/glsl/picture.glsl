@@ -1,8 +1,7 @@
 /* False colors as in `imaging.color.false_color`: red is brighter, blue darker, white equal. */
-vec4 over_background(vec4 lit)
+vec4 over_background(vec4 lit, vec3 behind)
 {
-  float alpha = mix(lit.a, 1.0, background.a);
-  return vec4(lit.rgb * scales.x + background.rgb * (1.0 - lit.a), alpha);
+  return vec4(scales.x * (lit.rgb + (1.0 - lit.a) * behind), mix(lit.a, 1.0, opacity));
 }
 
 void main()
@@ -11,10 +10,13 @@ void main()
   vec4 first = weights.x * texelFetch(first_picture, texel, 0);
   vec4 second = weights.y * texelFetch(second_picture, texel, 0);
   second.a = min(first.a, second.a);
-  color = over_background(first);
+  vec2 place = 2.0 * gl_FragCoord.xy / vec2(textureSize(first_picture, 0)) - 1.0;
+  vec3 ray = place.x * ray_x.xyz + place.y * ray_y.xyz + ray_center.xyz;
+  vec3 behind = ray_center.w * ltsh_sky_at(ray, ivec2(0), textureSize(sky, 0).x - 2);
+  color = over_background(first, behind);
   if (mode == LTSH_SPLIT) {
     float beyond = float(texel.x) + 0.5 - scales.z;
-    color = beyond > 0.0 ? over_background(second) : color;
+    color = beyond > 0.0 ? over_background(second, behind) : color;
     color = abs(beyond) <= scales.w ? vec4(vec3(0.8), 1.0) : color;
   }
   else if (mode == LTSH_DIFFERENCE) {

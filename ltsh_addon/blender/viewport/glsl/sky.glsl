@@ -1,0 +1,74 @@
+/* The light of the world, from a texture that `textures.sky_texels` describes: its mean is integrated exactly, what
+   differs from that at points of the lobe, each over as much of the picture as it stands for. */
+
+/* The mean of the picture over about so large a solid angle around a unit direction; `dither` between 0 and 1. */
+vec3 ltsh_sky_around(vec3 direction, float solid_angle, float dither)
+{
+    float stretch = abs(direction.x) + abs(direction.y) + abs(direction.z);
+    float texel = 4.0 * stretch * stretch * stretch / float(LTSH_SKY_SIZE * LTSH_SKY_SIZE);
+    float level = 0.5 * log2(max(solid_angle / texel, 1.0)) + dither;
+    int number = min(int(level), LTSH_SKY_LEVELS - 1);
+    int size = LTSH_SKY_SIZE >> number;
+    ivec2 corner = number == 0 ? ivec2(0, 1)
+                               : ivec2(LTSH_SKY_SIZE + 2, 2 * number - 1 + LTSH_SKY_SIZE - 2 * size);
+    return ltsh_sky_at(direction, corner, size);
+}
+
+#ifdef LTSH_SPECULAR
+/* All directions above a normal as a light: a rectangle so large that next to nothing is beside it. */
+ltsh_light ltsh_whole_sky(vec3 normal)
+{
+    vec3 tangent = ltsh_unit(cross(normal, abs(normal.x) < 0.7 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 1.0, 0.0)));
+    ltsh_light light;
+    light.offset = normal;
+    light.half_u = 1e4 * tangent;
+    light.half_v = -1e4 * cross(normal, tangent);
+    light.direction = -normal;
+    light.first = LTSH_QUAD_FIRST;
+    light.count = 4;
+    light.whole_first = LTSH_QUAD_FIRST;
+    light.whole_count = 4;
+    light.bound = 1.01;
+    light.is_round = false;
+    return light;
+}
+
+vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights weights, vec4 mean)
+{
+    specular_sum all_of_it = specular_integral(lobe, ltsh_whole_sky(point.normal));
+    vec3 radiance = mean.rgb * ltsh_reflected(point, specular_values(weights, all_of_it));
+    mat3 back = inverse(transpose(mat3(lobe.row_x, lobe.row_y, lobe.row_z)));
+    float stretch = abs(determinant(back));
+    int count = mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
+    for (int k = 0; k < count; ++k) {
+        float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
+        float angle = 2.3999632 * float(k) + jitter.y;
+        float height = sqrt(1.0 - squared);
+        vec3 warped = vec3(sqrt(squared) * vec2(cos(angle), sin(angle)), height);
+        vec3 direction = back * warped;
+        float inverse_length = inversesqrt(max(dot(direction, direction), 1e-37));
+        direction *= inverse_length;
+        float of_lobe = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
+        float solid_angle = of_lobe * stretch * inverse_length * inverse_length * inverse_length;
+        bool above = all(greaterThan(specular_heights(lobe, direction, warped, 1.0), vec3(0.0)));
+        vec4 values = specular_values(weights, specular_with_spot(specular_empty(), warped, -of_lobe));
+        vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
+        radiance += above ? ltsh_reflected(point, values) * (picture - mean.rgb) : vec3(0.0);
+    }
+    return max(radiance, vec3(0.0));
+}
+#endif
+
+#ifdef LTSH_DIFFUSE
+/* Of the part below a second horizon as much is missing as of a world that is the same everywhere. */
+vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
+{
+    diffuse_sum sum;
+    sum.total = -LTSH_PI * (lobe.plane_0 + (lobe.is_spare ? lobe.plane_0 : lobe.plane_1));
+    vec3 light = mean.rgb;
+    if (mean.w > 0.0) {
+        light = ltsh_sky_at(lobe.plane_0, ivec2(0, LTSH_SKY_SIZE + 3), LTSH_IRRADIANCE_SIZE);
+    }
+    return light * diffuse_form_factor(lobe, sum);
+}
+#endif

@@ -1,0 +1,245 @@
+"""The world in a view: its light, and what is seen of it behind the surfaces.
+
+Pictures of all directions are squares onto which an octahedron around the eye is unfolded: x and y of the upper half
+lie inside the inner square turned by 45 degrees.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+
+import bpy
+import numpy as np
+
+from ...cycles.environment import CUBE, SkyPicture, sky_lights
+from ...files import temporary_folder
+from ...scene import AreaLight, error_line
+from ..lights.world import light_of_world
+from ..process import client
+
+# Sides of the largest picture of the light, of the smallest, of that of the irradiance, and of what it is made of.
+SIZE, LEAST_SIZE, IRRADIANCE_SIZE, IRRADIANCE_SOURCE = 256, 4, 32, 64
+LEVELS = (SIZE // LEAST_SIZE).bit_length()
+# Directions in which a lobe meets the picture.
+POINTS = 16
+# For so long a world must not change before Cycles looks at it.
+REST_SECONDS = 0.3
+# Of all sides together, for shadows.
+MOST_PATCHES = 1536
+# Sides of the pictures of a cube that is enough for the light, and of the largest picture of a background.
+CUBE_SIZE, BACKGROUND_SIZE = 128, 2048
+
+
+@dataclass(frozen=True)
+class ShownSky:
+    """A world as a view shows it."""
+
+    sides: tuple[AreaLight, ...] = ()  # of a cube around all points, for shadows; none of a dark world
+    lights: tuple[AreaLight, ...] = ()  # what is small and bright in it
+    light: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # without that, (N, N, 3); N = 1: constant
+    background: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # as cameras see it
+
+
+def constant_sky(like: AreaLight | None, radiance: np.ndarray, background: np.ndarray) -> ShownSky:
+    """A world that is the same everywhere; `like` has the name and the traits of its light, None: it is dark."""
+    picture = np.array(radiance, np.float64).reshape(1, 1, 3)
+    sides = [] if like is None else sky_lights(like, [SkyPicture(*axes, picture) for axes in CUBE])[0]
+    shown = np.array(background, np.float64).reshape(1, 1, 3)
+    return ShownSky(tuple(sides), (), picture if sides else np.zeros((1, 1, 3)), shown)
+
+
+def varied_sky(like: AreaLight | None, light, lights, background: np.ndarray) -> ShownSky:
+    """A world of which there are a cube of coarse pictures of its `light` without the `lights` in it, and the
+    `background` (N, N, 3)."""
+    sides = () if like is None else tuple(sky_lights(like, light, MOST_PATCHES)[0])
+    if not sides:
+        return ShownSky(lights=tuple(lights), background=background)
+    return ShownSky(sides, tuple(lights), unfolded(light, SIZE), background)
+
+
+def background_of(pictures: list[SkyPicture]) -> np.ndarray:
+    """The background (N, N, 3) of a cube of pictures of it."""
+    return unfolded(pictures, min(2 * len(pictures[0].radiance), BACKGROUND_SIZE))
+
+
+def coarse(picture: SkyPicture) -> SkyPicture:
+    """With at most `CUBE_SIZE` pixels along each side."""
+    while len(picture.radiance) > CUBE_SIZE:
+        weight = picture.solid_angles()[..., None]
+        picture = replace(picture, radiance=_summed(picture.radiance * weight) / _summed(weight))
+    return picture
+
+
+def _summed(values: np.ndarray) -> np.ndarray:
+    """Sums over 2 x 2."""
+    rows = values[0::2] + values[1::2]
+    return rows[:, 0::2] + rows[:, 1::2]
+
+
+def directions(size: int) -> np.ndarray:
+    """Unit directions (N, N, 3) of the texels of a picture with `size` texels along each side, row 0 at v = -1."""
+    place = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
+    u, v = np.meshgrid(place, place)
+    height = 1.0 - np.abs(u) - np.abs(v)
+    below = height < 0.0
+    x = np.where(below, (1.0 - np.abs(v)) * np.where(u < 0.0, -1.0, 1.0), u)
+    y = np.where(below, (1.0 - np.abs(u)) * np.where(v < 0.0, -1.0, 1.0), v)
+    found = np.stack([x, y, height], axis=-1)
+    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
+
+def solid_angles(size: int) -> np.ndarray:
+    """Of these texels, (N, N) in sr; about."""
+    return (2.0 / size) ** 2 * np.abs(directions(size)).sum(axis=-1) ** 3
+
+
+def unfolded(pictures: list[SkyPicture], size: int) -> np.ndarray:
+    """The six pictures of a cube as one (size, size, 3), interpolated."""
+    toward = directions(size).reshape(-1, 3)
+    found = np.zeros((len(toward), 3))
+    side = np.argmax(np.stack([toward @ picture.ahead for picture in pictures]), axis=0)
+    for number, picture in enumerate(pictures):
+        own = np.flatnonzero(side == number)
+        along = toward[own] @ picture.ahead
+        count = len(picture.radiance)
+        column, row = (
+            np.clip((sign * (toward[own] @ axis) / (axis @ axis) / along + 1.0) * 0.5 * count - 0.5, 0.0, count - 1.0)
+            for sign, axis in ((1.0, picture.right), (-1.0, picture.up))
+        )
+        found[own] = _interpolated(picture.radiance, row, column)
+    return found.reshape(size, size, 3)
+
+
+def _interpolated(values: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    top, left = row.astype(int), column.astype(int)
+    down, right = np.minimum(top + 1, len(values) - 1), np.minimum(left + 1, values.shape[1] - 1)
+    y, x = (row - top)[:, None], (column - left)[:, None]
+    above = (1.0 - x) * values[top, left] + x * values[top, right]
+    below = (1.0 - x) * values[down, left] + x * values[down, right]
+    return (1.0 - y) * above + y * below
+
+
+def halved(picture: np.ndarray) -> np.ndarray:
+    """Means over 2 x 2 texels, by their solid angles."""
+    weight = solid_angles(len(picture))[..., None]
+    return _summed(picture * weight) / _summed(weight)
+
+
+def mean_of(picture: np.ndarray) -> np.ndarray:
+    """(3,) over all directions."""
+    return np.average(picture.reshape(-1, 3), axis=0, weights=solid_angles(len(picture)).ravel())
+
+
+def irradiance(picture: np.ndarray, size: int) -> np.ndarray:
+    """Irradiance over pi, (size, size, 3), of surfaces with the normals of the texels."""
+    toward, weight = directions(len(picture)).reshape(-1, 3), solid_angles(len(picture)).ravel()
+    mean = mean_of(picture)
+    cosines = np.maximum(directions(size).reshape(-1, 3) @ toward.T, 0.0)
+    # What differs from the mean: of that no error of the sum is seen where the world is the same everywhere.
+    rest = (picture.reshape(-1, 3) - mean) * weight[:, None] / np.pi
+    return np.maximum(mean + cosines @ rest, 0.0).reshape(size, size, 3)
+
+
+def with_border(picture: np.ndarray) -> np.ndarray:
+    """With one texel more on each side: what lies beyond the fold."""
+    wide = np.concatenate([picture[:1, ::-1], picture, picture[-1:, ::-1]])
+    return np.concatenate([wide[::-1, :1], wide, wide[::-1, -1:]], axis=1)
+
+
+def sky_texels(sky: ShownSky) -> np.ndarray:
+    """Texels (H, W, 4) of the light of `sky`.
+
+    The first row has the mean radiance, w = 1 where it is not everywhere the same, and whether glossy and diffuse lobes
+    see it. Below are pictures with borders: the largest, with the smaller ones beside it, and the irradiance over pi.
+    """
+    traits = sky.sides[0]
+    header = np.zeros((1, 2, 4))
+    header[0, 1, :2] = traits.affects_specular, traits.affects_diffuse
+    header[0, 0, :3] = mean_of(sky.light)
+    if len(sky.light) == 1:
+        return header
+    header[0, 0, 3] = 1.0
+    texels = np.zeros((SIZE + 3 + IRRADIANCE_SIZE + 2, SIZE + SIZE // 2 + 4, 4))
+    texels[:1, :2] = header
+    picture, row, sources = sky.light, 1, {}
+    for level in range(LEVELS):
+        sources[len(picture)] = picture
+        wide = with_border(picture)
+        column = 0 if level == 0 else SIZE + 2
+        texels[row : row + len(wide), column : column + len(wide), :3] = wide
+        row += len(wide) if level else 0
+        picture = halved(picture)
+    wide = with_border(irradiance(sources[IRRADIANCE_SOURCE], IRRADIANCE_SIZE))
+    texels[SIZE + 3 : SIZE + 3 + len(wide), : len(wide), :3] = wide
+    return texels
+
+
+def background_texels(sky: ShownSky) -> np.ndarray:
+    """The background with its border, (N + 2, N + 2, 4)."""
+    wide = with_border(sky.background)
+    return np.concatenate([wide, np.ones((*wide.shape[:2], 1))], axis=-1)
+
+
+class LiveWorld:
+    """Worlds as Cycles sees them, for a window: a second Blender renders them while the view goes on."""
+
+    def __init__(self):
+        self._wanted, self._changed = "", 0.0
+        self._of, self._sky = "", None  # the world that was looked at last, and what was found
+        self._thread: threading.Thread | None = None
+        self._outcome: tuple[ShownSky, list[str]] | Exception | None = None
+
+    def look(self, world) -> ShownSky | None:
+        """To be told of a new or changed `world`: what it looked like the last time, None where nobody has looked."""
+        self._wanted, self._changed = world.name_full, time.monotonic()
+        return self._sky if self._of == self._wanted else None
+
+    @property
+    def is_busy(self) -> bool:
+        """Is there anything to be waited for?"""
+        return bool(self._wanted) or self._thread is not None
+
+    def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
+        """Do what is next, in the main thread: what was found and what is to be said of it, if there is news."""
+        if self._thread is not None:
+            return None if self._thread.is_alive() else self._take()
+        if self._wanted and time.monotonic() - self._changed > REST_SECONDS:
+            self._begin(frame)
+        return None
+
+    def _take(self):
+        self._thread, outcome = None, self._outcome
+        if isinstance(outcome, Exception):
+            return None, [f"{self._of}: {error_line(outcome)}"]
+        if self._wanted == self._of:  # it has changed again
+            return None
+        self._sky = outcome[0]
+        return outcome
+
+    def _begin(self, frame: int) -> None:
+        world, self._of, self._wanted = bpy.data.worlds.get(self._wanted), self._wanted, ""
+        if world is None:
+            return
+        stack = ExitStack()
+        folder = stack.enter_context(temporary_folder())
+        path, name, like = folder / "world.blend", world.name, light_of_world(world)
+        try:
+            bpy.data.libraries.write(str(path), {world}, path_remap="ABSOLUTE", fake_user=True)
+        except BaseException:
+            stack.close()
+            raise
+
+        def work() -> None:
+            try:
+                with stack:
+                    found = client.look_at_world(path, name, frame, folder)
+                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
+                self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
+            except Exception as error:
+                self._outcome = error
+
+        self._thread = threading.Thread(target=work, name="LTSH world", daemon=True)
+        self._thread.start()

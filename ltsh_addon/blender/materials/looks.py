@@ -96,6 +96,13 @@ class Look:
         return self.values.get(name) or constant(NEUTRAL[name])
 
     @property
+    def through(self) -> float:
+        """The share of it, but for metal, that lets see what is behind."""
+        if self.kind == "glass":
+            return 1.0
+        return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
+
+    @property
     def images(self) -> dict[str, ImageUse]:
         """Images by slot of IMAGE_SLOTS."""
         found = {name: value.image for name, value in self.values.items() if name in IMAGE_SLOTS and value.image}

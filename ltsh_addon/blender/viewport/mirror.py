@@ -147,6 +147,11 @@ class ShownLook:
         """This lobe and the further ones; none of what is seen through."""
         return () if self.look.is_clear else (self, *self.further)
 
+    @property
+    def is_glass(self) -> bool:
+        """Is anything seen through it, but not as if it were not there?"""
+        return any(lobe.look.through > 0.0 for lobe in self.lobes)
+
 
 @dataclass(frozen=True)
 class ShownInstance:
@@ -245,6 +250,11 @@ class SceneMirror:
     def most_lobes(self) -> int:
         """How many lobes the material with the most has."""
         return max((len(shown.lobes) for shown in self._looks.values()), default=0)
+
+    @property
+    def has_glass(self) -> bool:
+        """Is anything seen through a surface?"""
+        return any(shown.is_glass for shown in self._looks.values())
 
     def sync(self, depsgraph, space=None) -> None:
         """Take over what has changed; `space` is the 3D view, whose local view counts."""

@@ -90,19 +90,101 @@ class PicturePass:
         self._batch.draw(shader)
 
 
+class VeilPass:
+    """Draws what is seen through glass; needs an active GPU context."""
+
+    def __init__(self):
+        constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
+        samplers = ("behind", "left", "glass", "sky")
+        self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
+
+    def draw(self, textures, target, view: View, is_seen: bool, blend: str) -> None:
+        """Draw a picture RGBA of what is behind into `target`, where there is glass times what is `left` of it, and
+        over the background. What is behind `is_seen`, or black. `textures` are these, positions of the glass and the
+        background."""
+        shader = self._shader
+        with target.bind():
+            gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
+            gpu.state.blend_set(blend)
+            gpu.state.depth_test_set("NONE")
+            try:
+                shader.bind()
+                for name, texture in zip(("behind", "left", "glass", "sky"), textures, strict=True):
+                    shader.uniform_sampler(name, texture)
+                shader.uniform_float("is_seen", float(is_seen))
+                for name, ray in zip(RAYS, view.rays, strict=True):
+                    shader.uniform_float(name, (*ray, 1.0))
+                self._batch.draw(shader)
+            finally:
+                gpu.state.blend_set("NONE")
+
+
+class _Layer:
+    """The G-buffer of some surfaces, and which horizons end their lobes."""
+
+    def __init__(self, before: _Layer | None = None):
+        self._surfaces = SurfacePass(None if before is None else before._surfaces)
+        self._horizons: HorizonPass | None = None
+        self._lobe_horizons: HorizonPass | None = None
+        self._gbuffer: GBufferTextures | None = None
+        self._lit: GBufferTextures | None = None
+        self.smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
+        self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
+
+    def draw(self, mirror, view: View, size) -> None:
+        """Draw the surfaces."""
+        self._lit = None
+        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+
+    def choose_horizons(self, mirror, view: View, lights: UploadedLights) -> None:
+        """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
+        self._lit = None
+        if self._horizons is None and self._gbuffer.geometric_normal is not None:
+            self._horizons = HorizonPass()
+        self._lit = self._with_horizons(self._gbuffer, self._horizons, mirror, view, lights)
+
+    @property
+    def is_ready(self) -> bool:
+        """Have the horizons been chosen?"""
+        return self._lit is not None
+
+    def lobe(self, number: int, mirror, view: View, lights: UploadedLights) -> GBufferTextures:
+        """What is to be lit of the lobes `number`; valid until the next call."""
+        if number == 0:
+            return self._lit
+        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
+        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
+            self._lobe_horizons = HorizonPass()
+        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view, lights)
+
+    def _with_horizons(self, gbuffer, horizons, mirror, view: View, lights) -> GBufferTextures:
+        self.smooth_normal = gbuffer.smooth_normal
+        if gbuffer.geometric_normal is None:
+            return gbuffer
+        horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye)
+        smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
+        return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
+
+    def free(self) -> None:
+        """Let go of everything."""
+        self._surfaces.free()
+        for horizons in (self._horizons, self._lobe_horizons):
+            if horizons is not None:
+                horizons.free()
+        self._gbuffer = self._lit = self.smooth_normal = self._horizons = self._lobe_horizons = None
+
+
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
     def __init__(self):
-        self._surfaces = SurfacePass()
+        self._surfaces = _Layer()
+        self._glass: _Layer | None = None
         self._picture = PicturePass()
+        self._veil: VeilPass | None = None
         self._lighting: dict[str, LightingPass] = {}
         self._targets: list = []
-        self._horizons: HorizonPass | None = None
-        self._lobe_horizons: HorizonPass | None = None
-        self._gbuffer: GBufferTextures | None = None
-        self._lit_gbuffer: GBufferTextures | None = None
-        self._smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
+        self._behind: list = []  # what is lit behind glass
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None, None)
         self._still, self.samples = None, 0
@@ -157,20 +239,38 @@ class ViewRenderer:
         """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all."""
         surfaces_changed = self._draw_surfaces(mirror, view, size)
         lights_changed = self._upload_lights(mirror, view, world)
-        if surfaces_changed or lights_changed or self._lit_gbuffer is None:
-            self._choose_horizons(mirror, view)
-        buffers = self._light(wanted, mirror, view, size)
-        for (_, passes), buffer in zip(wanted, buffers, strict=True):
-            if with_emission and passes == "combined":
-                self._surfaces.add_emission(mirror.instances, view, size, buffer)
+        layers = [self._surfaces, self._glass] if mirror.has_glass else [self._surfaces]
+        for layer in layers:
+            if surfaces_changed or lights_changed or not layer.is_ready:
+                layer.choose_horizons(mirror, view, self._lights)
+        targets = [self._target(self._targets, number, size) for number in range(len(wanted))]
+        first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
+        if not mirror.has_glass:
+            self._light(self._surfaces, wanted, targets, (mirror, view), first)
+            self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
+            return
+        behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
+        self._light(self._surfaces, wanted, behind, (mirror, view), "NONE")
+        self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
+        through = self._glass.through(mirror.instances, view)
+        glass = self._glass.lobe(0, mirror, view, self._lights).position
+        for (texture, _, _), target, (_, passes) in zip(self._behind, targets, wanted, strict=False):
+            is_seen = passes == "combined" and with_emission
+            self._veil.draw((texture, through, glass, self._background), target, view, is_seen, first)
+        self._light(self._glass, wanted, targets, (mirror, view), "ADDITIVE")
+        self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
-        """Draw the G-buffer if anything has changed, and tell that."""
+        """Draw the G-buffers if anything has changed, and tell that."""
         drawn = (mirror,), (mirror.surfaces_version, *_key(view, size))
         if _same(drawn, self._drawn):
             return False
         self._drawn = None
-        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+        self._surfaces.draw(mirror, view, size)
+        if mirror.has_glass:
+            if self._glass is None:
+                self._glass, self._veil = _Layer(self._surfaces), VeilPass()
+            self._glass.draw(mirror, view, size)
         self._drawn = drawn
         return True
 
@@ -194,39 +294,31 @@ class ViewRenderer:
         self._uploaded = lights, wanted, view.origin
         return True
 
-    def _choose_horizons(self, mirror, view: View) -> None:
-        """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
-        self._lit_gbuffer = None
-        if self._horizons is None and self._gbuffer.geometric_normal is not None:
-            self._horizons = HorizonPass()
-        self._lit_gbuffer = self._with_horizons(self._gbuffer, self._horizons, mirror, view)
-
-    def _with_horizons(self, gbuffer, horizons, mirror, view: View) -> GBufferTextures:
-        self._smooth_normal = gbuffer.smooth_normal
-        if gbuffer.geometric_normal is None:
-            return gbuffer
-        horizon = horizons.draw(gbuffer, self._lights, view.homogeneous_eye)
-        smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
-        return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
-
-    def _light(self, wanted: list[tuple[str, str]], mirror, view: View, size) -> list:
-        """The buffers that techniques and passes are drawn into; surfaces and shadows of a lobe are those of all."""
+    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> None:
+        """Light a layer into the buffers of techniques and passes, with the blending `first`, as of a `seen` mirror and
+        view; surfaces and shadows of a lobe are those of all."""
+        mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
-        buffers = [self._target(number, size) for number in range(len(wanted))]
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
+        sides = () if self._lights.sky is None else mirror.sky.sides
+        # A thread traces one picture at a time: that of what is behind the glass.
+        shadows = None if layer is self._glass and isinstance(self.shadows, LiveShadows) else self.shadows
+        for lighting in lightings:
+            lighting.number = self.samples
         for number in range(max(mirror.most_lobes, 1)):
-            gbuffer = self._lit_gbuffer if number == 0 else self._further_lobe(number, mirror, view)
-            if self.shadows is not None:
-                whole = replace(gbuffer, smooth_normal=self._smooth_normal)
-                sides = () if self._lights.sky is None else mirror.sky.sides
-                shares = self.shadows.shares(whole, view, self._lights.lights, sides, self.samples)
+            gbuffer = layer.lobe(number, mirror, view, self._lights)
+            if shadows is not None:
+                whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
+                shares = shadows.shares(whole, view, self._lights.lights, sides, self.samples)
                 gbuffer = replace(gbuffer, shares=shares)
-            first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
-            for lighting in lightings:
-                lighting.number = self.samples
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
-        return buffers
+
+    def _add_emission(self, layer: _Layer, wanted, buffers, seen: tuple, with_emission: bool) -> None:
+        mirror, view, size = seen
+        for (_, passes), buffer in zip(wanted, buffers, strict=True):
+            if with_emission and passes == "combined":
+                layer.add_emission(mirror.instances, view, size, buffer)
 
     def _lighting_of(self, technique: str, mirror) -> LightingPass:
         if technique not in self._lighting:
@@ -236,20 +328,15 @@ class ViewRenderer:
         lighting.set_lights(self._lights)
         return lighting
 
-    def _further_lobe(self, number: int, mirror, view: View) -> GBufferTextures:
-        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
-        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
-            self._lobe_horizons = HorizonPass()
-        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view)
-
-    def _target(self, number: int, size):
-        """The frame buffer that the technique `number` is drawn into: the sum of its samples."""
-        while len(self._targets) <= number:
-            self._targets.append(None)
-        if self._targets[number] is None or self._targets[number][2] != size:
+    @staticmethod
+    def _target(targets: list, number: int, size):
+        """The frame buffer `number` of `targets`; those that a technique is drawn into have the sum of its samples."""
+        while len(targets) <= number:
+            targets.append(None)
+        if targets[number] is None or targets[number][2] != size:
             texture = gpu.types.GPUTexture(size, format="RGBA32F")
-            self._targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
-        return self._targets[number][1]
+            targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
+        return targets[number][1]
 
     def read(self, number: int = 0) -> np.ndarray:
         """The last picture (H, W, 4) of the first technique, the second, or one beside; row 0 at the bottom."""
@@ -257,17 +344,12 @@ class ViewRenderer:
 
     def free(self) -> None:
         """Let go of everything."""
-        for lighting in self._lighting.values():
-            lighting.free()
+        for part in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
+            part.free()
         self._lighting.clear()
         self._targets.clear()
-        self._surfaces.free()
-        for horizons in (self._horizons, self._lobe_horizons):
-            if horizons is not None:
-                horizons.free()
-        self._smooth_normal = self._gbuffer = self._lit_gbuffer = self._lights = self._horizons = (
-            self._lobe_horizons
-        ) = None
+        self._behind.clear()
+        self._lights = self._glass = self._veil = None
         self._drawn, self._uploaded = None, (None, None, None)
         self._sky = self._sky_light = self._background = None
         self._still, self.samples = None, 0

@@ -27,7 +27,8 @@ from .textures import (
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
-EMISSION = ("emission",)
+EMISSION, THROUGH = ("emission",), ("through",)
+_ADDED = (EMISSION, THROUGH)
 # What a corner of a mesh has, and its type.
 _CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
 # Before, Cycles left interpolated normals as long as they are.
@@ -85,9 +86,20 @@ class View:
 
 
 class SurfacePass:
-    """Shaders and textures of one view's G-buffer; needs an active GPU context."""
+    """Shaders and textures of one view's G-buffer; needs an active GPU context.
 
-    def __init__(self):
+    Glass before the surfaces of another pass has one of its own, which is made with that and draws into its depth.
+    """
+
+    def __init__(self, before: SurfacePass | None = None):
+        self._before, self._is_glass = before, before is not None
+        self._through: tuple | None = None
+        if before is not None:
+            self._shaders, self._tables = before._shaders, before._tables
+            self._nothing, self._missing = before._nothing, before._missing
+            self._size = self._depth = None
+            self._targets: dict = {}
+            return
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._nothing = float_texture(np.zeros((1, 1, 4)))
@@ -103,6 +115,8 @@ class SurfacePass:
         if size != self._size:
             self._size, self._targets = size, {}
             self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
+        if self._before is not None and self._depth is not self._before._depth:
+            self._depth, self._targets = self._before._depth, {}
         return self._gbuffer(0, instances, view)
 
     def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
@@ -116,21 +130,38 @@ class SurfacePass:
     def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
         """Add what the surfaces drawn last emit to `frame_buffer`."""
         shining = [instance for instance in instances if any(np.any(look.look.emission) for look in instance.looks)]
-        if not shining:
-            return
+        if shining:
+            self._add(EMISSION, [(0, shining)], view, frame_buffer)
+
+    def through(self, instances: list[ShownInstance], view: View) -> gpu.types.GPUTexture:
+        """The texture (RGB) of what is left of the light from behind the surfaces drawn last."""
+        if (THROUGH, False) not in self._shaders:
+            self._shaders[THROUGH, False] = _shader(THROUGH)
+        if self._through is None or (self._through[0].width, self._through[0].height) != self._size:
+            texture = gpu.types.GPUTexture(self._size, format="RGBA16F")
+            self._through = texture, gpu.types.GPUFrameBuffer(color_slots=[texture])
+        with self._through[1].bind():
+            self._through[1].clear(color=(0.0, 0.0, 0.0, 0.0))
+        most = max((len(look.lobes) for instance in instances for look in instance.looks), default=0)
+        self._add(THROUGH, [(number, instances) for number in range(most)], view, self._through[1])
+        return self._through[0]
+
+    def _add(self, outputs, parts, view: View, frame_buffer) -> None:
+        """Add what the lobes (number, instances) of `parts` give where they are the surfaces drawn last."""
         with frame_buffer.bind():
-            gpu.state.viewport_set(0, 0, *size)
+            gpu.state.viewport_set(0, 0, *self._size)
             gpu.state.depth_test_set("NONE")
             gpu.state.blend_set("ADDITIVE_PREMULT")
             try:
-                self._draw_instances(self._shaders[EMISSION, False], shining, view, is_emission=True)
+                for number, instances in parts:
+                    self._draw_instances(outputs, instances, view, number)
             finally:
                 gpu.state.blend_set("NONE")
 
     def free(self) -> None:
         """Let go of everything."""
         self._targets, self._tables, self._shaders = {}, {}, {}
-        self._size = self._nothing = self._missing = self._depth = None
+        self._size = self._nothing = self._missing = self._depth = self._through = None
 
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
@@ -156,21 +187,23 @@ class SurfacePass:
         with buffer.bind():
             gpu.state.viewport_set(0, 0, *self._size)
             # Only the position tells where there is a surface, but no number may be left that is not one.
-            buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further else {"depth": 1.0}))
+            buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further or self._is_glass else {"depth": 1.0}))
             gpu.state.blend_set("NONE")
             gpu.state.depth_test_set("NONE" if is_further else "LESS_EQUAL")
             gpu.state.depth_mask_set(not is_further)
             gpu.state.face_culling_set("NONE")
             try:
-                self._draw_instances(self._shaders[outputs, is_further], instances, view, number)
+                self._draw_instances(outputs, instances, view, number)
             finally:
                 gpu.state.depth_test_set("NONE")
                 gpu.state.depth_mask_set(False)
         return textures
 
-    def _draw_instances(self, shader, instances, view: View, number: int = 0, is_emission: bool = False) -> None:
+    def _draw_instances(self, outputs, instances, view: View, number: int) -> None:
+        is_emission, is_later = outputs == EMISSION, number > 0 or outputs in _ADDED
+        shader = self._shaders[outputs, number > 0 and outputs not in _ADDED]
         shader.bind()
-        if number > 0 or is_emission:
+        if is_later:
             shader.uniform_sampler("positions", self._target(SURFACES, False)[0]["position"])
         values = np.vstack([view.projection.T, view.homogeneous_eye])
         # Kept until all is drawn: the card reads it then.
@@ -181,16 +214,22 @@ class SurfacePass:
         to_view = Matrix.Translation(-view.origin)
         # From near to far: what is hidden need not be computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
+            looks = [pair for pair in zip(instance.mesh.slots, instance.looks, strict=True) if self._draws(pair[1])]
+            if not looks:
+                continue
             shader.uniform_float("model", to_view @ instance.model)
             if not is_emission:
                 marks = instance.mesh.is_smooth, instance.is_only_user
                 shader.uniform_float("placement", (instance.receiver, instance.side, *marks))
-            for slot, look in zip(instance.mesh.slots, instance.looks, strict=True):
+            for slot, look in looks:
                 for lobe in look.lobes[number : number + 1]:
                     shader.uniform_block("look", lobe.uniforms)
                     if not is_emission:
                         self._bind_images(shader, lobe)
                     instance.mesh.batch(slot, lobe.look.uv_map).draw(shader)
+
+    def _draws(self, look: ShownLook) -> bool:
+        return look.is_glass == self._is_glass
 
     def _bind_images(self, shader, shown: ShownLook) -> None:
         if shown.textures is None:
@@ -224,7 +263,8 @@ def _shader(outputs, is_further: bool = False):
     )
     for name, value in DEFINES.items():
         info.define(name, value)
-    info.define({SURFACES: "DRAWS_SURFACES", NORMALS: "DRAWS_NORMALS", EMISSION: "DRAWS_EMISSION"}[outputs])
+    drawn = {SURFACES: "SURFACES", NORMALS: "NORMALS", EMISSION: "EMISSION", THROUGH: "THROUGH"}[outputs]
+    info.define(f"DRAWS_{drawn}")
     if is_further:
         info.define("IS_FURTHER")
     info.uniform_buf(0, "SurfaceView", "view")
@@ -238,7 +278,7 @@ def _shader(outputs, is_further: bool = False):
     samplers = []
     if outputs != EMISSION:
         samplers += [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table"]
-    if is_further or outputs == EMISSION:
+    if is_further or outputs in _ADDED:
         samplers.append("positions")
     for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D", name)

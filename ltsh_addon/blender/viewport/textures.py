@@ -359,7 +359,7 @@ def look_values(look: Look) -> np.ndarray:
     data = np.zeros((LOOK_SIZE, 4))
     flags = (look.normal is not None) + 2 * look.corrected
     data[0] = KINDS[look.kind], look.scattered, flags, look.normal_strength
-    data[1] = *look.emission, look.value("transmission").offset[0]
+    data[1] = *look.emission, look.through
     data[2] = *look.value("tint").offset, look.value("specular_level").offset[0]
     for position, name in enumerate(IMAGE_SLOTS):
         value = look.normal if name == "normal" else look.value(name)

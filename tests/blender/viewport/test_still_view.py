@@ -233,7 +233,7 @@ def live_pictures():
         scene.live.follow((1,), lambda: 1 / 0)
         scene.live._scene_before = (1,)
         scene.live.take_news()
-        scene.live.shares(scene.renderer._gbuffer, scene.view, scene.renderer._lights.lights, 0)
+        scene.live.shares(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
         return plain, exact, first, levels, rest, recolored, after_move, scene.live.problem
     finally:
         scene.live.stop()

@@ -138,7 +138,7 @@ def drawn(camera):
                 shown = ShownPicture(technique, name, "single", "ltc", 0.5, 1.0, 1.0, True)
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer)
                 pictures[technique, name] = renderer.read().reshape(-1, 4)[:, :3].astype(np.float64)
-        samples, pixel = samples_in(renderer._gbuffer, view.eye)
+        samples, pixel = samples_in(renderer._surfaces._gbuffer, view.eye)
         return mirror.lights, samples, pixel, {key: values[pixel] for key, values in pictures.items()}
     finally:
         renderer.free()

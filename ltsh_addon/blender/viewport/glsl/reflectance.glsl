@@ -175,3 +175,12 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
   }
   return lobe;
 }
+
+/* What is seen of things behind: light crosses the surface twice, before and behind what is inside. */
+vec3 let_through(vec3 color, float metallic, float ior, float cosine)
+{
+  bool principled = int(look.data[0].x + 0.5) == PRINCIPLED;
+  float share = look.data[1].w * (principled ? 1.0 - metallic : 1.0);
+  float left = 1.0 - fresnel_of_dielectric(cosine, ior);
+  return share * left * left * (principled ? color : color * color);
+}

@@ -1,6 +1,6 @@
 /* Surfaces into the G-buffer, lobe by lobe: what `cycles.lobes` does for samples. */
 
-#if defined(IS_FURTHER) || defined(DRAWS_EMISSION)
+#if defined(IS_FURTHER) || defined(DRAWS_EMISSION) || defined(DRAWS_THROUGH)
 /* What is drawn later is drawn where it is the surface of the G-buffer. */
 bool is_seen()
 {
@@ -43,13 +43,12 @@ void main()
     specular_normal = valid_specular_normal(diffuse_normal, true_normal, towards_eye);
   }
 
-#ifdef DRAWS_SURFACES
+#if defined(DRAWS_SURFACES) || defined(DRAWS_THROUGH)
   vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
   float roughness = clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0);
   float metallic = clamp(slot_value(metallic_image, METALLIC_SLOT, v_uv).x, 0.0, 1.0);
   float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1.0);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
-  Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
   vec3 weight = vec3(look.data[LAYERS].x);
   weight *= clamp(slot_value(weight_image, WEIGHT_SLOT, v_uv).x, 0.0, 1.0);
   weight *= view_factor(look.data[LAYERS + 2].xyz, abs(dot(smooth_normal, towards_eye)), backfacing);
@@ -60,6 +59,11 @@ void main()
     }
     weight *= left_under_coat(clamp(dot(coat_normal, towards_eye), 0.0, 1.0));
   }
+#endif
+#ifdef DRAWS_THROUGH
+  out_through = vec4(weight * let_through(color, metallic, ior, cosine), 0.0);
+#elif defined(DRAWS_SURFACES)
+  Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
   out_position = vec4(v_position, 1.0 + placement.x);
   out_normal = vec4(specular_normal, roughness);
   out_base = vec4(weight * lobe.diffuse, lobe.ior);
@@ -75,7 +79,7 @@ void main()
   out_diffuse_normal = vec4(diffuse_normal, alpha2);
   out_smooth_normal = vec4(smooth_normal, 0.0);
 #endif
-#ifdef IS_FURTHER
+#if defined(IS_FURTHER) || defined(DRAWS_THROUGH)
   if (!is_seen()) {
     discard;
   }

@@ -8,6 +8,9 @@ import gpu
 import numpy as np
 import pytest
 
+from ltsh_addon.blender.viewport import still
+from ltsh_addon.scene import SceneError
+
 # For tests that read a scene by operators or the depsgraph while they draw.
 edits_with_graphics = pytest.mark.skipif(
     bpy.app.version < (5, 2, 0), reason="before 5.2 only renders may use graphics, and not edit scenes"
@@ -16,43 +19,12 @@ edits_with_graphics = pytest.mark.skipif(
 
 def with_graphics(function):
     """What `function()` returns; skips the test on a machine without OpenGL."""
-    if hasattr(gpu, "init"):
-        try:
-            gpu.init()
-        except (RuntimeError, SystemError) as error:
-            pytest.skip(f"Blender finds no graphics here: {error}")
-        return function()
-    return _inside_render(function)
-
-
-def _inside_render(function):
-    outcome = {}
-
-    class Engine(bpy.types.RenderEngine):
-        bl_idname, bl_label, bl_use_gpu_context = "TEST_GRAPHICS", "Graphics", True
-
-        def render(self, depsgraph):
-            # What is raised in here would only be printed.
-            try:
-                outcome["value"] = function()
-            except BaseException as error:
-                outcome["error"] = error
-
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    scene.collection.objects.link(scene.camera)
-    scene.render.resolution_x = scene.render.resolution_y = 8
-    bpy.utils.register_class(Engine)
     try:
-        scene.render.engine = Engine.bl_idname
-        bpy.ops.render.render()
-    finally:
-        # bpy 4.5 hangs at its end while such a class is registered.
-        bpy.utils.unregister_class(Engine)
-    if "error" in outcome:
-        raise outcome["error"]
-    return outcome["value"]
+        return still.with_graphics(function)
+    except SceneError as error:
+        if hasattr(gpu, "init"):
+            pytest.skip(f"Blender finds no graphics here: {error}")
+        raise
 
 
 class Canvas:

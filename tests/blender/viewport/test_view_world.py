@@ -70,7 +70,7 @@ def set_up_scene(add_world):
     ],
 )
 def test_a_view_is_lit_by_the_world_as_pictures_are(capsys, tmp_path, add_world, shadows, most, seen):
-    """Patches of pictures are 1 % off the gradient in Cycles, edges of few points 1 %; of shadows there is the noise of both."""
+    """Patches of pictures are 1 % off the gradient in Cycles, edges of few points 1 %; shadows have noise."""
     with_graphics(lambda: None)
     set_up_scene(add_world)
     path = parts.save(tmp_path / "sky.blend")

@@ -4,13 +4,16 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from graphics_card import edits_with_graphics, with_graphics
+from graphics_card import Canvas, edits_with_graphics, with_graphics
 from view_pictures import SIZE, image, normal_map, patches_too_far, textured, viewport_picture
 
 from ltsh_addon import shading
 from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.materials.looks import look_of
+from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.surfaces import View
 from ltsh_addon.cycles.closures import sheen_albedo, velvet_albedo
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
@@ -297,3 +300,60 @@ def test_nothing_of_the_file_is_changed():
     for material in materials:
         look_of(material)
     assert content() == before
+
+
+def glass_wall():
+    """A glowing wall, a pane of glass before its right half, and a stick before both; (camera, index of glass)."""
+    parts.empty_scene(*SIZE)
+    parts.add_world(Color=(0.3, 0.2, 0.1, 1.0))
+    black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0}
+    glow = {"Emission Color": (0.2, 0.4, 0.8, 1.0), "Emission Strength": 1.0}
+    parts.add_plane(parts.principled("glowing", **black, **glow)[0], size=2.0, location=(0.0, 0.0, -1.0))
+    glass = parts.bsdf_material("ShaderNodeBsdfGlass", "glass", Color=(0.9, 0.5, 0.7, 1.0), Roughness=0.2, IOR=1.5)[0]
+    parts.add_plane(glass, size=4.0, location=(2.0, 0.0, 0.0))
+    parts.add_plane(parts.principled("stick", **black, **glow)[0], size=0.4, location=(1.0, 0.0, 0.5))
+    camera = parts.add_top_camera(4.0)
+    bpy.context.view_layer.update()
+    return camera
+
+
+@edits_with_graphics
+def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it():
+    """Seen from above, of an orthographic camera: what crosses both sides of a pane is (1 - F)^2 color^2."""
+    camera = glass_wall()
+
+    def draw():
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
+        try:
+            mirror.sync(depsgraph)
+            view = View.of(
+                camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), True
+            )
+            pictures = []
+            for passes in ("combined", "specular"):
+                shown = ShownPicture("ltsh4", passes, "single", "ltc", 0.5, 1.0, 1.0, False)
+                for _ in range(2):
+                    renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
+                pictures.append(canvas.read()[..., :3])
+            return pictures
+        finally:
+            renderer.free()
+
+    combined, specular = with_graphics(draw)
+    height, width = combined.shape[:2]
+
+    def at(picture, x, y):
+        return picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
+
+    world, glow = np.array([0.3, 0.2, 0.1]), np.array([0.2, 0.4, 0.8])
+    through = 0.96**2 * np.array([0.9, 0.5, 0.7]) ** 2
+    # What is reflected of an even world is about F of it.
+    reflected = at(specular, 0.5, 0.3)
+    np.testing.assert_allclose(reflected, 0.04 * np.array([0.9, 0.5, 0.7]) * world, rtol=0.05)
+    places = ((-0.5, 0.3, glow, False), (-1.5, 0.3, world, False), (0.5, 0.3, glow, True), (1.5, 0.3, world, True))
+    for x, y, behind, is_glass in places:
+        expected = through * behind + reflected if is_glass else behind
+        np.testing.assert_allclose(at(combined, x, y), expected, rtol=5e-3, err_msg=f"{x}, {y}")
+    # The stick is before the glass.
+    np.testing.assert_allclose(at(combined, 1.0, 0.0), glow, rtol=5e-3)

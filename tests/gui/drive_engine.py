@@ -143,7 +143,7 @@ def rendered(rig, seen):
     scene = bpy.context.scene
     camera, resolution = scene.camera, (scene.render.resolution_x, scene.render.resolution_y)
     scene.camera = eyes.camera_like_view(rig, "Like the view")
-    eyes.view().render_samples, eyes.view().technique_passes, eyes.view().technique = 1, True, "ltsh4"
+    scene.ltsh.anti_aliasing, eyes.view().technique_passes, eyes.view().technique = 1, True, "ltsh4"
     found = yield from eyes.final_render(rig)
     rig.shot("engine_7_f12.png")
     for name, label in LABELS.items():

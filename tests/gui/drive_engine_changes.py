@@ -18,7 +18,7 @@ EXPOSURE = -1.5
 
 def main(rig):
     scene = bpy.context.scene
-    scene.ltsh_view.technique, scene.ltsh_view.render_samples = "ltsh4", 1
+    scene.ltsh_view.technique, scene.ltsh.anti_aliasing = "ltsh4", 1
     yield from eyes.engine_started(rig)
     eyes.bare_view(rig)
     eyes.plain_colors(scene, EXPOSURE)

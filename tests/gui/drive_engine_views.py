@@ -205,7 +205,7 @@ def is_even(pixels):
 def stopped_by_escape(rig):
     scene = bpy.context.scene
     scene.render.resolution_x, scene.render.resolution_y = 1920, 1080
-    eyes.view().render_samples = 16
+    settings().anti_aliasing = 16
     ended = yield from eyes.render_started(rig)
     yield 3
     pulse = Pulse()

@@ -160,7 +160,7 @@ def _job_of(engine, depsgraph) -> FinalJob:
         scene=scene.name,
         view_layer=depsgraph.view_layer.name,
         frame=scene.frame_current if engine.is_animation else None,
-        sub_samples=settings.render_samples,
+        sub_samples=scene.ltsh.anti_aliasing,
         technique=settings.technique,
         shown=settings.shown,
         other_techniques=SHIPPED_TABLES if settings.technique_passes else (),

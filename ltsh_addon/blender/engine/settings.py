@@ -1,4 +1,4 @@
-"""Settings of the view, their panels, and the line that splits it."""
+"""Settings of the view, the panels of others that it shows too, and the line that splits it."""
 
 from __future__ import annotations
 
@@ -61,11 +61,6 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         name="Scale", description="Difference of radiance that gets the full color",
         min=1e-4, soft_max=10.0, default=0.25, precision=3, update=_redraw,
     )  # fmt: skip
-    render_samples: bpy.props.IntProperty(
-        name="Render Samples",
-        description="Points per pixel of final renders, drawn from the pixel filter; 1 takes pixel centers",
-        min=1, soft_max=64, default=4,
-    )  # fmt: skip
     complete: bpy.props.BoolProperty(
         name="Complete",
         description="Final renders also have what is not direct light, by Cycles and denoised: bounces, glass, "
@@ -84,63 +79,6 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     artist_engine: bpy.props.StringProperty(
         name="Former Engine", description="The render engine to give back after the preview", options={"HIDDEN"}
     )
-
-
-def draw_view_settings(layout, scene) -> None:
-    """The controls of what is seen; the same in every panel that shows them."""
-    settings = scene.ltsh_view
-    if settings.artist_engine:
-        layout.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK")
-    layout.prop(settings, "technique")
-    layout.prop(settings, "shown")
-    layout.prop(settings, "world")
-    layout.prop(settings, "mode")
-    if settings.mode in ("split", "difference"):
-        layout.prop(settings, "second_technique")
-    if settings.mode == "split":
-        layout.prop(settings, "split_position", slider=True)
-    if settings.mode == "difference":
-        layout.prop(settings, "difference_scale")
-
-
-class _View:
-    bl_label = "LTSH Viewport"
-
-    @classmethod
-    def poll(cls, context):
-        return context.engine == ENGINE
-
-    def draw(self, context):
-        layout = self.layout
-        layout.use_property_split, layout.use_property_decorate = True, False
-        draw_view_settings(layout, context.scene)
-
-
-class LTSH_PT_view_sidebar(_View, bpy.types.Panel):
-    """What is seen, in the sidebar of the 3D view."""
-
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "LTSH"
-
-
-class LTSH_PT_view(_View, bpy.types.Panel):
-    """The engine's panel in the render properties."""
-
-    bl_space_type = "PROPERTIES"
-    bl_region_type = "WINDOW"
-    bl_context = "render"
-    COMPAT_ENGINES = {ENGINE}
-
-    def draw(self, context):
-        super().draw(context)
-        column = self.layout.column(heading="Final Render")
-        column.prop(context.scene.ltsh_view, "render_samples", text="Samples")
-        column.prop(context.scene.ltsh_view, "complete")
-        if context.scene.ltsh_view.complete:
-            column.prop(context.scene.ltsh_view, "cycles_samples")
-        else:
-            column.prop(context.scene.ltsh_view, "technique_passes")
 
 
 # Settings of Cycles' renders in these tabs mean nothing to other engines.
@@ -271,12 +209,12 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
         self.line.use_draw_modal = True
 
 
-CLASSES = (LTSH_ViewSettings, LTSH_PT_view_sidebar, LTSH_PT_view, LTSH_GT_split, LTSH_GGT_split)
+CLASSES = (LTSH_ViewSettings, LTSH_GT_split, LTSH_GGT_split)
 _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    """Add the settings, their panels and the gizmo; show the panels that others have for the same things."""
+    """Add the settings and the gizmo; show the panels that others have for the same things."""
     _add_classes()
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()

@@ -1,4 +1,4 @@
-"""The child's task that puts baked textures to use: a new .blend whose objects show them (runs in the child)."""
+"""Baked textures put to use: materials that show them, in the open file or in a new .blend (a task of the child)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from ..saving import save_copy
 from .pixels import open_scene
 
 GROUP_PREFIX = "LTSH Bake"
+# What a material that shows a texture remembers: the one it stands for (0: none), and how its slot held that.
+FORMER, FORMER_LINK = "ltsh_former_material", "ltsh_former_link"
 
 
 def apply_bake(job: dict, progress) -> dict:
@@ -25,11 +27,37 @@ def apply_bake(job: dict, progress) -> dict:
         ob = bpy.data.objects.get(entry["object"])
         if ob is None:
             raise SceneError(f"object {entry['object']!r} is gone from {job['scene']}")
-        group = _group(ob.name, _image(entry), entry["uv"])
-        _show(ob, group)
+        show_texture(ob, entry)
     bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
     save_copy(path, relative_remap=True)
     return {"warnings": warnings}
+
+
+def show_texture(ob, entry: dict) -> None:
+    """Give `ob` copies of its materials that show the texture of `entry` (see `client.apply_bake`)."""
+    restore_materials(ob)
+    _show(ob, _group(ob.name, _image(entry), entry["uv"]))
+
+
+def shows_texture(ob) -> bool:
+    """True where a material of `ob` is one of `show_texture`."""
+    return any(slot.material is not None and FORMER_LINK in slot.material for slot in ob.material_slots)
+
+
+def restore_materials(ob) -> bool:
+    """Give `ob` the materials back that it had before `show_texture`; False where it shows no texture."""
+    found = False
+    for slot in ob.material_slots:
+        shown = slot.material
+        if shown is None or FORMER_LINK not in shown:
+            continue
+        found, former, link = True, shown.get(FORMER), shown[FORMER_LINK]
+        slot.material = former if isinstance(former, bpy.types.Material) else None
+        if link == "DATA":
+            slot.link = "DATA"
+        if shown.users == 0:
+            bpy.data.materials.remove(shown)
+    return found
 
 
 def _image(entry):
@@ -81,10 +109,12 @@ def _show(ob, group) -> None:
     for slot in ob.material_slots:
         shown = slot.material
         # The mesh may have other users, which go on showing their materials.
+        link = slot.link
         slot.link = "OBJECT"
         name = shown.name if shown is not None else ob.name
         material = shown.copy() if shown is not None else bpy.data.materials.new(name)
         material.name = f"{name} (baked {ob.name})"
+        material[FORMER], material[FORMER_LINK] = shown or 0, link
         ensure_nodes(material)
         tree = material.node_tree
         output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")

@@ -191,16 +191,57 @@ def settle() -> None:
     _state["settling"].clear()
 
 
+ARRANGE_SECONDS, ARRANGE_TRIES = 0.2, 50
+
+
 def put_in_editor(context, scene) -> bool:
-    """Show the image of `scene` in an Image Editor of the window that shows nothing or a picture of ours."""
-    screen = context.window.screen if context.window is not None else None
-    for area in screen.areas if screen is not None else ():
-        if area.type == "IMAGE_EDITOR":
+    """Show the image of `scene` in an Image Editor that shows nothing, a render or a picture of ours; False where none
+    does. The window of `context` comes first."""
+    windows = [] if context.window is None else [context.window, *bpy.context.window_manager.windows]
+    for area in (area for window in windows for area in window.screen.areas):
+        if area.ui_type == "IMAGE_EDITOR":
             space = area.spaces.active
-            if space.image is None or results.LAYER in space.image:
+            if space.image is None or space.image.type == "RENDER_RESULT" or results.LAYER in space.image:
                 space.image = viewer_image(scene)
                 return True
     return False
+
+
+def open_editor(context, scene) -> bool:
+    """Show the image of `scene` in an Image Editor, if need be in a new window; False where none can be opened."""
+    if put_in_editor(context, scene):
+        return True
+    windows = bpy.context.window_manager.windows
+    if context.window is None:
+        return False
+    try:
+        with bpy.context.temp_override(window=context.window):
+            bpy.ops.wm.window_new()
+    except RuntimeError:
+        return False  # the window is in full screen
+    window = windows[-1]
+    area = window.screen.areas[0]
+    area.ui_type = "IMAGE_EDITOR"
+    area.spaces.active.image = viewer_image(scene)
+    area.spaces.active.show_region_ui = True
+    # Blender knows the size and the tabs of the new area after it has drawn it.
+    tries = iter(range(ARRANGE_TRIES))
+    bpy.app.timers.register(lambda: _arrange(window, area, next(tries, None)), first_interval=ARRANGE_SECONDS)
+    return True
+
+
+def _arrange(window, area, attempt: int | None) -> float | None:
+    """Fit the picture into its new area and open our tab; seconds until the next attempt where it is not drawn."""
+    try:
+        regions = {region.type: region for region in area.regions}
+        regions["UI"].active_panel_category = "LTSH"
+        with bpy.context.temp_override(window=window, area=area, region=regions["WINDOW"]):
+            bpy.ops.image.view_all(fit_view=True)
+    except TypeError:
+        return None if attempt is None else ARRANGE_SECONDS
+    except (ReferenceError, KeyError, RuntimeError):
+        pass  # the area has been closed meanwhile, or shows something else
+    return None
 
 
 def redraw_image_editors() -> None:

@@ -89,8 +89,7 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
     return PictureOptions(
         scene=scene_file,
         output=output_folder(scene, command),
-        techniques=chosen(settings, "techniques"),
-        passes=chosen(settings, "passes"),
+        techniques=chosen(settings, "techniques") if command == "compare" else (scene.ltsh_view.technique,),
         resolution=preflight.picture_of(scene),
         sub_samples=settings.anti_aliasing,
         shadows="on" if settings.shadows else "off",
@@ -113,7 +112,7 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         sub_samples=settings.anti_aliasing,
         margin=settings.bake_margin,
         view=settings.bake_view,
-        techniques=chosen(settings, "techniques"),
+        techniques=(context.scene.ltsh_view.technique,),
         passes=chosen(settings, "bake_passes"),
         error=settings.bake_error,
         cycles_samples=settings.cycles_samples,

@@ -145,7 +145,9 @@ class _JobOperator:
             self._opened = True
         elif not comparison.read_a_picture(scene):
             comparison.refresh(scene)
-            comparison.put_in_editor(context, scene)
+            # Only the first pictures open a window, which may be closed before the next ones are there.
+            show = comparison.open_editor if job.shown == 0 and self._timer is not None else comparison.put_in_editor
+            show(context, scene)
             self._opened = False
             job.shown += 1
         return True

@@ -10,7 +10,8 @@ from bpy.app.translations import pgettext_iface as translated
 from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
-from .preview import is_previewing
+from .preview import ENGINE, is_previewing
+from .settings import active_light
 from .view_operators import COMMANDS
 
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
@@ -99,15 +100,6 @@ def gray(layout):
     return row
 
 
-def draw_shadows(layout, settings) -> None:
-    """What stands in the way of light."""
-    column = layout.column(align=True)
-    column.prop(settings, "shadows")
-    row = column.row()
-    row.active = settings.shadows
-    row.prop(settings, "shadow_rays")
-
-
 def draw_right(layout, text: str) -> None:
     """Gray text at the right end."""
     side = gray(layout)
@@ -115,10 +107,10 @@ def draw_right(layout, text: str) -> None:
     side.label(text=text, translate=False)
 
 
-def draw_button(layout, context, operator: str, icon: str, ready: bool) -> None:
-    """A large button, gray while it cannot run."""
+def draw_button(layout, operator: str, icon: str, ready: bool, scale: float = 1.0) -> None:
+    """A button, gray while it cannot run."""
     row = layout.row()
-    row.scale_y = 1.4
+    row.scale_y = scale
     row.enabled = ready
     row.operator(operator, icon=icon)
 
@@ -143,6 +135,9 @@ STATE_ICONS = {EXACT: "CHECKMARK", APPROXIMATED: "ERROR", LEFT_OUT: "CANCEL"}
 ENTRIES_SHOWN = 24
 
 
+LARGE, LARGEST = 1.4, 1.8  # heights of buttons
+
+
 class _Main:
     bl_label = "LTSH"
 
@@ -153,29 +148,54 @@ class _Main:
         layout.operator("ltsh.manual", text="", icon="QUESTION")
 
     def draw(self, context):
+        layout, scene = self.layout, context.scene
+        row = layout.row()
+        row.scale_y = LARGEST
+        if is_previewing(scene):
+            row.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK", depress=True)
+        else:
+            row.operator("ltsh.preview", icon="SHADING_RENDERED")
+        draw_job(layout)
+        draw_view_settings(layout, context)
+
+
+def draw_view_settings(layout, context) -> None:
+    """What shades, and what of it is seen where the engine is ours."""
+    scene, view = context.scene, context.scene.ltsh_view
+    column = layout.column()
+    toggles(column, context, 3).prop(view, "technique", expand=True)
+    if scene.render.engine == ENGINE:
+        toggles(column, context, 3).prop(view, "shown", expand=True)
+        toggles(column, context, 3).prop(view, "mode", expand=True)
+        if view.mode != "single":
+            column.prop(view, "second_technique", text="")
+        if view.mode == "split":
+            column.prop(view, "split_position", slider=True)
+        elif view.mode == "difference":
+            column.prop(view, "difference_scale")
+    row = layout.row()
+    row.prop(scene.ltsh, "shadows")
+    if scene.render.engine == ENGINE:
+        row.prop(view, "world")
+
+
+class _Compare:
+    bl_label = "Compare"
+
+    def draw(self, context):
         layout, settings = self.layout, context.scene.ltsh
-        running = draw_job(layout)
-        column = layout.column()
-        column.label(text="Techniques")
-        toggles(column, context, 4).prop(settings, "techniques")
-        column.separator(factor=0.5)
-        column.label(text="Passes")
-        column.row(align=True).prop(settings, "passes")
-        split_names(layout, context)
-        column = layout.column(align=True)
-        column.prop(settings, "resolution_percentage", slider=True)
-        draw_right(column, "{} × {} px".format(*preflight.picture_of(context.scene)))
-        column = layout.column(align=True)
-        column.prop(settings, "anti_aliasing")
-        column.prop(settings, "cycles_samples")
-        draw_shadows(layout, settings)
-        if not running:
-            ready = draw_problems(layout, context, "shade")
-            draw_button(layout, context, "ltsh.shade", "RENDER_STILL", ready)
-            draw_button(layout, context, "ltsh.compare", "MOD_MIRROR", ready)
-            # During the preview the panel of the viewport has the button that ends it.
-            if not is_previewing(context.scene):
-                draw_button(layout, context, "ltsh.preview", "SHADING_RENDERED", True)
+        if operators.running_job() is None:
+            ready = draw_problems(layout, context, "compare")
+            draw_button(layout, "ltsh.compare", "MOD_MIRROR", ready, LARGE)
+            draw_button(layout, "ltsh.shade", "RENDER_STILL", ready)
+        header, body = layout.panel("ltsh_compare_settings", default_closed=True)
+        header.label(text="Settings")
+        if body is not None:
+            toggles(body, context, 4).prop(settings, "techniques")
+            split_names(body, context)
+            column = body.column(align=True)
+            column.prop(settings, "resolution_percentage", slider=True)
+            draw_right(column, "{} × {} px".format(*preflight.picture_of(context.scene)))
 
 
 class _Bake:
@@ -183,27 +203,73 @@ class _Bake:
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context):
-        layout, settings = self.layout, context.scene.ltsh
-        column = layout.column()
-        toggles(column, context, 4).prop(settings, "bake_passes")
-        split_names(layout, context)
-        column = layout.column()
-        column.prop(settings, "bake_size")
-        column.prop(settings, "anti_aliasing")
-        column.prop(settings, "bake_margin")
-        column.prop(settings, "bake_view")
-        ob = context.object
-        if ob is not None and ob.type == "MESH":
-            column.prop_search(settings, "bake_uv_map", ob.data, "uv_layers", icon="GROUP_UVS")
-        column.prop(settings, "bake_error")
-        draw_shadows(layout, settings)
+        layout = self.layout
         if operators.running_job() is None:
             ready = draw_problems(layout, context, "bake")
             count = len(preflight.bake_objects(context)[0])
             if count:
                 text = translated("1 object") if count == 1 else translated("{} objects").format(count)
                 gray(layout).label(text=text, icon="OBJECT_DATA", translate=False)
-            draw_button(layout, context, "ltsh.bake", "RENDER_RESULT", ready)
+            draw_button(layout, "ltsh.bake", "RENDER_RESULT", ready, LARGE)
+            row = layout.row(align=True)
+            row.operator("ltsh.apply_bake", icon="MATERIAL")
+            row.operator("ltsh.restore_materials", text="", icon="LOOP_BACK")
+        header, body = layout.panel("ltsh_bake_settings", default_closed=True)
+        header.label(text="Settings")
+        if body is not None:
+            self.draw_settings(body, context)
+
+    def draw_settings(self, layout, context):
+        """What is baked."""
+        settings, ob = context.scene.ltsh, context.object
+        toggles(layout, context, 4).prop(settings, "bake_passes")
+        split_names(layout, context)
+        column = layout.column()
+        for name in ("bake_size", "bake_margin", "bake_view"):
+            column.prop(settings, name)
+        if ob is not None and ob.type == "MESH":
+            column.prop_search(settings, "bake_uv_map", ob.data, "uv_layers", icon="GROUP_UVS")
+        column.prop(settings, "bake_error")
+
+
+class _Final:
+    """F12 with our engine."""
+
+    bl_label = "Final Render"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.scene.render.engine == ENGINE
+
+    def draw(self, context):
+        draw_final_settings(self.layout, context.scene)
+
+
+def draw_final_settings(layout, scene) -> None:
+    """What F12 renders with our engine."""
+    view = scene.ltsh_view
+    layout.prop(view, "complete")
+    layout.prop(view, "cycles_samples" if view.complete else "technique_passes")
+
+
+class _Quality:
+    """What previews at rest, pictures and bakes share."""
+
+    bl_label = "Quality and Output"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context):
+        layout, settings = self.layout, context.scene.ltsh
+        split_names(layout, context)
+        column = layout.column(align=True)
+        column.prop(settings, "anti_aliasing")
+        column.prop(settings, "cycles_samples")
+        row = column.row(align=True)
+        row.active = settings.shadows
+        row.prop(settings, "shadow_rays")
+        layout.prop(settings, "output_folder")
+        draw_text(gray(layout), context, str(output_folder(context.scene, "").parent))
 
 
 class _Entries:
@@ -236,25 +302,85 @@ class _Entries:
             layout.label(text=translated("and {} more").format(len(entries) - ENTRIES_SHOWN), translate=False)
 
 
+LIGHT_ICONS = {"AREA": "LIGHT_AREA", "POINT": "LIGHT_POINT", "SPOT": "LIGHT_SPOT", "SUN": "LIGHT_SUN"}
+# Widths in a row of the list, as Blender counts them.
+NAME_UNITS, POWER_UNITS, COLOR_UNITS = 3.6, 4.4, 1.2
+LIGHT_ROWS = 4
+
+
+class LTSH_UL_lights(bpy.types.UIList):
+    """Lights with what an artist changes most."""
+
+    def filter_items(self, context, data, name):
+        """Lights alone, those whose names have what is searched for."""
+        objects, wanted = getattr(data, name), self.filter_name.lower()
+        shown = [ob.type == "LIGHT" and (wanted in ob.name.lower()) != self.use_filter_invert for ob in objects]
+        order = bpy.types.UI_UL_list.sort_items_by_name(objects) if self.use_filter_sort_alpha else []
+        return [self.bitflag_filter_item * own for own in shown], order
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flag=0):
+        """Name, power, color, solo and mute of a light."""
+        own, light = item.ltsh_light, item.data
+        row = layout.row(align=True)
+        name = row.row()
+        name.active, name.ui_units_x = not item.hide_render, NAME_UNITS
+        name.prop(item, "name", text="", emboss=False, icon=_light_icon(context, item))
+        for key, units in (("energy", POWER_UNITS), ("color", COLOR_UNITS)):
+            field = row.row()
+            field.ui_units_x = units
+            field.prop(light, key, text="")
+        row.prop(own, "solo", text="", icon="SOLO_ON" if own.solo else "SOLO_OFF", emboss=False)
+        row.prop(own, "mute", text="", icon="HIDE_ON" if own.mute else "HIDE_OFF", emboss=False)
+
+
+def _light_icon(context, ob) -> str:
+    """What kind of light it is, or that it is not exact."""
+    entry = _entry_of(context, ob)
+    noted = entry is not None and entry.state != EXACT
+    return STATE_ICONS[entry.state] if noted else LIGHT_ICONS[ob.data.type]
+
+
+def _entry_of(context, ob):
+    """What the overview says of the light `ob`; None where it is hidden in renders."""
+    return next((entry for entry in overview(context.scene).lights if entry.name == ob.name), None)
+
+
+def light_properties(light) -> list[str]:
+    """What can be set at a light, by its type and shape."""
+    names = ["energy", "exposure", "color"]
+    if light.type == "AREA":
+        names += ["shape", "size", *(["size_y"] if light.shape in ("RECTANGLE", "ELLIPSE") else [])]
+    elif light.type == "SUN":
+        names.append("angle")
+    else:
+        names += ["shadow_soft_size", *(["spot_size", "spot_blend"] if light.type == "SPOT" else [])]
+    return [name for name in names if name in light.bl_rna.properties]
+
+
 class _Lights(_Entries):
     bl_label = "Lights"
+    bl_options = set()
     key = "lights"
+
+    def draw(self, context):
+        layout, scene = self.layout, context.scene
+        layout.template_list("LTSH_UL_lights", "", scene, "objects", scene.ltsh, "active_light", rows=LIGHT_ROWS)
+        ob = active_light(context)
+        if ob is None:
+            gray(layout).label(text="Click a light to select it")
+            return
+        entry = _entry_of(context, ob)
+        for note in entry.notes if entry is not None else ():
+            draw_text(layout, context, note, STATE_ICONS[entry.state])
+        split_names(layout, context)
+        column = layout.column()
+        for name in light_properties(ob.data):
+            column.prop(ob.data, name)
 
 
 class _Materials(_Entries):
     bl_label = "Materials"
     key = "materials"
-
-
-class _Output:
-    bl_label = "Output"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context):
-        layout = self.layout
-        split_names(layout, context)
-        layout.prop(context.scene.ltsh, "output_folder")
-        draw_text(gray(layout), context, str(output_folder(context.scene, "").parent))
 
 
 FIGURES = (("relative_l2", "L2 %"), ("bias", "Bias %"), ("flip", "FLIP"))
@@ -402,12 +528,15 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
 
 
 CLASSES = (
+    LTSH_UL_lights,
     *in_both_places(_Main, "main"),
-    *in_both_places(_Bake, "bake", "main"),
     *in_both_places(_Lights, "lights", "main"),
-    *in_both_places(_Materials, "materials", "main"),
-    *in_both_places(_Output, "output", "main"),
+    *in_both_places(_Compare, "compare", "main"),
+    *in_both_places(_Bake, "bake", "main"),
     *in_both_places(_Results, "results", "main"),
+    *in_both_places(_Final, "final", "main"),
+    *in_both_places(_Quality, "quality", "main"),
+    *in_both_places(_Materials, "materials", "main"),
     LTSH_PT_IMAGE_results,
 )
 register, unregister = bpy.utils.register_classes_factory(CLASSES)

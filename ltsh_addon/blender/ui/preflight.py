@@ -18,6 +18,7 @@ import numpy as np
 from bpy.props import StringProperty
 
 from ...scene import error_line
+from ..extract.apply import shows_texture
 from ..extract.bake import ObjectError, check_object
 from ..lights.area import (
     LightInventory,
@@ -73,9 +74,9 @@ def problems(context, command: str) -> list[Problem]:
     scene, settings = context.scene, context.scene.ltsh
     missing = missing_libraries()
     found = [Problem(missing)] if missing else []
-    if not settings.techniques:
-        found.append(Problem("No technique is chosen: choose at least one"))
-    if not (settings.bake_passes if command == "bake" else settings.passes):
+    if command == "compare" and not settings.techniques:
+        found.append(Problem("No technique is chosen: choose at least one to compare"))
+    if command == "bake" and not settings.bake_passes:
         found.append(Problem("No pass is chosen: choose at least one"))
     needs_camera = command != "bake" or settings.bake_view == "camera"
     found += _camera(scene) if needs_camera else []
@@ -120,6 +121,9 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
     if ob.hide_render:
         text = f"Object {ob.name!r} is hidden in renders"
         return Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": ob.name})
+    if shows_texture(ob):
+        text = f"Object {ob.name!r} shows a baked texture in place of its materials"
+        return Problem(text, True, "ltsh.restore_materials", "Restore")
     try:
         check_object(ob)
     except ObjectError as error:

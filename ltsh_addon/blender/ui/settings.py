@@ -181,17 +181,104 @@ class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     settings: FloatVectorProperty(size=5, options={"HIDDEN"})
 
 
+NOT_HELD = -1
+
+
+def lights_of(scene) -> list:
+    """The light objects of `scene`, hidden ones too."""
+    return [ob for ob in scene.objects if ob.type == "LIGHT"]
+
+
+def active_light(context):
+    """The light that is chosen in the list of lights, which is the active object; None where that is no light."""
+    ob = context.view_layer.objects.active
+    return ob if ob is not None and ob.type == "LIGHT" else None
+
+
+def _active_index(settings) -> int:
+    """Place of the active light among the objects of the scene, -1 where there is none."""
+    scene = settings.id_data
+    ob = active_light(bpy.context) if bpy.context.scene == scene else None
+    return -1 if ob is None else scene.objects.find(ob.name)
+
+
+def _select(settings, index: int) -> None:
+    """Select the light at that place among the objects of the scene, and nothing else."""
+    objects, layer = settings.id_data.objects, bpy.context.view_layer
+    if not 0 <= index < len(objects) or objects[index].name not in layer.objects:
+        return
+    if bpy.context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for other in layer.objects:
+        if other.select_get():
+            other.select_set(False)
+    objects[index].select_set(True)
+    layer.objects.active = objects[index]
+
+
+def _hidden(ob) -> int:
+    """Whether `ob` is hidden in views (1) and in renders (2)."""
+    return int(ob.hide_viewport) + 2 * int(ob.hide_render)
+
+
+def _hide(ob, hidden: int) -> None:
+    for name, value in (("hide_viewport", bool(hidden & 1)), ("hide_render", bool(hidden & 2))):
+        if getattr(ob, name) != value:
+            setattr(ob, name, value)
+
+
+def _follow_solo(own, context) -> None:
+    """Hide all lights but those on solo; where none is, each is as it was before."""
+    lights = lights_of(context.scene)
+    solo = any(ob.ltsh_light.solo for ob in lights)
+    for ob in lights:
+        if solo and not ob.ltsh_light.solo:
+            if ob.ltsh_light.held == NOT_HELD:
+                ob.ltsh_light.held = _hidden(ob)
+            _hide(ob, 3)
+        else:
+            _release(ob)
+
+
+def _release(ob) -> None:
+    """Give back what `ob` was before a solo of others."""
+    if ob.ltsh_light.held != NOT_HELD:
+        _hide(ob, ob.ltsh_light.held)
+        ob.ltsh_light.held = NOT_HELD
+
+
+def _is_muted(own) -> bool:
+    return bool((_hidden(own.id_data) if own.held == NOT_HELD else own.held) & 2)
+
+
+def _set_muted(own, muted: bool) -> None:
+    if own.held != NOT_HELD and any(ob.ltsh_light.solo for ob in lights_of(bpy.context.scene)):
+        own.held = 3 if muted else 0
+    else:
+        own.held = NOT_HELD
+        _hide(own.id_data, 3 if muted else 0)
+
+
+class LTSH_PG_light(bpy.types.PropertyGroup):
+    """What the list of lights changes in an object."""
+
+    mute: BoolProperty(
+        name="Mute", description="Hide the light in views and renders", get=_is_muted, set=_set_muted
+    )  # fmt: skip
+    solo: BoolProperty(
+        name="Solo", description="Hide all lights that are not on solo, in views and renders, until this is off again",
+        update=_follow_solo,
+    )  # fmt: skip
+    held: IntProperty(default=NOT_HELD, options={"HIDDEN"})  # what to give back after a solo of others
+
+
 class LTSH_PG_scene(bpy.types.PropertyGroup):
     """What to shade, bake and look at in a scene."""
 
     techniques: EnumProperty(
-        name="Techniques",
-        description="How the glossy lobe is integrated over the lights. Shift-click to choose several",
+        name="Compared",
+        description="Techniques whose pictures are put beside that of Cycles. Shift-click to choose several",
         items=TECHNIQUE_ITEMS, options={"ENUM_FLAG"}, default={"ltc", "ltsh4"},
-    )  # fmt: skip
-    passes: EnumProperty(
-        name="Passes", description="Parts of the reflected light. Shift-click to choose several",
-        items=PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
     )  # fmt: skip
     resolution_percentage: IntProperty(
         name="Resolution", description="Percentage of the scene's render resolution",
@@ -200,7 +287,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     anti_aliasing: IntProperty(
         name="Anti-Aliasing",
         description="Points per pixel, drawn from the scene's pixel filter, or per texel of a bake; 1 takes centers",
-        min=1, max=256, soft_max=64, default=1,
+        min=1, max=256, soft_max=64, default=4,
     )  # fmt: skip
     cycles_samples: IntProperty(
         name="Cycles Samples",
@@ -251,6 +338,10 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )  # fmt: skip
     mixed: CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
     mixed_active: IntProperty(name="Light", options={"HIDDEN"})
+    active_light: IntProperty(
+        name="Active Light", description="Click a light to select it", get=_active_index, set=_select,
+        options={"HIDDEN"},
+    )  # fmt: skip
     result_folder: StringProperty(
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -288,9 +379,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 
 
 SUBFOLDER = "ltsh"
-KEPT = ("techniques", "passes", "resolution_percentage", "anti_aliasing", "cycles_samples",
-        "shadows", "shadow_rays", "keep_lights", "bake_size", "bake_margin", "bake_view",
-        "bake_passes", "bake_error")  # fmt: skip
+KEPT = ("techniques", "resolution_percentage", "anti_aliasing", "cycles_samples", "shadows", "shadow_rays",
+        "keep_lights", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):
@@ -313,7 +403,7 @@ class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
     preset_add_operator = "ltsh.add_preset"
 
 
-CLASSES = (LTSH_AddonPreferences, LTSH_PG_mixed_light, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
+CLASSES = (LTSH_AddonPreferences, LTSH_PG_mixed_light, LTSH_PG_light, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
 _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # Blender looks for a folder "presets" in it.
 PRESETS_PARENT = str(Path(__file__).parent)
@@ -324,12 +414,18 @@ def register() -> None:
     _add_classes()
     apply(bpy.context)
     bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
+    bpy.types.Object.ltsh_light = PointerProperty(type=LTSH_PG_light, name="LTSH Light")
     bpy.utils.register_preset_path(PRESETS_PARENT)
 
 
 def unregister() -> None:
-    """Remove what `register` added; environment and log are as before."""
+    """Remove what `register` added; environment, log, and lights that a solo hides are as before."""
+    for ob in bpy.data.objects:
+        if ob.type == "LIGHT":
+            _release(ob)
+            ob.ltsh_light.property_unset("solo")
     bpy.utils.unregister_preset_path(PRESETS_PARENT)
+    del bpy.types.Object.ltsh_light
     del bpy.types.Scene.ltsh
     logger = logging.getLogger(LOGGER)
     while _log_handlers:

@@ -11,13 +11,14 @@ from bpy.props import EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ...files import replacing
+from ...scene import error_line, listed
+from ..extract.apply import restore_materials, show_texture, shows_texture
 from . import comparison, results
 from .job import output_folder
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs" / "manual.md"
 # Text editors show no pictures.
 PICTURE_LINE = re.compile(r"^!\[.*\)\n\n?", re.MULTILINE)
-ARRANGE_SECONDS, ARRANGE_TRIES = 0.2, 50
 COMMANDS = (
     ("shade", "Shade", "What Shade Camera View left last"),
     ("compare", "Compare", "What Compare with Cycles left last"),
@@ -35,48 +36,17 @@ class _NeedsResults:
 
 
 class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
-    """Show the pictures in an Image Editor; where none is free, half of the largest area becomes one"""
+    """Show the pictures in an Image Editor that is open, or in a window of their own"""
 
     bl_idname = "ltsh.open_results"
     bl_label = "Open in Image Editor"
 
     def execute(self, context):
         comparison.refresh(context.scene)
-        if comparison.put_in_editor(context, context.scene):
+        if comparison.open_editor(context, context.scene):
             return {"FINISHED"}
-        if context.window is None:
-            self.report({"ERROR"}, "There is no window: pictures are in the image list")
-            return {"CANCELLED"}
-        screen = context.window.screen
-        known = set(screen.areas)
-        largest = max(screen.areas, key=lambda area: area.width * area.height)
-        with context.temp_override(area=largest, region=largest.regions[-1]):
-            if "FINISHED" not in bpy.ops.screen.area_split(direction="VERTICAL", factor=0.5):
-                self.report({"ERROR"}, "The area cannot be split: leave full screen first")
-                return {"CANCELLED"}
-        area = next(area for area in screen.areas if area not in known)
-        area.type = "IMAGE_EDITOR"
-        area.spaces.active.image = comparison.viewer_image(context.scene)
-        area.spaces.active.show_region_ui = True
-        window = context.window
-        # Blender knows the size and the tabs of the new area after it has drawn it.
-        tries = iter(range(ARRANGE_TRIES))
-        bpy.app.timers.register(lambda: _arrange(window, area, next(tries, None)), first_interval=ARRANGE_SECONDS)
-        return {"FINISHED"}
-
-
-def _arrange(window, area, attempt: int | None) -> float | None:
-    """Fit the picture into its new area and open our tab; seconds until the next attempt where it is not drawn."""
-    try:
-        regions = {region.type: region for region in area.regions}
-        regions["UI"].active_panel_category = "LTSH"
-        with bpy.context.temp_override(window=window, area=area, region=regions["WINDOW"]):
-            bpy.ops.image.view_all(fit_view=True)
-    except TypeError:
-        return None if attempt is None else ARRANGE_SECONDS
-    except (ReferenceError, KeyError, RuntimeError):
-        pass  # the area has been closed meanwhile, or shows something else
-    return None
+        self.report({"ERROR"}, "No window could be opened: leave full screen, or find the pictures in the image list")
+        return {"CANCELLED"}
 
 
 class LTSH_OT_show_results(bpy.types.Operator):
@@ -155,6 +125,84 @@ class LTSH_OT_open_folder(_NeedsResults, bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LTSH_OT_apply_bake(bpy.types.Operator):
+    """Let the objects of the last bake show their textures: they get copies of their materials"""
+
+    bl_idname = "ltsh.apply_bake"
+    bl_label = "Apply Bake"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if context.scene is None or last_bake(context.scene) is None:
+            cls.poll_message_set("There is no bake yet: bake first")
+            return False
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
+        result, gone, shown = last_bake(context.scene), [], []
+        for record in result.report["objects"]:
+            ob = context.scene.objects.get(record["name"])
+            if ob is None:
+                gone.append(record["name"])
+                continue
+            try:
+                show_texture(ob, baked_texture(result, record))
+            except (OSError, RuntimeError, KeyError) as error:
+                self.report({"ERROR"}, f"Object {ob.name!r} cannot show its texture ({error_line(error)}): bake again")
+                continue
+            shown.append(ob.name)
+        if gone:
+            self.report({"WARNING"}, f"Not in the scene any more: {listed(map(repr, gone))}")
+        if not shown:
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"Showing baked textures: {listed(shown)}")
+        return {"FINISHED"}
+
+
+class LTSH_OT_restore_materials(bpy.types.Operator):
+    """Give objects that show baked textures their materials back"""
+
+    bl_idname = "ltsh.restore_materials"
+    bl_label = "Restore Materials"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if context.scene is None or not any(shows_texture(ob) for ob in context.scene.objects):
+            cls.poll_message_set("No object shows a baked texture")
+            return False
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
+        restored = [ob.name for ob in context.scene.objects if restore_materials(ob)]
+        self.report({"INFO"}, f"Materials are back: {listed(restored)}")
+        return {"FINISHED"}
+
+
+def last_bake(scene):
+    """The results of the last bake of `scene`; None where there is none."""
+    result = results.result_in(str(output_folder(scene, "bake") / "images"))
+    return result if result is not None and result.command == "bake" and result.report["objects"] else None
+
+
+def baked_texture(result, record: dict) -> dict:
+    """What `show_texture` takes: all baked light of the object of `record`, or its first pass. Copies the pictures to
+    files of their own, which stay when the next bake replaces the pictures. Raises OSError."""
+    files = []
+    for number, tile in record["tiles"].items():
+        stem = Path(tile["file"]).stem
+        group = result.groups[stem]
+        layer = f"{group['names'][0]}.{'combined' if 'combined' in group['passes'] else group['passes'][0]}"
+        source = result.folder / group["files"][layer]
+        name = f"{stem}.{layer}" if len(record["tiles"]) == 1 else f"{stem.rpartition('.')[0]}.{layer}.{number}"
+        path = result.folder.parent / f"{name}.exr"
+        with replacing(path) as temporary:
+            shutil.copyfile(source, temporary)
+        files.append({"path": str(path), "tile": int(number)})
+    return {"name": f"{record['name']} {layer}", "uv": record["uv"], "files": files}
+
+
 class LTSH_OT_manual(bpy.types.Operator):
     """Read the manual of LTSH, one page, in a new window"""
 
@@ -189,6 +237,8 @@ CLASSES = (
     LTSH_OT_swap,
     LTSH_OT_save_exr,
     LTSH_OT_open_folder,
+    LTSH_OT_apply_bake,
+    LTSH_OT_restore_materials,
     LTSH_OT_manual,
 )
 register, unregister = bpy.utils.register_classes_factory(CLASSES)

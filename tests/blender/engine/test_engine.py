@@ -36,7 +36,7 @@ def lit_scene():
     parts.add_camera()
     scene = bpy.context.scene
     scene.render.engine = "LTSH"
-    scene.ltsh_view.render_samples, scene.ltsh_view.technique = 1, "ltsh2"
+    scene.ltsh.anti_aliasing, scene.ltsh_view.technique = 1, "ltsh2"
     scene.ltsh.shadows = False
     settings = scene.render.image_settings
     settings.file_format, settings.color_depth = "OPEN_EXR", "32"

@@ -22,7 +22,8 @@ def room(path, width=24, height=16):
     parts.add_area_light()
     parts.add_camera()
     bpy.ops.wm.save_as_mainfile(filepath=str(path))
-    scene.ltsh.cycles_samples, scene.ltsh.bake_size, scene.ltsh.bake_margin = 4, "256", 2
+    scene.ltsh.cycles_samples, scene.ltsh.anti_aliasing = 4, 1
+    scene.ltsh.bake_size, scene.ltsh.bake_margin = "256", 2
     return scene
 
 

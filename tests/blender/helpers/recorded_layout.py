@@ -106,7 +106,7 @@ def _operator(name: str):
     return getattr(getattr(bpy.ops, module), function).get_rna_type()
 
 
-def _stand_in(panel) -> type:
+def stand_in(panel) -> type:
     """A class with the methods of `panel` that can be instantiated, which Blender's own panels cannot."""
     found = object
     for kind in reversed(panel.__mro__):
@@ -130,14 +130,14 @@ def _bound_to(value, cell):
 
 def drawn(panel, function="draw", width=300, scale=1.0, **context) -> list[Shown]:
     """What `panel` draws in a region `width` pixels wide."""
-    stand_in = _stand_in(panel)()
-    stand_in.layout = Layout()
+    found = stand_in(panel)()
+    found.layout = Layout()
     space = SimpleNamespace(type=panel.bl_space_type, image=None)
     preferences = SimpleNamespace(system=SimpleNamespace(ui_scale=scale), addons=bpy.context.preferences.addons)
     now = {name: getattr(bpy.context, name) for name in ("scene", "object", "selected_objects", "view_layer", "mode")}
     now |= {"region": SimpleNamespace(width=width), "space_data": space, "preferences": preferences}
-    getattr(stand_in, function)(SimpleNamespace(**{**now, **context}))
-    return stand_in.layout.shown
+    getattr(found, function)(SimpleNamespace(**{**now, **context}))
+    return found.layout.shown
 
 
 def texts(shown) -> str:

@@ -9,8 +9,10 @@ from job_window import Hand, image_pixels
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.process import blender_process
-from ltsh_addon.blender.ui import job, operators, results
+from ltsh_addon.blender.ui import job, operators, preflight, results
 from ltsh_addon.blender.ui.job import Job, Plan
+from ltsh_addon.imaging.exr import write_channels
+from ltsh_addon.pipeline import display_layers
 
 
 @pytest.fixture
@@ -54,7 +56,7 @@ def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, report
 
 
 def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, reported):
-    scene.ltsh.techniques, scene.ltsh.anti_aliasing, scene.ltsh.resolution_percentage = {"ltsh2"}, 2, 50
+    scene.ltsh_view.technique, scene.ltsh.anti_aliasing, scene.ltsh.resolution_percentage = "ltsh2", 2, 50
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
     assert [job.STARTING, *reported] == planned("shade")
     command_line("shade", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltsh2", "--aa", "2",
@@ -76,6 +78,42 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
     # Pictures of the other job go from the list of images, not from the disk: one click shows them again.
     assert "LTSH ltsh2.diffuse" not in bpy.data.images
     assert bpy.ops.ltsh.show_results(command="shade") == {"FINISHED"} and "LTSH ltsh2.specular" in bpy.data.images
+
+
+def baked(scene, tmp_path):
+    """A bake of the floor as the job leaves it: specular and diffuse of LTSH 4; their sum (H, W, 3)."""
+    output = tmp_path / "ltsh" / "bake"
+    output.mkdir(parents=True)
+    pictures = np.random.default_rng(5).random((2, 6, 10, 3), np.float32)
+    layers = {f"ltsh4.{part}": picture for part, picture in zip(("specular", "diffuse"), pictures, strict=True)}
+    channels = {f"{layer}.{letter}": picture[..., index] for layer, picture in layers.items()
+                for index, letter in enumerate("RGB")}  # fmt: skip
+    write_channels(output / "Floor.exr", channels)
+    record = {"name": "Floor", "uv": "UVMap", "tiles": {"1001": {"file": "Floor.exr"}}}
+    results.show(scene, display_layers.write("bake", output, {"objects": [record], "warnings": []}))
+    return pictures.sum(axis=0)
+
+
+def test_a_bake_is_shown_in_the_scene_and_taken_back(scene, tmp_path):
+    floor = bpy.data.objects["Floor"]
+    former, materials = floor.material_slots[0].material, set(bpy.data.materials)
+    assert not bpy.ops.ltsh.apply_bake.poll() and not bpy.ops.ltsh.restore_materials.poll()
+    expected = baked(scene, tmp_path)
+    for _ in range(2):  # once more replaces it
+        assert bpy.ops.ltsh.apply_bake() == {"FINISHED"}
+        (slot,) = floor.material_slots
+        (group,) = [node.node_tree for node in slot.material.node_tree.nodes if node.type == "GROUP"]
+        (texture,) = [node for node in group.nodes if node.type == "TEX_IMAGE"]
+        assert Path(bpy.path.abspath(texture.image.filepath)) == tmp_path / "ltsh" / "bake" / "Floor.ltsh4.combined.exr"
+        np.testing.assert_array_equal(image_pixels(texture.image.name), expected)
+        assert slot.link == "OBJECT" and floor.data.materials[0] == former
+        assert len(set(bpy.data.materials) - materials) == 1
+    floor.select_set(True)
+    (problem,) = preflight.problems(bpy.context, "bake")
+    assert problem.blocks and problem.fix == "ltsh.restore_materials"
+    assert bpy.ops.ltsh.restore_materials() == {"FINISHED"}
+    assert (slot.link, slot.material) == ("DATA", former) and set(bpy.data.materials) == materials
+    assert preflight.problems(bpy.context, "bake") == []
 
 
 def test_a_scene_that_is_renamed_or_removed_meanwhile(scene):

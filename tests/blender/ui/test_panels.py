@@ -3,13 +3,15 @@
 import bpy
 import pytest
 import scene_parts as parts
-from recorded_layout import Layout, buttons, drawn, texts
+from recorded_layout import Layout, buttons, drawn, stand_in, texts
 
 from ltsh_addon.blender.ui import operators, panels, preflight
 from ltsh_addon.blender.ui.job import Job, Plan, Step
 
-MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[:10]
-JOBS = ("ltsh.shade", "ltsh.compare")
+MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[1:-1]
+LIGHTS, COMPARE, BAKE, RESULTS, FINAL, QUALITY, MATERIALS = PARTS[::2]
+JOBS = ("ltsh.compare", "ltsh.shade")
+BAKES = ("ltsh.bake", "ltsh.apply_bake", "ltsh.restore_materials")
 
 
 def all_panels():
@@ -80,7 +82,7 @@ def test_everything_that_can_be_clicked_says_what_it_does(scene):
 def test_every_panel_draws_in_every_state(scene, tmp_path, add_results, width):
     """Nothing selected and no results, a job that runs, results that are partial, and those that are complete."""
     drawn_panels = all_panels()
-    assert len(drawn_panels) >= 14
+    assert len(drawn_panels) >= 17
 
     def draw_all():
         for panel in drawn_panels:
@@ -107,7 +109,7 @@ def test_sentences_are_broken_into_lines_that_fit(scene, width):
     scene.camera = None
     bpy.data.objects["Light"].hide_render = True
     for factor in (1.0, 2.0):
-        shown = drawn(MAIN_3D, width=width * factor, scale=factor)
+        shown = drawn(COMPARE, width=width * factor, scale=factor)
         assert "The scene has no active camera" in texts(shown)
         lines = [item.what for item in shown if item.kind == "label"]
         assert max(len(line) for line in lines) * 6.6 < max(width, 16 * 6.6), lines
@@ -121,23 +123,24 @@ def test_both_places_show_the_same(scene):
 
 
 def test_buttons_are_gray_where_something_is_missing_which_is_said(scene):
-    shown = drawn(MAIN_3D)
-    assert buttons(shown) == dict.fromkeys((*JOBS, "ltsh.preview"), True)
+    assert buttons(drawn(MAIN_3D)) == {"ltsh.preview": True}
+    shown = drawn(COMPARE)
+    assert buttons(shown) == dict.fromkeys(JOBS, True)
     assert "24 × 16 px" in texts(shown)
     scene.camera = None
-    shown = drawn(MAIN_3D)
+    shown = drawn(COMPARE)
     assert "The scene has no active camera" in texts(shown)
-    assert buttons(shown) == dict.fromkeys(JOBS, False) | {"ltsh.add_camera": True, "ltsh.preview": True}
+    assert buttons(shown) == dict.fromkeys(JOBS, False) | {"ltsh.add_camera": True}
 
 
 def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
     monkeypatch.setattr("ltsh_addon.blender.ui.preflight.missing_libraries", lambda: "OpenEXR cannot be imported (x)")
     bpy.data.objects["Floor"].select_set(True)
-    shown = drawn(MAIN_3D)
+    shown = drawn(COMPARE)
     assert "OpenEXR cannot be imported" in texts(shown)
-    assert buttons(shown) == dict.fromkeys(JOBS, False) | {"ltsh.preview": True}
-    bake = drawn(PARTS[0])
-    assert "OpenEXR cannot be imported" in texts(bake) and buttons(bake) == {"ltsh.bake": False}
+    assert buttons(shown) == dict.fromkeys(JOBS, False) and buttons(drawn(MAIN_3D)) == {"ltsh.preview": True}
+    bake = drawn(BAKE)
+    assert "OpenEXR cannot be imported" in texts(bake) and not buttons(bake)["ltsh.bake"]
     for operator in (bpy.ops.ltsh.shade, bpy.ops.ltsh.compare, bpy.ops.ltsh.bake):
         with pytest.raises(RuntimeError, match="OpenEXR cannot be imported"):
             operator()
@@ -151,10 +154,77 @@ def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
     job._take({"stage": "Cycles A", "fraction": 0.25})
     plan._share = 0.25
     shown = drawn(MAIN_3D)
-    assert buttons(shown) == {"ltsh.cancel": True}
+    assert buttons(shown) == {"ltsh.preview": True, "ltsh.cancel": True}
+    assert not {*JOBS, *BAKES} & {*buttons(drawn(COMPARE)), *buttons(drawn(BAKE))}
     (progress,) = [item.what for item in shown if item.kind == "progress"]
     assert progress.startswith("25 %")
     assert {"Compare with Cycles", "Cycles, First Half", "2 / 2"} <= {item.what for item in shown}
+
+
+def row(ob, width=300):
+    """What the list of lights draws for `ob`."""
+    layout = Layout()
+    stand_in(panels.LTSH_UL_lights)().draw_item(bpy.context, layout, bpy.context.scene, ob, 0, None, "")
+    return layout.shown
+
+
+def test_the_list_of_lights_shows_lights_alone_and_finds_them_by_name(scene):
+    parts.add_area_light("Key")
+    listed = stand_in(panels.LTSH_UL_lights)()
+    listed.bitflag_filter_item, listed.filter_name = 1 << 30, ""
+    listed.use_filter_invert = listed.use_filter_sort_alpha = False
+
+    def names():
+        flags, order = listed.filter_items(bpy.context, scene, "objects")
+        assert order == []
+        return [ob.name for ob, flag in zip(scene.objects, flags, strict=True) if flag]
+
+    assert sorted(names()) == ["Key", "Light"]
+    listed.filter_name = "KE"
+    assert names() == ["Key"]
+    bpy.data.objects["Light"].hide_render = True
+    assert [item.what for item in row(bpy.data.objects["Light"])] == ["name", "energy", "color", "solo", "mute"]
+
+
+def test_a_click_in_the_list_selects_the_light_and_a_selected_light_is_chosen_in_it(scene):
+    light, floor = bpy.data.objects["Light"], bpy.data.objects["Floor"]
+    floor.select_set(True)
+    bpy.context.view_layer.objects.active = floor
+    assert scene.ltsh.active_light == -1
+    scene.ltsh.active_light = scene.objects.find("Light")
+    assert bpy.context.selected_objects == [light] and bpy.context.view_layer.objects.active == light
+    assert scene.objects[scene.ltsh.active_light] == light
+    scene.ltsh.active_light = len(scene.objects)
+    assert bpy.context.view_layer.objects.active == light
+
+
+def test_solo_hides_the_others_and_gives_back_what_was_hidden(scene):
+    for name in ("Key", "Fill", "Rim"):
+        parts.add_area_light(name)
+    key, fill, rim, light = (bpy.data.objects[name] for name in ("Key", "Fill", "Rim", "Light"))
+    fill.hide_render = True
+
+    def hidden():
+        return [(ob.hide_viewport, ob.hide_render) for ob in (key, fill, rim, light)]
+
+    before = hidden()
+    key.ltsh_light.solo = True
+    assert hidden() == [(False, False), *3 * [(True, True)]]
+    assert [ob.ltsh_light.mute for ob in (key, fill, rim, light)] == [False, True, False, False]
+    rim.ltsh_light.solo = rim.ltsh_light.mute = True
+    light.ltsh_light.mute = True
+    key.ltsh_light.solo = False
+    assert hidden() == [(True, True)] * 4
+    rim.ltsh_light.solo = False
+    assert hidden() == [(False, False), before[1], (True, True), (True, True)]
+    for ob in (rim, light):
+        ob.ltsh_light.mute = False
+    assert hidden() == before
+    # A light that a solo has hidden, whose soloed one is gone, can be unmuted.
+    key.ltsh_light.solo = True
+    bpy.data.objects.remove(key)
+    rim.ltsh_light.mute = False
+    assert not rim.hide_render and not rim.hide_viewport
 
 
 def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
@@ -162,26 +232,27 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
     glass, _ = parts.bsdf_material("ShaderNodeBsdfHairPrincipled", "Fur")
     parts.add_plane(glass, name="Fur")
     bpy.context.view_layer.update()
-    shown = drawn(PARTS[2])
-    signs = {item.what: item.icon for item in shown if item.icon}
-    assert signs["Light"] == "CHECKMARK" and signs["Torn"] == "CANCEL"
-    header = drawn(PARTS[2], "draw_header_preset")
+    signs = {name: row(bpy.data.objects[name])[0].icon for name in ("Light", "Torn")}
+    assert signs == {"Light": "LIGHT_AREA", "Torn": "CANCEL"}
+    header = drawn(LIGHTS, "draw_header_preset")
     assert [item.what for item in header] == ["2", "1"]
-    signs = {item.what: item.icon for item in drawn(PARTS[4]) if item.icon}
+    bpy.context.view_layer.objects.active = bpy.data.objects["Torn"]
+    assert "its size or scale is zero" in texts(drawn(LIGHTS))
+    signs = {item.what: item.icon for item in drawn(MATERIALS) if item.icon}
     assert signs["Floor"] == "CHECKMARK" and signs["Fur"] == "CANCEL"
 
 
 def test_numbers_are_those_of_the_report(scene, add_results):
     add_results()
-    shown = drawn(panels.CLASSES[10])
+    shown = drawn(RESULTS)
     for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
-    narrow = texts(drawn(panels.CLASSES[10], width=220)).replace("\u00a0", " ")
+    narrow = texts(drawn(RESULTS, width=220)).replace("\u00a0", " ")
     assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
     add_results("Not complete: without Cycles", ("ltc", "ltsh4"))
-    assert "Not complete: without Cycles" in texts(drawn(panels.CLASSES[10]))
+    assert "Not complete: without Cycles" in texts(drawn(RESULTS))
 
 
 def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results):

@@ -112,7 +112,7 @@ TOLD = [
     (lambda: bpy.ops.object.select_all(action="DESELECT"), "bake",
      "No mesh is selected: select the objects to bake"),
     (setting("bake_uv_map", "Lightmap"), "bake", "Object 'Floor' has no UV map 'Lightmap', found 'UVMap'"),
-    (setting("techniques", set()), "bake", "No technique is chosen: choose at least one"),
+    (setting("techniques", set()), "compare", "No technique is chosen: choose at least one to compare"),
     (setting("bake_passes", set()), "bake", "No pass is chosen: choose at least one"),
     (setting("resolution_percentage", 10), "shade", "The picture is smaller than 4 pixels: raise the resolution"),
     (set_output_folder_that_is_a_file, "shade", "Output folder '//taken/' cannot be written: choose another"),

@@ -3,7 +3,6 @@ import bpy
 settings = bpy.context.scene.ltsh
 
 settings.techniques = {"ltc", "ltsh4"}
-settings.passes = {"specular", "diffuse"}
 settings.resolution_percentage = 50
 settings.anti_aliasing = 1
 settings.cycles_samples = 64

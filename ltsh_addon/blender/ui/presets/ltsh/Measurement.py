@@ -3,7 +3,6 @@ import bpy
 settings = bpy.context.scene.ltsh
 
 settings.techniques = {"ltc", "ltsh2", "ltsh4", "reference"}
-settings.passes = {"specular", "diffuse"}
 settings.resolution_percentage = 100
 settings.anti_aliasing = 16
 settings.cycles_samples = 2048

@@ -32,7 +32,7 @@ import bpy
 scene = bpy.context.scene
 scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = 64, 36, 100
 scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-scene.ltsh_view.render_samples = 2
+scene.ltsh.anti_aliasing = 2
 """
 
 

@@ -403,7 +403,14 @@ class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
     preset_add_operator = "ltsh.add_preset"
 
 
-CLASSES = (LTSH_AddonPreferences, LTSH_PG_mixed_light, LTSH_PG_light, LTSH_PG_scene, LTSH_OT_add_preset, LTSH_PT_presets)
+CLASSES = (
+    LTSH_AddonPreferences,
+    LTSH_PG_mixed_light,
+    LTSH_PG_light,
+    LTSH_PG_scene,
+    LTSH_OT_add_preset,
+    LTSH_PT_presets,
+)
 _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # Blender looks for a folder "presets" in it.
 PRESETS_PARENT = str(Path(__file__).parent)

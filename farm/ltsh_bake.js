@@ -31,7 +31,7 @@ const JOB_TYPE = {
         },
         {
             key: "techniques", label: "Techniques", type: "string", default: "ltsh4",
-            description: "Some of ltc, ltsh2, ltsh4, reference, separated by commas",
+            description: "Some of ltc, ltsh2, ltsh4, ltsh4c, reference, separated by commas",
         },
         {
             key: "passes", label: "Passes", type: "string", default: "specular,diffuse",

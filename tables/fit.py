@@ -46,6 +46,8 @@ def write_table(path: Path, fitted) -> None:
         "node_error_median": float(np.median(fitted.node_errors)),
         "command": f"python -m ltsh_addon tables fit {family.name}{_options(fitted)}",
     }
+    if family.bend is not None:
+        metadata["bend"] = family.bend
     arrays = {**fitted.arrays, "node_errors": fitted.node_errors.astype(np.float32)}
     _write_npz(path, {**arrays, "metadata": np.array(json.dumps(metadata))})
 
@@ -60,6 +62,7 @@ def settings(family, model, size) -> dict:
     """What a fit depends on, beside the code."""
     return {
         "family": family.name,
+        **({} if family.bend is None else {"bend": list(family.bend)}),
         "brdf": model.name,
         "size": size,
         "ridge": projection.RIDGE,

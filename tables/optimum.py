@@ -103,6 +103,8 @@ def edge_terms(name: str) -> int:
     family = family_named(name)
     if family.kind == "ltc":
         return 1
+    if family.bend is not None:
+        return family.size
     used = np.abs(family.span @ ridge_matrix(family.degree)) > 1e-9
     return int(used.any(axis=0).sum())
 
@@ -128,7 +130,7 @@ def grazing_errors(table: LookupTable, count: int = len(ROUGHNESS)) -> list[Graz
     """Errors at `count` of the values of ROUGHNESS, spread over them, and at all COSINES; spherical harmonics only."""
     chosen = np.unique(np.linspace(0, len(ROUGHNESS) - 1, max(count, 2)).round().astype(int))
     roughness, cosine = (grid.ravel() for grid in np.meshgrid(np.array(ROUGHNESS)[chosen], COSINES, indexing="ij"))
-    family = family_named(f"ltsh{table.degree}")
+    family = family_named(f"ltsh{table.degree}" if table.bend is None else f"ltsh{table.degree}c")
     shape = (len(chosen), len(COSINES))
     _, parameters = best_lobes(family, cosine, roughness, shape, starts=[_warp_of_table(table, cosine, roughness)])
     points = Points.at(GGX, cosine, roughness**2, FLAT)

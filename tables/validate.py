@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ltsh_addon.shading import brdf, evaluate_lobe, header, spherical_harmonics
+from ltsh_addon.shading import brdf, evaluate_lobe, header
 from ltsh_addon.shading.lookup_table import LookupTable
 
 from .families import gauss_legendre
@@ -139,7 +139,7 @@ def _basis_at(table, mu, roughness, directions):
     length = np.linalg.norm(warped, axis=-1)
     unit = warped / length[:, None]
     if lobe.tilt is None:
-        basis = spherical_harmonics.evaluate(table.degree, unit)
+        basis = table.basis(unit)
     else:
         basis = np.maximum(np.sin(lobe.tilt) * unit[:, 0] + np.cos(lobe.tilt) * unit[:, 2], 0.0)[None]
     basis = basis / length**3

@@ -19,8 +19,7 @@ from ..files import replacing
 from ..imaging.exr import write_channels
 from ..scene import VERSION
 from ..shading import header, load_table
-from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable
-from ..shading.spherical_harmonics import hemisphere_integrals
+from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
@@ -101,7 +100,8 @@ def table_channels(table: LookupTable) -> dict[str, np.ndarray]:
 def _coefficient_suffixes(table) -> list[str]:
     if table.family == "ltc":
         return [""]
-    return [f"_{l}_{m}" for l in range(table.degree + 1) for m in range(l + 1)]  # noqa: E741 (the field's letter)
+    suffixes = [f"_{l}_{m}" for l in range(table.degree + 1) for m in range(l + 1)]  # noqa: E741 (the field's letter)
+    return suffixes if table.bend is None else [*suffixes, "_bent_x", "_bent_z"]
 
 
 def _directional_albedo(table) -> np.ndarray:
@@ -109,7 +109,7 @@ def _directional_albedo(table) -> np.ndarray:
     coefficients = table.coefficients.astype(float)
     if table.family == "ltc":
         return coefficients[..., 0] * (0.5 + 0.5 * np.cos(table.warp[..., 3:].astype(float)))
-    return coefficients @ hemisphere_integrals(table.degree)
+    return coefficients @ basis_integrals(coefficients.shape[-1])
 
 
 def _attributes(table) -> dict[str, str]:
@@ -144,7 +144,12 @@ def _attributes(table) -> dict[str, str]:
 def _original(table) -> str:
     if table.family == "ltc":
         return "c max(0, w . (sin(tilt), 0, cos(tilt))) / pi"
-    return "sum c_l_m Y_lm, Y_lm = K_lm P_l^(m)(z) Re((x + i y)^m), orthonormal, P_l^(m) the m-th derivative"
+    harmonics = "sum c_l_m Y_lm, Y_lm = K_lm P_l^(m)(z) Re((x + i y)^m), orthonormal, P_l^(m) the m-th derivative"
+    if table.bend is None:
+        return harmonics
+    xx, xz, yy = table.bend
+    bent = f"(v_x c_bent_x + v_z c_bent_z) |V| / (pi |v|^4), v = V w, V = [[{xx}, 0, {xz}], [0, {yy}, 0], [0, 0, 1]]"
+    return f"{harmonics}, + {bent}"
 
 
 def _curve_names(table) -> list[str]:

@@ -105,7 +105,7 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
         ior = None if isinstance(vectors[-1], int) else samples.ior[index]
         second = rows[clip_rows[0]] if len(clip_rows) > 1 else None
         limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
-    at_point = small_lights.LobeAtPoint(rows, weights, table.family == "ltc", limits)
+    at_point = small_lights.LobeAtPoint(rows, weights, table, limits)
     sharpest = small_lights.SharpestLobes(*axes, width)
     return Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest)
 

@@ -23,10 +23,10 @@ import numpy as np
 from . import edge_integrals, lookup_table, tails, wgsl
 from .lobes import LEAST_SHARE
 from .lookup_table import LookupTable, TableError
-from .spherical_harmonics import coefficient_index, hemisphere_integrals, normalization
+from .spherical_harmonics import coefficient_index, normalization
 
 # Raise it when a function of core.h changes: headers of different versions refuse to be included together.
-CORE_VERSION = 6
+CORE_VERSION = 7
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
@@ -83,9 +83,10 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
     if table.family == "ltsh":
         values |= {
             "WEIGHT_LINES": "\n".join(_weight_lines(table.ridge_weights)),
-            "MOMENT_LINES": "\n".join(f"        {line}" for line in moment_lines(table.degree)),
-            "EXPANSION_LINES": "\n".join(_expansion_lines(table.degree)),
-            "ALBEDO": _sum(hemisphere_integrals(table.degree), 1e-12),
+            "BENT_POLYGON": _bent_polygon(table),
+            "MOMENT_LINES": "\n".join(f"        {line}" for line in _all_moment_lines(table)),
+            "EXPANSION_LINES": "\n".join([*_expansion_lines(table.degree), *_bent_expansion_lines(table)]),
+            "ALBEDO": _sum(lookup_table.basis_integrals(table.coefficients.shape[3]), 1e-12),
             "LEAST_OF_COSINE": float_literal(0.5 * LEAST_SHARE / np.pi),
         }
     return filled(_of_family(_text("table.h"), table.family), values)
@@ -197,6 +198,48 @@ def moment_lines(degree: int):
         for j, (u_x, u_z) in enumerate(edge_integrals.RIDGE_DIRECTIONS[: k + 2]):
             row = 1 + k * (k + 3) // 2 + j
             yield f"moments.values[{row}] += ltsh_edge_moment(edge, {u_x}f, {u_z}f, {k});"
+
+
+def bend_literals(table) -> str:
+    """The numbers of the bend of a table as arguments of ltsh_bent."""
+    return ", ".join(float_literal(entry) for entry in table.bend)
+
+
+def bent_factor(table, times: float) -> str:
+    """`times` the factor of the functions of a bend: they are this times v_x and v_z over |v|^4, v = ltsh_bent(w)."""
+    xx, _, yy = table.bend
+    return float_literal(times * xx * yy / np.pi)
+
+
+def _bent_polygon(table) -> str:
+    if table.bend is None:
+        return ""
+    return f"\n    ltsh_polygon bent = ltsh_bent_polygon(unit, {bend_literals(table)});"
+
+
+def _all_moment_lines(table):
+    yield from moment_lines(table.degree)
+    if table.bend is not None:
+        yield "ltsh_edge leaning = ltsh_make_edge(bent, i);"
+        yield from bent_moment_lines(table)
+
+
+def bent_moment_lines(table):
+    """Statements that add the edge `leaning` of the bent polygon to the last two moments."""
+    count = table.coefficients.shape[3]
+    for row, axis in ((count - 2, "x"), (count - 1, "z")):
+        yield f"moments.values[{row}] += leaning.normal.{axis} * leaning.phi;"
+
+
+def _bent_expansion_lines(table):
+    """The same for the functions themselves: see `lookup_table.bent_cosines`."""
+    if table.bend is None:
+        return
+    count = table.coefficients.shape[3]
+    both = " + ".join(f"bent.{axis} * coefficients.values[{count - 2 + n}]" for n, axis in enumerate("xz"))
+    yield f"    ltsh_vec3 bent = ltsh_bent(unit, {bend_literals(table)});"
+    yield "    float squares = ltsh_dot(bent, bent);"
+    yield f"    original += {bent_factor(table, 1.0)} * ({both}) / (squares * squares);"
 
 
 def _expansion_lines(degree):

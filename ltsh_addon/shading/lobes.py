@@ -10,9 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from . import edge_integrals, moments32, spherical_harmonics
+from . import edge_integrals, moments32
 from .light_polygons import integrate_visible
-from .lookup_table import Lobe, LookupTable
+from .lookup_table import Lobe, LookupTable, bent
 from .polygon import (
     dot,
     edge_sums,
@@ -51,7 +51,7 @@ def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.
     length = np.sqrt((warped * warped).sum(axis=0))
     unit = warped / length
     if lobe.tilt is None:
-        basis = spherical_harmonics.evaluate(table.degree, np.moveaxis(unit, 0, -1))
+        basis = table.basis(np.moveaxis(unit, 0, -1))
         original = (basis * lobe.coefficients[0][:, None, :]).sum(axis=0)
     else:
         toward_axis = np.sin(lobe.tilt) * unit[0] + np.cos(lobe.tilt) * unit[2]
@@ -107,6 +107,9 @@ def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coeff
     if lobe.tilt is not None:
         return coefficients[:, 0] * _tilted_cosine_integral(warped, lobe.tilt)
     moments = integrals_on_sphere(partial(edge_integrals.moments, degree=table.degree), warped)
+    if table.bend is not None:
+        leaning = integrals_on_sphere(edge_integrals.vector_irradiance, bent(table.bend, warped))[::2]
+        moments = np.concatenate([moments, 2.0 * leaning])
     weights = table.ridge_weights.astype(moments.dtype)
     # Not a matrix product: with BLAS the bits of a point may depend on how many points share its batch.
     ridge_moments = sum(column[:, None] * row for column, row in zip(weights.T, moments, strict=True))

@@ -8,7 +8,8 @@ known up to a factor, is upper triangular: it leaves the horizon in place.
 
 The stored A, B, C tend to 1 as alpha -> 0, where GGX becomes an exactly transformed clamped cosine; that is why they
 may be interpolated. At normal incidence A = C. D_orig is a spherical harmonics expansion ("ltsh"), or a clamped cosine
-around the axis (sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M).
+around the axis (sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M). A table with a `bend` adds to the
+spherical harmonics two linear functions under one more warp, the same for the whole table: see `bent_cosines`.
 
 Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg), which is dense at grazing angles.
 One coefficient vector per Fresnel curve shares the warp: a lobe is linear in its coefficients, so that a reflectance
@@ -19,20 +20,21 @@ sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
 
-from ..reading import Malformed, check, parse_json, read_arrays
+from ..reading import NUMBER, Malformed, check, parse_json, read_arrays
 from ..scene import SHIPPED_TABLES
 from .edge_integrals import MAX_DEGREE, ridge_matrix
-from .spherical_harmonics import coefficient_count, degree_of, hemisphere_integrals
+from .spherical_harmonics import coefficient_count, degree_of, evaluate, hemisphere_integrals
 
 FORMAT_VERSION = 2
 WARP_REGULARIZATION = 0.5
 # Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
 MIN_ALPHA = 1e-5
+_MOST_BENT = 1e3
 # Arrays by name, and what each of their axes has at least.
 _FEWEST = {
     "warp": (2, 2, 3),
@@ -43,7 +45,7 @@ _FEWEST = {
     "average_albedo": (2, 2),
 }
 _METADATA = {
-    "family": str, "degree": int, "name?": str, "brdf?": str, "fresnel_curve_names?": [str],
+    "family": str, "degree": int, "name?": str, "brdf?": str, "fresnel_curve_names?": [str], "bend?": [NUMBER],
 }  # fmt: skip
 
 
@@ -82,7 +84,7 @@ class Lobe:
         """Integrals (F, P) over the hemisphere: the directional albedo for every Fresnel curve."""
         if self.tilt is not None:
             return self.coefficients[:, 0] * (0.5 + 0.5 * np.cos(self.tilt))
-        integrals = hemisphere_integrals(degree_of(self.coefficients.shape[1])).astype(self.coefficients.dtype)
+        integrals = basis_integrals(self.coefficients.shape[1]).astype(self.coefficients.dtype)
         # No BLAS, so that a result does not depend on how many points share a batch.
         return sum(integral * self.coefficients[:, k] for k, integral in enumerate(integrals) if integral != 0.0)
 
@@ -101,6 +103,11 @@ class LookupTable:
     fresnel_weights: np.ndarray  # (I, F): the reflectance of a dielectric of that IOR as a combination of the curves
     average_albedo: np.ndarray  # (R, F) integral of 2 mu albedo(mu) over mu in [0, 1]
     metadata: dict
+    bend: tuple[float, float, float] | None = None  # of `bent_cosines`, whose two coefficients are then the last ones
+
+    def basis(self, unit: np.ndarray) -> np.ndarray:
+        """Values (K, ...) at unit directions (..., 3) of what the coefficients of an "ltsh" table multiply."""
+        return basis_values(self.degree, self.bend, unit)
 
     @cached_property
     def _channels(self) -> np.ndarray:
@@ -110,8 +117,16 @@ class LookupTable:
 
     @cached_property
     def ridge_weights(self) -> np.ndarray:
-        """Matrix (K, K) from spherical harmonics coefficients to weights of the polygon's moments."""
-        return ridge_matrix(self.degree)
+        """Matrix (K, K) from coefficients of "ltsh" to weights of the polygon's moments: those of
+        `edge_integrals.moments`, then twice the integrals of x and z over the bent polygon."""
+        matrix = ridge_matrix(self.degree)
+        if self.bend is None:
+            return matrix
+        count = len(matrix)
+        bent = np.zeros((count + 2, count + 2))
+        bent[:count, :count] = matrix
+        bent[[count, count + 1], [count, count + 1]] = 0.5 / np.pi
+        return bent
 
     def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray, curves: int | None = None) -> Lobe:
         """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1], with the
@@ -138,6 +153,35 @@ class LookupTable:
     def dielectric_weights(self, ior: np.ndarray) -> np.ndarray:
         """Weights (F, P) of the Fresnel curves for dielectrics of relative `ior` (P,), clamped to the table's range."""
         return np.stack([np.interp(ior, self.fresnel_ior, column) for column in self.fresnel_weights.T])
+
+
+def bent(bend, vectors) -> np.ndarray:
+    """Vectors (3, ...) under the warp of `bent_cosines`."""
+    xx, xz, yy = (vectors.dtype.type(entry) for entry in bend)
+    return np.stack([xx * vectors[0] + xz * vectors[2], yy * vectors[1], vectors[2]])
+
+
+def bent_cosines(bend, unit) -> np.ndarray:
+    """Values (2, ...) at unit directions (..., 3) of x / pi and z / pi under the warp [[xx, 0, xz], [0, yy, 0],
+    [0, 0, 1]] of `bend` (xx, xz, yy): a linearly transformed cosine, and its derivative by the direction to which it
+    leans. Their integrals over the hemisphere are 0 and 1."""
+    warped = bent(bend, np.moveaxis(unit, -1, 0))
+    squares = (warped * warped).sum(axis=0)
+    return warped[::2] * (bend[0] * bend[2] / np.pi / (squares * squares)).astype(unit.dtype)
+
+
+def basis_values(degree, bend, unit) -> np.ndarray:
+    """Values (K, ...) at unit directions (..., 3): spherical harmonics, and the `bent_cosines` where there is a bend."""
+    basis = evaluate(degree, unit)
+    return basis if bend is None else np.concatenate([basis, bent_cosines(bend, unit)])
+
+
+@cache
+def basis_integrals(count: int) -> np.ndarray:
+    """Integrals (K,) over the hemisphere of the `count` functions of `basis_values`."""
+    degree = degree_of(count)
+    integrals = hemisphere_integrals(degree)
+    return integrals if count == len(integrals) else np.concatenate([integrals, [0.0, 1.0]])
 
 
 def warp_entries(cosine, alpha, a, b, c, sine=None):
@@ -187,7 +231,7 @@ def _interpolate(channels, shape, roughness, theta_coordinate):
 
 
 def load_table(name_or_path: str | Path) -> LookupTable:
-    """The shipped table "ltc", "ltsh2" or "ltsh4", or the table in a .npz file. Raises TableError."""
+    """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError."""
     path = Path(name_or_path)
     if str(name_or_path) in SHIPPED_TABLES:
         path = Path(__file__).resolve().parents[2] / "tables" / f"{name_or_path}.npz"
@@ -203,6 +247,8 @@ def load_table(name_or_path: str | Path) -> LookupTable:
     except Malformed as error:
         raise TableError(f"lookup table {path}: {error}; fit it again or reinstall") from error
     known = {name: metadata[name] for name in ("family", "degree")}
+    if "bend" in metadata:
+        known["bend"] = tuple(float(entry) for entry in metadata["bend"])
     return LookupTable(name=metadata.get("name", path.stem), metadata=metadata, **known, **arrays)
 
 
@@ -214,6 +260,11 @@ def _check_metadata(metadata) -> None:
     family, degree = metadata["family"], metadata["degree"]
     if family not in ("ltc", "ltsh") or not 1 <= degree <= MAX_DEGREE:
         raise Malformed(f"family {family!r} of degree {degree} is unknown")
+    bend = metadata.get("bend", [1.0, 0.0, 1.0])
+    if len(bend) != 3 or not all(abs(entry) <= _MOST_BENT for entry in bend) or min(bend[0], bend[2]) < 1 / _MOST_BENT:
+        raise Malformed(f"bend is {bend}, expected xx, xz and yy of a warp, xx and yy above 0")
+    if family == "ltc" and "bend" in metadata:
+        raise Malformed("bend: expected none in a table of clamped cosines")
 
 
 def _check_arrays(arrays, metadata) -> None:
@@ -227,9 +278,10 @@ def _check_arrays(arrays, metadata) -> None:
             raise Malformed(f"{key} holds NaN or infinity in single precision, expected finite numbers")
     (rows, columns), curves = arrays["warp"].shape[:2], len(arrays["fresnel_curves"])
     is_ltc = metadata["family"] == "ltc"
+    count = 1 if is_ltc else coefficient_count(metadata["degree"]) + (2 if "bend" in metadata else 0)
     shapes = {
         "warp": (rows, columns, 4 if is_ltc else 3),
-        "coefficients": (rows, columns, curves, 1 if is_ltc else coefficient_count(metadata["degree"])),
+        "coefficients": (rows, columns, curves, count),
         "fresnel_weights": (len(arrays["fresnel_ior"]), curves),
         "average_albedo": (rows, curves),
     }

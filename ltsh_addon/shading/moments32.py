@@ -185,14 +185,13 @@ def _direction_integrals(corners, axes, scratch, smallest):
     return integrals, needs_float64
 
 
-def form_matrix(degree: int) -> np.ndarray:
-    """Matrix (K, K) from the `moments` here to those of `edge_integrals.moments`.
+def form_matrix(degree: int, more: int = 0) -> np.ndarray:
+    """Matrix (K, K) from the `moments` here to those of `edge_integrals.moments`, and `more` that are the same.
 
     The sum of (u.X) K_k over the edges is a form in u, homogeneous of degree k + 1. Here are the coefficients of
     u_x^(k+1), u_x^k u_z, ..., u_z^(k+1), there the values for the first k + 2 directions.
     """
-    matrix = np.zeros((coefficient_count(degree),) * 2)
-    matrix[0, 0] = 1.0
+    matrix = np.eye(coefficient_count(degree) + more)
     for k in range(degree):
         rows = slice(1 + k * (k + 3) // 2, 1 + (k + 1) * (k + 4) // 2)
         power = np.arange(k + 2)
@@ -201,29 +200,39 @@ def form_matrix(degree: int) -> np.ndarray:
 
 
 def moments(
-    corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+    corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE, bend: tuple | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0 that need not be unit, in the order of `form_matrix`, and
-    the mask (P,) of points that need float64. `degree` 1 to 4. The result is overwritten by the next call."""
+    the mask (P,) of points that need float64. `degree` 1 to 4. With the `bend` of a table its two moments follow. The
+    result is overwritten by the next call."""
     unit, shifted, needs_float64 = _edges(corners, scratch, smallest)
+    count, bent_count = coefficient_count(degree), 0 if bend is None else 2
+    result = scratch("moments", (count + bent_count, shifted.shape[1]))
+    normal = _polynomial_moments(unit, shifted, degree, scratch, result)
+    needs_float64 |= np.abs(result[0]) > np.float32(LARGEST_SAFE_ANGLE)
+    if bend is not None:
+        needs_float64 |= _bent_moments(unit, normal, bend, scratch, result[count:])
+    return result, needs_float64
+
+
+def _polynomial_moments(unit, shifted, degree, scratch, result):
+    """Put the moments into result (>= K, P); returns the x and z components (2, V, P) of the edges' normals."""
     shape = shifted.shape
-    result = scratch("moments", (coefficient_count(degree), shape[1]))
     normal = scratch("normal", (2, *shape))
     for row, (first, second) in zip(normal, ((1, 2), (0, 1)), strict=True):
         _cross_component(unit, first, second, scratch, row)
     total = np.add(unit[::2, :-1], unit[::2, 1:], out=scratch("total", normal.shape))
-    result[0] = angle = _solid_angle(shifted, total[1], normal[1], scratch)
-    needs_float64 |= np.abs(angle) > np.float32(LARGEST_SAFE_ANGLE)
+    result[0] = _solid_angle(shifted, total[1], normal[1], scratch)
     factors = _ArcFactors(degree, shifted, scratch)
     pair = scratch("pair", normal.shape)
     np.add.reduce(np.multiply(normal, factors.phi, out=pair), axis=1, out=result[1:3])
     if degree == 1:
-        return result, needs_float64
+        return normal
     np.multiply(normal, factors.q, out=pair)
     linear = _product(pair, total, scratch("linear", (3, *shape)), scratch)
     np.add.reduce(linear, axis=1, out=result[3:6])
     if degree == 2:
-        return result, needs_float64
+        return normal
     product = _product(unit[::2, :-1], unit[::2, 1:], scratch("product", linear.shape), scratch)
     squared = _product(total, total, scratch("squared", linear.shape), scratch)
     if degree == 4:
@@ -236,7 +245,43 @@ def moments(
     np.multiply(normal, squared[1], out=cubic[1:3])
     cubic[1:3] += np.multiply(normal[::-1], squared[::2], out=pair)
     np.add.reduce(cubic, axis=1, out=result[6:10])
-    return result, needs_float64
+    return normal
+
+
+def _bent_moments(unit, normal, bend, scratch, out):
+    """Put twice the integrals of x and z over the polygons that `lookup_table.bent` makes of those with corners `unit`
+    (3, V + 1, P) into out (2, P); the mask (P,) of points that need float64. Overwrites `normal`, see above."""
+    xx, xz, yy = (np.float32(entry) for entry in bend)
+    shape = normal.shape[1:]
+    rows, length = scratch("bent", (2, *unit.shape[1:])), scratch("bent_length", unit.shape[1:])
+    np.multiply(unit[0], xx, out=rows[0])
+    rows[0] += np.multiply(unit[2], xz, out=length)
+    np.multiply(unit[1], yy, out=rows[1])
+    np.multiply(unit[2], unit[2], out=length)
+    squares = np.multiply(rows, rows, out=scratch("bent_squares", rows.shape))
+    length += squares[0]
+    length += squares[1]
+    length += _TINY
+    np.divide(np.float32(1.0), np.sqrt(length, out=length), out=length)
+    scale = np.multiply(length[:-1], length[1:], out=scratch("two", shape))
+    products = np.multiply(rows[:, :-1], rows[:, 1:], out=scratch("pair", normal.shape))
+    shifted = np.multiply(unit[2, :-1], unit[2, 1:], out=scratch("shifted", shape))
+    shifted += products[0]
+    shifted += products[1]
+    shifted *= scale
+    shifted += np.float32(1.0)
+    needs_float64 = np.minimum.reduce(shifted, axis=0) < np.float32(SHORTEST_SAFE)
+    np.absolute(shifted, out=shifted)
+    shifted += np.float32(1e-12)
+    phi = _phi(shifted, scratch)
+    phi *= scale
+    # The cross product of warped vectors is that of the vectors under the warp's cofactors.
+    normal[1] *= xx
+    normal[1] -= np.multiply(normal[0], xz, out=scratch("one", shape))
+    normal *= phi
+    np.add.reduce(normal, axis=1, out=out)
+    out *= yy
+    return needs_float64
 
 
 def _product(a, b, out, scratch):
@@ -303,7 +348,12 @@ def _solid_angle(shifted, total_z, normal_z, scratch):
 
 
 def weighted_moments(
-    corners: np.ndarray, weights: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE
+    corners: np.ndarray,
+    weights: np.ndarray,
+    degree: int,
+    scratch: Scratch,
+    smallest: float = SMALLEST_SAFE,
+    bend: tuple | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
     in sr, the signed integrals (P,) of z / pi, and the mask (P,) of points that need float64. `degree` 1 to 4."""
@@ -311,7 +361,7 @@ def weighted_moments(
     sums = np.empty((vectors, points), np.float32)
     angle, cosine, needs_float64 = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, bool)
     for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
-        found, needs_float64[part] = moments(corners[:, :, part], degree, scratch, smallest)
+        found, needs_float64[part] = moments(corners[:, :, part], degree, scratch, smallest, bend)
         weight = weights[:, :, part]
         products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
         np.add.reduce(products, axis=1, out=sums[:, part])
@@ -388,7 +438,7 @@ class RidgeTable:
         the sign of the solid angle, signed integrals (P,) of a clamped cosine of mass 1 under the same warp, and the
         mask (P,) of points that need float64."""
         if self.source.family == "ltsh":
-            return weighted_moments(corners, weights, self.degree, scratch, smallest)
+            return weighted_moments(corners, weights, self.degree, scratch, smallest, self.source.bend)
         # The clamped cosine is not negative: its integral has the sign of the solid angle.
         integral, needs_float64 = cosine_integral(corners, scratch, smallest)
         integral *= np.float32(1.0 / np.pi)
@@ -397,7 +447,12 @@ class RidgeTable:
 
 def prepare(table: LookupTable) -> RidgeTable:
     """The table with weights of the `moments` here, made once per table. Degrees above MAX_DEGREE: ValueError."""
-    return _kept(table, "_ridge_table", lambda: _product_in_order(table.ridge_weights, form_matrix(table.degree)))
+
+    def matrix():
+        forms = form_matrix(table.degree, 0 if table.bend is None else 2)
+        return _product_in_order(table.ridge_weights, forms)
+
+    return _kept(table, "_ridge_table", matrix)
 
 
 def along_directions(table: LookupTable) -> RidgeTable:

@@ -15,7 +15,9 @@ import numpy as np
 
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
 from .lobes import LEAST_SHARE
+from .lookup_table import bent_cosines
 from .polygon import dot
+from .spherical_harmonics import degree_of
 
 # Radius of a light by the length over which the integrand changes, at most.
 LARGEST = 0.05
@@ -164,13 +166,14 @@ class ShadowedCosineAtPoint:
 class LobeAtPoint:
     """Integrals (F, ...) of lobes over small lights, with the weights (F, K, ...) of a `moments32.RidgeTable`."""
 
-    def __init__(self, rows, weights, is_cosine, limits):
-        self.rows, self.is_cosine, self.limits = rows, is_cosine, limits
+    def __init__(self, rows, weights, table, limits):
+        self.rows, self.limits = rows, limits
+        self.is_cosine, self.bend = table.family == "ltc", table.bend
         x, y, z = rows[:3]
         self.determinant = dot(x, np.stack([
             y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0]
         ]))  # fmt: skip
-        self.terms = weights if is_cosine else polynomial_terms(weights)
+        self.terms = weights if self.is_cosine else polynomial_terms(weights)
 
     def __call__(self, part, rays: Rays):
         x, y, z = (dot(row[:, part], rays.offset) for row in self.rows[:3])
@@ -183,7 +186,8 @@ class LobeAtPoint:
         if self.is_cosine:
             return self.terms[:, 0, part] * cosine
         x *= inverse
-        values = np.stack([polynomial(terms[..., part], x, z) for terms in self.terms])
+        leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
+        values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in self.terms])
         values *= angle
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
@@ -199,6 +203,7 @@ class LobeAtPoint:
         np.sqrt(inverse, out=inverse)
         np.divide(np.float32(1.0), inverse, out=inverse)
         x, z = x * inverse, z * inverse
+        leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
         angle = inverse * inverse
         angle *= inverse
         angle *= weights
@@ -206,10 +211,24 @@ class LobeAtPoint:
         cosine = _sum(z, angle) * (determinant * np.float32(1.0 / np.pi))
         if self.is_cosine:
             return self.terms[:, 0, part] * cosine
-        values = np.stack([_sum(polynomial(terms[:, part], x, z), angle) for terms in self.terms])
+        values = np.stack([_sum(self._value(terms[:, part], x, z, leaning), angle) for terms in self.terms])
         values *= determinant
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
+        return values
+
+
+    def _leaning(self, x, y, z):
+        """The two functions (2, ...) of the bend whose terms come last, in a direction (x, y, z)."""
+        return (2.0 * np.pi) * bent_cosines(self.bend, np.stack([x, y, z], axis=-1))
+
+    @staticmethod
+    def _value(terms, x, z, leaning):
+        if leaning is None:
+            return polynomial(terms, x, z)
+        values = polynomial(terms[:-2], x, z)
+        values += terms[-2] * leaning[0]
+        values += terms[-1] * leaning[1]
         return values
 
 
@@ -221,22 +240,23 @@ def _sum(values, weights):
 
 def polynomial_terms(weights: np.ndarray) -> np.ndarray:
     """Coefficients (..., K, P) of 1; x, z; x^2, xz, z^2; x^3, ... of a lobe with weights (..., K, P) of `moments`.
+    Weights of the two moments of a bend stay as they are.
 
     The moments of a patch around the direction (x, y, z) are its solid angle times 1; 2 x, 2 z; and for k > 1 the
     coefficients of the form (k + 1) (u.w)^k - (k - 1) |u|^2 (u.w)^(k - 2) in u, w = (x, z).
     """
     w = np.moveaxis(weights, -2, 0)
-    terms = np.empty_like(w)
-    terms[0] = w[0]
+    terms = w.copy()
+    degree = degree_of(len(w))
     terms[1:3] = 2.0 * w[1:3]
-    if len(w) > 3:
+    if degree > 1:
         terms[0] -= w[3] + w[5]
         terms[3:6] = 3.0 * w[3], 6.0 * w[4], 3.0 * w[5]
-    if len(w) > 6:
+    if degree > 2:
         terms[1] -= 2.0 * (w[6] + w[8])
         terms[2] -= 2.0 * (w[7] + w[9])
         terms[6:10] = 4.0 * w[6], 12.0 * w[7], 12.0 * w[8], 4.0 * w[9]
-    if len(w) > 10:
+    if degree > 3:
         terms[3] -= 3.0 * (w[10] + w[12])
         terms[4] -= 6.0 * (w[11] + w[13])
         terms[5] -= 3.0 * (w[12] + w[14])

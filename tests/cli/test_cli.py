@@ -86,7 +86,7 @@ def test_without_json_a_table_of_errors_is_printed_and_warnings_go_to_stderr(cap
     code, stdout, stderr = run(capsys, "compare", room, "-o", out, "--quiet")
     assert code == 0 and stderr == f"warning: {fake_scene.WARNING}\n"
     rows = [line.split()[0] for line in stdout.splitlines()]
-    table = ["technique", "ltc", "ltsh2", "ltsh4", "reference"]
+    table = ["technique", "ltc", "ltsh2", "ltsh4", "ltsh4c", "reference"]
     assert rows == ["specular,", *table, "diffuse,", *table, "written"]
 
 

@@ -20,7 +20,7 @@ def assert_misuse(result, complaint):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--techniques", "ltsh9"], "'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4, reference"),
+        (["--techniques", "ltsh9"], "'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4, ltsh4c, reference"),
         (["--techniques", ""], "is unknown"),
         (["--techniques", "ltc,ltsh2.exr"], "'ltsh2.exr' is unknown"),
         (["--passes", "glossy"], "passes are 'glossy', expected some of specular, diffuse"),

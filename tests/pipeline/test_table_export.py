@@ -41,6 +41,7 @@ def test_the_image_holds_the_table_bit_for_bit(exported, name):
     table, channels = shading.load_table(name), read_channels(exported / f"{name}.exr")
     pairs = [(l, m) for l in range(table.degree + 1) for m in range(l + 1)]  # noqa: E741
     suffixes = ["c"] if table.family == "ltc" else [f"c_{l}_{m}" for l, m in pairs]  # noqa: E741
+    suffixes += ["c_bent_x", "c_bent_z"] if table.bend else []
     warp_names = ["A", "B", "C", "tilt"][: table.warp.shape[2]]
     expected = {f"warp.{key}": table.warp[..., n] for n, key in enumerate(warp_names)}
     curves = range(len(table.fresnel_curves))
@@ -132,7 +133,7 @@ def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["ltsh9", "-o", "OUT"], "table 'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4 or the path"),
+        (["ltsh9", "-o", "OUT"], "table 'ltsh9' is unknown, expected some of ltc, ltsh2, ltsh4, ltsh4c or the path"),
         (["reference", "-o", "OUT"], "'reference' is unknown"),
         (["ltc"], "-o"),
         (["ltc", "other/LTC.npz", "-o", "OUT"], "ltc and other/LTC.npz would get the same names"),

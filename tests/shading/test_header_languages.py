@@ -73,7 +73,7 @@ def _functions(text, name):
 
 def test_both_branches_define_the_same_documented_functions(folder, tables):
     documented = set(re.findall(r"`((?:ltsh|<name>)_[a-z_0-9]+)(?:\(|`)", DOCUMENT.read_text(encoding="utf-8")))
-    for name in ("ltc", "ltsh2", "ltsh4"):
+    for name in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):
         functions = _functions(_glsl(folder / f"{name}.h", name), name)
         assert functions == documented - {"<name>_data"}, functions ^ documented
         assert _functions(header_harness.preprocessed(folder / f"{name}.h"), name) == functions | {"<name>_data_at"}

@@ -7,7 +7,7 @@ import pytest
 import test_workers
 from surface_scenes import area_light, four_lights, random_samples
 from test_polygon_lights import STAR, polygon_light
-from test_workers import children_only, short_tasks_for_children, started  # noqa: F401 (fixtures)
+from test_workers import DTYPES, children_only, short_tasks_for_children, started  # noqa: F401 (fixtures)
 
 from ltsh_addon import shading
 
@@ -29,7 +29,7 @@ def every_light():
     return [*lights, area_light(spread=0.2, group="Fill")]
 
 
-@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, 2 * [np.float32, np.float64], strict=True)))
+@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, DTYPES, strict=True)))
 def test_only_receivers_are_lit(technique, dtype):
     samples = numbered_samples(24, seed=1)
     lights = every_light()

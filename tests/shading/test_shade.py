@@ -208,7 +208,7 @@ def test_unknown_passes_are_refused(passes):
 
 @pytest.mark.parametrize("technique", ["ltsh5", "", "Reference", "no/such.npz"])
 def test_unknown_techniques_are_refused(technique):
-    with pytest.raises(shading.TableError, match="no such file or table; shipped are ltc, ltsh2, ltsh4"):
+    with pytest.raises(shading.TableError, match="no such file or table; shipped are ltc, ltsh2, ltsh4, ltsh4c"):
         shade(random_samples(4), four_lights(), technique)
 
 

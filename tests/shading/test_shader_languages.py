@@ -132,7 +132,7 @@ def exported(name: str, language: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("language", MAIN)
-@pytest.mark.parametrize("name", ["ltc", pytest.param("ltsh2", marks=pytest.mark.soak), "ltsh4"])
+@pytest.mark.parametrize("name", ["ltc", pytest.param("ltsh2", marks=pytest.mark.soak), "ltsh4", "ltsh4c"])
 def test_shaders_of_every_language_integrate_as_numpy_does(device, folder, tables, tmp_path, name, language):
     source = MAIN[language].replace("HEADER", exported(name, language, folder))
     source += BODY if language != "wgsl" else ""

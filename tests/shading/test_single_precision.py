@@ -192,6 +192,19 @@ def test_edge_loop_gives_the_moments(degree, corners):
     assert np.abs(moments - expected)[:, ~needs_float64].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
 
 
+@pytest.mark.parametrize("corners", [3, 5, 32])
+def test_bent_moments_are_those_of_the_bent_polygon(corners):
+    """In double precision, after the warp of the bend; tolerance as above."""
+    bend, polygons = (0.4, 0.2, 1.4), regular_polygons(corners, 300, seed=corners)
+    moments, needs_float64 = moments32.moments(polygons, 4, moments32.Scratch(), bend=bend)
+    plain, _ = moments32.moments(polygons, 4, moments32.Scratch())
+    x, y, z = polygons.astype(np.float64)
+    bent = project_to_sphere(np.stack([0.4 * x + 0.2 * z, 1.4 * y, z]))
+    expected = 2.0 * edge_integrals.vector_irradiance(bent)[::2]
+    assert np.array_equal(moments[:-2], plain) and needs_float64.mean() < 0.2
+    assert np.abs(moments[-2:] - expected)[:, ~needs_float64].max() < 1e-7 * corners * np.abs(expected).max() + 1e-6
+
+
 def regular_polygons(corners, count, seed):
     """Polygons (3, V, P) in float32 around random directions above the horizon, of 0.03 to 0.5 rad."""
     generator = np.random.default_rng(seed)

@@ -212,7 +212,7 @@ def test_the_beckmann_brdf_is_reciprocal_and_conserves_energy():
     assert (albedo < 1.003).all() and (albedo > 0.99).all()
 
 
-@pytest.mark.parametrize("name", ["ltc", "ltsh2", "ltsh4", "ridges4", "zonal3", "odd4"])
+@pytest.mark.parametrize("name", ["ltc", "ltsh2", "ltsh4", "ltsh4c", "ridges4", "zonal3", "odd4"])
 def test_basis_albedo_is_the_integral_of_the_basis(name):
     """By the validation's quadrature on the original domain; a clamped cosine may be tilted."""
     family = family_named(name)

@@ -35,7 +35,8 @@ def test_all_shipped_tables_have_the_same_curves():
     first, *others = (load_table(name) for name in SHIPPED_TABLES)
     for other in others:
         for field in ("fresnel_curves", "fresnel_ior", "fresnel_weights"):
-            assert np.array_equal(getattr(first, field), getattr(other, field)), field
+            # Fitted on several machines, which round differently.
+            assert np.allclose(getattr(first, field), getattr(other, field), rtol=0.0, atol=1e-6), field
 
 
 def test_a_combination_of_the_curves_is_found_again(basis):

@@ -9,7 +9,11 @@ from gpu_extras.batch import batch_for_shader
 from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
 
-TECHNIQUE_ITEMS = tuple((name, TECHNIQUES[name].label, TECHNIQUES[name].description) for name in SHIPPED_TABLES)
+# Files keep the numbers: they stay as they are.
+_NUMBERS = {"ltc": 0, "ltsh2": 1, "ltsh4": 2, CYCLES: 3, "ltsh4c": 4}
+TECHNIQUE_ITEMS = tuple(
+    (name, TECHNIQUES[name].label, TECHNIQUES[name].description, _NUMBERS[name]) for name in SHIPPED_TABLES
+)
 SHOWN_PASSES = (
     ("combined", "Both", "Specular and diffuse reflection, emission and background"),
     ("specular", "Specular", "Light that the glossy lobes reflect"),
@@ -22,7 +26,12 @@ MODES = (
 )
 SECOND_ITEMS = (
     *TECHNIQUE_ITEMS,
-    (CYCLES, "Cycles", "The picture that Compare with Cycles has made, where the view is through its camera"),
+    (
+        CYCLES,
+        "Cycles",
+        "The picture that Compare with Cycles has made, where the view is through its camera",
+        _NUMBERS[CYCLES],
+    ),
 )
 
 

@@ -50,7 +50,7 @@ MOST = 0.99
 # Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
-SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, REFERENCE: 100.0}
+SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, "ltsh4c": 7.5, REFERENCE: 100.0}
 SHADOW_SECONDS = 8.0
 REFERENCE_POINTS = 0.15
 

@@ -21,7 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...scene import CYCLES, TECHNIQUES
+from ...scene import CYCLES, REFERENCE, TECHNIQUES
 from ...shading.parallel import CORES_VARIABLE
 from .comparison import changed, mixed
 
@@ -122,10 +122,10 @@ def _set_variable(name: str, value: str | None) -> None:
         os.environ[name] = value
 
 
-# Members of sets of choices: name, label, description, bit.
+# Members of sets of choices: name, label, description, bit. Files keep the bits: they stay as they are.
+_BITS = {"ltc": 1, "ltsh2": 2, "ltsh4": 4, REFERENCE: 8, CYCLES: 16, "ltsh4c": 32}
 TECHNIQUE_ITEMS = tuple(
-    (name, technique.label, technique.description, 1 << index)
-    for index, (name, technique) in enumerate(TECHNIQUES.items())
+    (name, technique.label, technique.description, _BITS[name]) for name, technique in TECHNIQUES.items()
 )
 PASS_ITEMS = (
     ("specular", "Specular", "Glossy reflection, surface color included", 1),
@@ -136,7 +136,7 @@ BAKE_PASS_ITEMS = (
     ("diffuse_light", "Lightmap", "Diffuse reflection without the color of the surface", 4),
     ("combined", "Combined", "Specular and diffuse together", 8),
 )
-PICTURE_ITEMS = (*TECHNIQUE_ITEMS, (CYCLES, "Cycles", "The Cycles reference of the same points", 16))
+PICTURE_ITEMS = (*TECHNIQUE_ITEMS, (CYCLES, "Cycles", "The Cycles reference of the same points", _BITS[CYCLES]))
 VIEWS = (
     ("camera", "Active Camera", "The specular part as the scene's camera sees it"),
     ("above", "Above Surface", "The specular part as seen along the normal of each point, independent of any camera"),

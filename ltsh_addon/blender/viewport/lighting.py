@@ -104,7 +104,7 @@ class LightingPass:
     """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
 
     def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
-        """`technique` is "ltc", "ltsh2", "ltsh4", a table's path or a table of degree up to 4.
+        """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", a table's path or a table of degree up to 4.
 
         Dielectrics of the indices of refraction `iors`, multiples of 0.005, are faster; others are as exact.
         Raises TableError and ValueError.

@@ -18,7 +18,18 @@ from gpu_extras.batch import batch_for_shader
 from ...cycles import horizons
 from ...shading import facing, light_cone, moments32
 from ...shading.float64 import LEAST_ROUGHNESS
-from ...shading.header import core_text, definitions, filled, float_literal, moment_lines, source_text, table_sizes
+from ...shading.header import (
+    bend_literals,
+    bent_factor,
+    bent_moment_lines,
+    core_text,
+    definitions,
+    filled,
+    float_literal,
+    moment_lines,
+    source_text,
+    table_sizes,
+)
 from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
 from ...shading.lobes import LEAST_SHARE
 from ...shading.lookup_table import LookupTable
@@ -188,6 +199,9 @@ def _specular_text(table, is_cosine, features) -> str:
     count = table.coefficients.shape[3]
     moments = [f"    {line}" for line in moment_lines(table.degree)]
     spots = [line.replace("ltsh_edge_moment(edge,", "solid_angle * ltsh_spot_moment(direction,") for line in moments]
+    if table.bend is not None:
+        moments += _bent_edge_lines(table)
+        spots += _bent_spot_lines(table)
     fetches = [f"    vec4 block_{n} = ltsh_table_at(cell, layer + {n});" for n in range(-(-count // 4))]
     fetches += [f"    weights.values[{k}] = block_{k // 4}.{'xyzw'[k % 4]};" for k in range(count)]
     terms = [
@@ -206,6 +220,23 @@ def _specular_text(table, is_cosine, features) -> str:
         sum_value = "specular_values(weights, sum)"
         values["FOCUSED"] = _focused_text("specular", "specular_weights weights, ", sum_value, "mat3(1.0)")
     return filled(glsl("specular"), values)
+
+
+def _bent_edge_lines(table):
+    """Statements that add the edge from `start` to `end` to the moments of the table's bend."""
+    bent = [f"ltsh_unit(ltsh_bent({end}, {bend_literals(table)}))" for end in ("start", "end")]
+    yield f"    ltsh_edge leaning = ltsh_edge_between({', '.join(bent)});"
+    yield from (f"    {line}" for line in bent_moment_lines(table))
+
+
+def _bent_spot_lines(table):
+    """The same for a spot; moments are 2 pi times the integrals of `lookup_table.bent_cosines`."""
+    yield f"    vec3 bent = ltsh_bent(direction, {bend_literals(table)});"
+    yield "    float squares = dot(bent, bent);"
+    yield f"    float share = {bent_factor(table, 2.0 * np.pi)} * solid_angle / (squares * squares);"
+    count = table.coefficients.shape[3]
+    for row, axis in ((count - 2, "x"), (count - 1, "z")):
+        yield f"    moments.values[{row}] += share * bent.{axis};"
 
 
 def _diffuse_text(features) -> str:

@@ -329,6 +329,21 @@ LTSH_FUNCTION float ltsh_edge_moment(ltsh_edge edge, float u_x, float u_z, int k
     return normal * ltsh_arc_power(edge, k, start, total);
 }
 
+/* v under the warp [[xx, 0, xz], [0, yy, 0], [0, 0, 1]]. */
+LTSH_FUNCTION ltsh_vec3 ltsh_bent(ltsh_vec3 v, float xx, float xz, float yy)
+{
+    return ltsh_make_vec3(xx * v.x + xz * v.z, yy * v.y, v.z);
+}
+
+/* A polygon on the sphere under that warp, on the sphere again. */
+LTSH_FUNCTION ltsh_polygon ltsh_bent_polygon(ltsh_polygon unit, float xx, float xz, float yy)
+{
+    for (int i = 0; i < unit.count; ++i) {
+        unit.corners[i] = ltsh_unit(ltsh_bent(unit.corners[i], xx, xz, yy));
+    }
+    return unit;
+}
+
 /* As ltsh_make_cell, for who knows the sine better than it follows from a cosine close to one; both from 0 to 1. */
 LTSH_FUNCTION ltsh_cell ltsh_make_cell_at(float cos_theta_o, float sin_theta_o, float roughness, int rows, int columns)
 {

@@ -173,7 +173,7 @@ LTSH_FUNCTION @prefix@_moments @prefix@_polygon_moments(ltsh_warp warp, ltsh_pol
     for (int k = 0; k < @PREFIX@_COEFFICIENTS; ++k) {
         moments.values[k] = 0.0f;
     }
-    moments.values[0] = ltsh_solid_angle(unit);
+    moments.values[0] = ltsh_solid_angle(unit);@BENT_POLYGON@
     for (int i = 0; i < unit.count; ++i) {
         ltsh_edge edge = ltsh_make_edge(unit, i);
 @MOMENT_LINES@

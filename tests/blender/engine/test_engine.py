@@ -270,7 +270,7 @@ def test_progress_grows_to_the_end_and_can_stop(scene, tmp_path):
     render_module.final_picture(job, path, lambda stage, fraction: stages.append((fraction, stage)))
     fractions = [fraction for fraction, _ in stages]
     assert fractions == sorted(fractions) and fractions[0] >= 0.0 and 0.9 < fractions[-1] <= 1.0
-    assert {"LTC", "LTSH 2", "LTSH 4"} <= {stage for _, stage in stages}
+    assert {"LTC", "LTSH 2", "LTSH 4", "LTSH 4c"} <= {stage for _, stage in stages}
     with pytest.raises(Cancelled):
         render_module.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
 

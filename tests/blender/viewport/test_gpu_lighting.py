@@ -13,7 +13,7 @@ from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.textures import upload_samples
 
 WIDTH, HEIGHT = 32, 16
-TECHNIQUES = ("ltc", "ltsh2", "ltsh4")
+TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # What the preview promises: below the differences between techniques, and nothing the eye could see.
 RELATIVE, ABSOLUTE = 1e-3, 1e-5
 # The quadrature over a profile is good to 3e-3 in both, and which one is taken may depend on rounding.

@@ -133,7 +133,7 @@ def drawn(camera):
     view = View.of(camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False)
     pictures = {}
     try:
-        for technique in ("ltc", "ltsh2", "ltsh4"):
+        for technique in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):
             for name in shading.PASSES:
                 shown = ShownPicture(technique, name, "single", "ltc", 0.5, 1.0, 1.0, True)
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer)

@@ -2,7 +2,7 @@ import bpy
 
 settings = bpy.context.scene.ltsh
 
-settings.techniques = {"ltc", "ltsh2", "ltsh4", "reference"}
+settings.techniques = {"ltc", "ltsh2", "ltsh4", "ltsh4c", "reference"}
 settings.resolution_percentage = 100
 settings.anti_aliasing = 16
 settings.cycles_samples = 2048

@@ -60,7 +60,9 @@ TECHNIQUES = {
         "LTSH 2", "LTSH N=2", "Linearly transformed spherical harmonics of degree 2: nearly as fast as LTC"
     ),
     "ltsh4": Technique(
-        "LTSH 4", "LTSH N=4", "Linearly transformed spherical harmonics of degree 4: accurate, in 1.6 times the time of LTC"
+        "LTSH 4",
+        "LTSH N=4",
+        "Linearly transformed spherical harmonics of degree 4: accurate, 1.6 times the time of LTC",
     ),
     "ltsh4c": Technique(
         "LTSH 4c",

@@ -171,7 +171,7 @@ def bent_cosines(bend, unit) -> np.ndarray:
 
 
 def basis_values(degree, bend, unit) -> np.ndarray:
-    """Values (K, ...) at unit directions (..., 3): spherical harmonics, and the `bent_cosines` where there is a bend."""
+    """Values (K, ...) at unit directions (..., 3): spherical harmonics, then the `bent_cosines` of a bend."""
     basis = evaluate(degree, unit)
     return basis if bend is None else np.concatenate([basis, bent_cosines(bend, unit)])
 

@@ -217,7 +217,6 @@ class LobeAtPoint:
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         return values
 
-
     def _leaning(self, x, y, z):
         """The two functions (2, ...) of the bend whose terms come last, in a direction (x, y, z)."""
         return (2.0 * np.pi) * bent_cosines(self.bend, np.stack([x, y, z], axis=-1))

@@ -23,6 +23,7 @@ from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, Shado
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
+SAME_REST = "bounced light, and all else that Cycles has rendered, is as the lights were; there is no PNG"
 KEPT_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
     "render the picture again for the last digits there"
@@ -84,11 +85,34 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
         warnings += (KEPT_WEIGHTS.format(split, len(kept.extraction.samples)),)
     extraction = replace(kept.extraction, lights=lights, warnings=warnings)
     results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
-    comparison = picture.Comparison(options, extraction, results, kept.shadows)
+    if kept.rest:
+        extraction = replace(extraction, warnings=(*extraction.warnings, SAME_REST))
+        comparison = _Finished(options, extraction, results, kept.shadows, kept)
+    else:
+        comparison = picture.Comparison(options, extraction, results, kept.shadows)
     changed = [{"light": change.name, **{key: value for key, value in asdict(change).items() if key != "name"}}
                for change in changes]  # fmt: skip
     report = {**comparison.report(), "relit": changed}
     return {"files": comparison.write(output, report, False, progress), **report}
+
+
+@dataclass(frozen=True)
+class _Finished(picture.Comparison):
+    """A finished picture, with what is not ours as it was."""
+
+    kept: KeptPicture | None = None
+
+    def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
+        found, rest = {}, self.kept.rest[""]
+        for name, pixels in super().layers().items():
+            technique, _, part = name.partition(".")
+            pass_name = part.partition("@")[0]
+            if technique in self.results and pass_name in self.options.passes:
+                found[name] = pixels * self.kept.taken[pass_name][..., None]
+        combined = rest.copy()
+        for name in self.options.passes:
+            combined[..., :3] += found[f"{technique_of(self.kept)}.{name}"]
+        return {"combined": combined, **found, "rest": rest}
 
 
 def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:

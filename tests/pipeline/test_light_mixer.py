@@ -133,6 +133,26 @@ def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_grou
     np.testing.assert_allclose(bounced, expected, atol=1e-5)
 
 
+def test_a_finished_picture_lit_anew_keeps_the_rest(capsys, monkeypatch, room, out):
+    whole = shade(capsys, monkeypatch, room, out / "first")
+    kept, random = kept_in(out / "first"), np.random.default_rng(3)
+    rest, taken = (
+        random.random((*whole.shape[:2], 4)),
+        {name: random.random(whole.shape[:2]) for name in ("specular", "diffuse")},
+    )
+    path = out / "finished" / "render.samples.npz"
+    path.parent.mkdir()
+    lighting.keep_picture(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
+    found = run(capsys, "relight", out / "finished", "--light", "Light 1", "--power", "x3", "--json", "--quiet")
+    assert found[0] == 0 and relight.SAME_REST in found[1]
+    channels = read_channels(out / "finished" / "relit" / "render.exr")
+    assert np.allclose(channels["rest.A"], rest[..., 3]) and np.allclose(channels["combined.A"], rest[..., 3])
+    pictures = light_pictures(KeptPicture.load(path))
+    expected = np.einsum("rhwc,r->hwc", pictures.layers, [1.0, 3.0, 1.0, 1.0])
+    combined = np.stack([channels[f"combined.{letter}"] for letter in "RGB"], axis=-1)
+    np.testing.assert_allclose(combined, expected, rtol=1e-5, atol=1e-6)
+
+
 def options(room, output):
     from ltsh_addon.pipeline.options import PictureOptions
 

@@ -205,7 +205,7 @@ MOST_PAIRS = 1 << 23
 LINES = 16
 SHARED = "they share their shadow rays, so they change together"
 WEAKEST = "the weakest lights of the picture, which change together"
-NO_BOUNCES = f"bounced light is part of {REST!r}: it does not follow the lights"
+NOT_OF_LIGHTS = "the background, what glows, and in finished pictures bounced light: they do not follow the lights"
 SHARED_OUT = "bounced light of light group {!r} is shared out among {} by their direct light"
 
 
@@ -273,7 +273,7 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
     notes = _share_out_bounces(kept, rows, members, layers)
     rest = kept.rest.get("")
     if rest is not None:
-        rows.append(Row(REST, (), note=NO_BOUNCES))
+        rows.append(Row(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
     alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
     facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}

@@ -14,14 +14,16 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ...pipeline.lighting import shade_lights, trace_shadows
+from ...pipeline.lighting import KeptPicture, shade_lights, trace_shadows
 from ...pipeline.options import RenderOptions
+from ...pipeline.relight import LightPictures, light_pictures
 from ...pipeline.render import finish
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
 from ..process import client
 from ..saving import save_working_copy
+from ..ui import comparison
 from ..ui.preview import ENGINE
 from . import view
 from .view import EngineView
@@ -113,6 +115,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             if name in passes:
                 passes[name].rect.foreach_set(blender_pixels(image))
         self.end_result(result)
+        if picture.lights is not None:
+            comparison.mix_render(job.scene, picture.lights)
 
     def _progress(self):
         """A progress callback that shows where the render stands, and stops it when the user does."""
@@ -169,6 +173,7 @@ def _job_of(engine, depsgraph) -> FinalJob:
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
         cycles_samples=settings.cycles_samples if settings.complete else 0,
         cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
+        keeps_lights=scene.ltsh.keep_lights and not engine.is_animation,
     )
 
 
@@ -188,6 +193,7 @@ class FinalJob:
     background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
     cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
     cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
+    keeps_lights: bool = False  # for the light mixer
 
     def shaded_as(self) -> dict[str, str]:
         """Names of passes start with -> technique."""
@@ -207,6 +213,7 @@ class FinalPicture:
     passes: dict[str, np.ndarray]
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
+    lights: LightPictures | None = None
 
 
 def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
@@ -227,7 +234,7 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
     )
     extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
     names = list(dict.fromkeys(job.shaded_as().values()))
-    share, start = (1.0 - EXTRACTION_SHARE) / (len(names) + 1), EXTRACTION_SHARE
+    share, start = (1.0 - EXTRACTION_SHARE) / (len(names) + 1 + job.keeps_lights), EXTRACTION_SHARE
     shadows, warnings = None, extraction.warnings
     if extraction.occluders is not None:
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share))
@@ -249,7 +256,13 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
         color = color + emission
     coverage = inside_border(extraction.film.coverage(), extraction.border)
     combined = _over_background(color, coverage, job, extraction.exposure)
-    return FinalPicture(combined, passes, warnings, extraction.problems)
+    lights = None
+    if job.keeps_lights:
+        glow = extraction.exposure * extraction.emission * (job.shown == "combined")
+        rest = _over_background(glow, extraction.film.coverage(), job, extraction.exposure)
+        kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
+        lights = light_pictures(kept, _part(progress, 1.0 - share, share))
+    return FinalPicture(combined, passes, warnings, extraction.problems, lights)
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
@@ -274,7 +287,13 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> Fi
         if planes and set(letters) <= set(planes):
             passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
     passes = {name: inside_border(image, border) for name, image in passes.items()}
-    return FinalPicture(inside_border(made.combined, border), passes, tuple(made.report["warnings"]))
+    lights, ours = None, made.comparison
+    if job.keeps_lights:
+        rest, chosen = {"": made.rest}, {"techniques": options.techniques, "passes": PASSES}
+        kept = KeptPicture(ours.extraction, ours.shadows, chosen, False, rest, made.taken)
+        lights = light_pictures(kept, progress)
+    warnings = tuple(made.report["warnings"])
+    return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights)
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
+from ...pipeline.relight import LightPictures
 from ...scene import error_line
 from . import drawing, results
 
@@ -38,6 +39,20 @@ def mixed(item, context) -> None:
         changed(settings, context)
     else:
         settings.mode = "MIX"
+    put_in_editor(context, item.id_data)
+
+
+def mix_render(name: str, pictures: LightPictures) -> None:
+    """Let the mixer change the lights of a final render of the scene `name`; called while Blender renders."""
+
+    def take() -> None:
+        scene = bpy.data.scenes.get(name)
+        if scene is not None:
+            results.mix_render(scene, pictures)
+            redraw_image_editors()
+            redraw_panels()
+
+    bpy.app.timers.register(take, first_interval=0.0)
 
 
 def _warn(error: RuntimeError) -> None:
@@ -47,13 +62,13 @@ def _warn(error: RuntimeError) -> None:
 
 def refresh(scene) -> bool:
     """Bring the image up to date; False where there are no results."""
-    result = results.result_of(scene)
-    if result is None:
-        return False
     mixture = results.mixed_pixels(scene) if scene.ltsh.mode == "MIX" else None
     if mixture is not None:
         _show(scene, mixture, True)
         return True
+    result = results.result_of(scene)
+    if result is None:
+        return False
     choice = results.choice_of(scene.ltsh, result)
     results.images_of_pass(scene, result, choice)
     group = result.groups[choice.group]
@@ -521,7 +536,14 @@ def _mix_again(*_):
             refresh(scene)
 
 
+@bpy.app.handlers.persistent
+def _forget_renders(*_):
+    """Before loading."""
+    results.forget_renders()
+
+
 HANDLERS = (
+    ("load_pre", _forget_renders),
     ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),
     ("undo_post", _mix_again), ("redo_post", _mix_again),
 )  # fmt: skip

@@ -12,7 +12,7 @@ from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
 from ...pipeline.lighting import KEPT_SUFFIX
 from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, Row, load_kept, moved_picture, tint
-from ...scene import AreaLight
+from ...scene import AreaLight, SceneError
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
 PREFIX = "LTSH "
@@ -81,6 +81,7 @@ def show(scene, folder: Path) -> None:
     """Make the pictures in `folder` the results of `scene`, with images for the chosen pass."""
     scene.ltsh.result_folder = _blender_path(folder)
     _pixels.clear()
+    _rendered.clear()
     result = result_of(scene)
     if result is None:
         return
@@ -210,10 +211,14 @@ def _stored(settings, key: str, value: str):
 
 # Of the picture that was asked for last, and what was kept of it to shade lights that have moved.
 _mixer: dict = {"stamp": None, "mixer": None, "kept": None, "is_silent": False}
+# Of final renders by the name of their scene, as long as nothing else is shown; they are in no file.
+_rendered: dict[str, Mixer] = {}
 
 
 def mixer_of(scene) -> Mixer | None:
     """The light mixer of the results of `scene`; None where they have no pictures of the lights."""
+    if scene.name in _rendered:
+        return _rendered[scene.name]
     result = result_of(scene)
     if result is None:
         return None
@@ -228,11 +233,25 @@ def mixer_of(scene) -> Mixer | None:
     return _mixer["mixer"]
 
 
+def mix_render(scene, pictures: LightPictures) -> None:
+    """Let the mixer of `scene` change the lights of a final render."""
+    _rendered.clear()
+    _rendered[scene.name] = Mixer(pictures)
+    _take_rows(scene)
+
+
+def forget_renders() -> None:
+    """Another file is opened: its scenes may have the same names."""
+    _rendered.clear()
+
+
 def update_moved(scene, moved: dict[int, AreaLight]) -> None:
     """Shade lights of the mixer anew, by the numbers of their rows, and write them to the picture's files.
 
     Raises OSError, ValueError, SceneError.
     """
+    if scene.name in _rendered:
+        raise SceneError("lights of a final render: render again, or shade a picture, whose lights can be moved")
     result, mixer = result_of(scene), mixer_of(scene)
     if _mixer["kept"] is None:
         _mixer["kept"] = load_kept((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
+from job_window import image_pixels
 
 import ltsh_addon
 from ltsh_addon import shading
@@ -16,6 +17,7 @@ from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
+from ltsh_addon.blender.ui import results
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
@@ -273,6 +275,36 @@ def test_progress_grows_to_the_end_and_can_stop(scene, tmp_path):
     assert {"LTC", "LTSH 2", "LTSH 4", "LTSH 4c"} <= {stage for _, stage in stages}
     with pytest.raises(Cancelled):
         render_module.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"shown": "diffuse"}, {"background": np.array([0.1, 0.2, 0.3])}, {"cycles_samples": 4}]
+)
+def test_a_final_picture_is_the_sum_of_its_lights_and_the_rest(scene, tmp_path, settings):
+    """What the light mixer gets of it."""
+    values = {"shown": "combined", "keeps_lights": True, **settings}
+    job = render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh4", **values)
+    found = render_module.final_picture(job, parts.save(tmp_path / "scene.blend"), lambda stage, fraction: True)
+    layers, combined = found.lights.layers, found.combined
+    np.testing.assert_allclose(layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5 * combined.max())
+    np.testing.assert_allclose(found.lights.alpha, combined[..., 3], atol=1e-6)
+    assert layers[0].max() > 0.1 * combined[..., :3].max()
+
+
+def test_a_render_is_what_the_mixer_changes_until_results_are_shown(scene, monkeypatch):
+    later = []
+    monkeypatch.setattr(bpy.app.timers, "register", lambda function, **_: later.append(function))
+    bpy.ops.render.render()
+    (take,) = [one for one in later if one.__name__ == "take"]
+    take()
+    mixer = results.mixer_of(scene)
+    assert [row.name for row in mixer.rows][-1] == "Everything else" and len(scene.ltsh.mixed) == len(mixer.rows)
+    scene.ltsh.mixed[0].muted = True
+    assert scene.ltsh.mode == "MIX"
+    found, expected = image_pixels("LTSH Comparison"), mixer.pictures.layers[1:].sum(axis=0)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    results.forget_renders()
+    assert results.mixer_of(scene) is None
 
 
 def test_work_that_never_asks_is_left_at_once():

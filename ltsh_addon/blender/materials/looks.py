@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...cycles.closures import sheen_albedo, velvet_albedo
+from ...cycles.closures import velvet_albedo
 from ...cycles.lobes import SMALLEST_WEIGHT
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
@@ -79,12 +79,13 @@ class Look:
     weight: float = 1.0
     view_factor: ViewFactor | None = None  # times the weight
     coat: Coat | None = None  # over it; of the kind COAT itself
+    sheen: tuple[float, float] | None = None  # over it and its coat: the largest weight of a color, and its roughness
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # of a node that is not shaded
-    albedo: float = 1.0  # of sheen and velvet: the mean over all views, by which its color is shown
+    albedo: float = 1.0  # of velvet: the mean over all views, by which its color is shown
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -124,13 +125,10 @@ def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
     return Look("diffuse", {"color": constant(color)}, notes=notes)
 
 
-ALBEDOS = {"sheen": sheen_albedo, "velvet": velvet_albedo}
-
-
-def mean_albedo(kind: str, roughness: float) -> float:
-    """Share of uniform light that sheen or velvet of `roughness` reflects."""
+def mean_albedo_of_velvet(roughness: float) -> float:
+    """Share of uniform light that velvet of `roughness` reflects."""
     cosine = (np.arange(64) + 0.5) / 64.0
-    return float(np.average(ALBEDOS[kind](cosine, np.full(64, roughness)), weights=cosine))
+    return float(np.average(velvet_albedo(cosine, np.full(64, roughness)), weights=cosine))
 
 
 def default_look() -> Look:
@@ -285,14 +283,18 @@ class _Reader:
             values = {"color": constant(self.material.diffuse_color), **share.values}
             return [Look("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
         look = self._lobe(source, bsdf, share)
+        fuzz = self._sheen(source, look) if look.kind == "principled" else []
         coat = self._coat(source, look) if look.kind == "principled" else None
+        if fuzz:
+            tint, roughness = (fuzz[0].value(name).offset for name in ("color", "roughness"))
+            look = replace(look, sheen=(float(np.max(tint)), float(np.max(roughness))))
         if coat is None:
-            return [look]
+            return [look, *fuzz]
         look = replace(look, coat=coat)
         values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior), "weight": look.value("weight")}
         # Its multiple scattering is always there.
         shine = replace(look, kind=COAT, values=values, scattered=True)
-        return [look, shine if coat.follows_normal else replace(shine, normal=None)]
+        return [look, shine if coat.follows_normal else replace(shine, normal=None), *fuzz]
 
     def _lobe(self, source: Source, bsdf: Bsdf, share: Share) -> Look:
         node, names = source.node, bsdf.sockets
@@ -301,10 +303,6 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
-        if bsdf.kind == "principled":
-            weight = constant_inputs(source, "Sheen Weight")
-            if weight is None or weight[0][0] > 0.0:
-                self.note("sheen is not shown")
         rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
         if rough is None or rough[0][0] > 0.0:
             self.note("rough diffuse reflection is shown as smooth")
@@ -313,13 +311,25 @@ class _Reader:
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
-        if bsdf.kind in ALBEDOS:
+        if bsdf.kind == "velvet":
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
             roughness = values["roughness"]
-            look = replace(look, albedo=mean_albedo(bsdf.kind, roughness.offset[0] if roughness.is_constant else 0.5))
+            look = replace(look, albedo=mean_albedo_of_velvet(roughness.offset[0] if roughness.is_constant else 0.5))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look
+
+    def _sheen(self, source: Source, look: Look) -> list[Look]:
+        """The lobe of the fuzz on a Principled BSDF, if there is any."""
+        weight, roughness, tint = (
+            np.maximum(self._value(source, "", f"Sheen {name}").offset, 0.0) for name in ("Weight", "Roughness", "Tint")
+        )
+        color = np.max(weight) * tint * np.ones(3)
+        if np.max(color) <= SMALLEST_WEIGHT:
+            return []
+        values = {"color": constant(color), "roughness": constant(min(float(np.max(roughness)), 1.0))}
+        values["weight"] = look.value("weight")
+        return [replace(look, kind="sheen", values=values, scattered=False)]
 
     def _coat(self, source: Source, look: Look) -> Coat | None:
         """What covers a Principled BSDF, None where nothing does."""

@@ -175,6 +175,7 @@ class LightingPass:
             shadowed=gbuffer.shares is not None,
             facing=self._has_facing,
             sky=self._sky is not None,
+            sheen=passes != "specular" and gbuffer.has_sheen,
         )
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
@@ -187,7 +188,7 @@ class LightingPass:
                 shader.bind()
                 for name in features.samplers:
                     shader.uniform_sampler(name, self._texture(name, gbuffer))
-                if features.specular:
+                if features.specular or features.sheen:
                     shader.uniform_float("view", view)
                 if features.sky and features.specular:
                     shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))

@@ -83,6 +83,7 @@ class Features:
     shadowed: bool = False  # a share of each light that is seen
     facing: bool = False  # lights that face every point
     sky: bool = False  # the light of the world
+    sheen: bool = False  # diffuse lobes that are sheen
 
     @property
     def samplers(self) -> tuple[str, ...]:
@@ -105,7 +106,9 @@ class Features:
 
 def lighting_shader(table: LookupTable, features: Features):
     """The lighting shader for `table` of degree 1 to 4, and its batch."""
-    constants = {"place": "IVEC4", "view": "VEC4"} if features.specular else {"place": "IVEC4"}
+    constants = {"place": "IVEC4"}
+    if features.specular or features.sheen:
+        constants["view"] = "VEC4"
     if features.shadowed:
         constants["grid"] = "MAT4"
     if features.sky and features.specular:

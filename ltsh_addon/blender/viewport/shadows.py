@@ -352,17 +352,19 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tupl
         name: None if getattr(gbuffer, name) is None else texels(getattr(gbuffer, name))[pixel]
         for name in ("diffuse_normal", "smooth_normal", "geometric_normal")
     }
-    bent = further["diffuse_normal"]
+    bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
     return SurfaceSamples(
         position=position[:, :3],
         view=np.broadcast_to(view.eye, (len(pixel), 3)) if view.is_parallel else _unit(view.eye - position[:, :3]),
         normal=_unit(normal),
         diffuse_normal=_unit(normal if bent is None else bent),
-        roughness=normal[:, 3],
+        roughness=np.where(fuzzy, 1.0, normal[:, 3]),
         specular_f0=f0[:, :3],
         specular_f90=f90[:, :3],
         dielectric=dielectric[:, :3],
-        ior=base[:, 3],
+        ior=np.where(fuzzy, 1.5, base[:, 3]),
+        sheen_a=np.where(fuzzy, -base[:, 3], 0.0),
+        sheen_b=np.where(fuzzy, normal[:, 3], 0.0),
         diffuse_albedo=base[:, :3],
         geometric_normal=_unit_or_none(further["geometric_normal"]),
         smooth_normal=_unit_or_none(further["smooth_normal"]),

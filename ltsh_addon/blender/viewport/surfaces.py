@@ -21,6 +21,7 @@ from .textures import (
     blend_table,
     float_table,
     float_texture,
+    sheen_table,
     uniform_buffer,
 )
 
@@ -102,6 +103,7 @@ class SurfacePass:
             return
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
+        self._tables["sheen_table"] = float_texture(sheen_table())
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size = self._depth = None
@@ -167,7 +169,8 @@ class SurfacePass:
         textures = self._draw_into(SURFACES, instances, view, number)
         if has_normals(instances):
             textures = textures | self._draw_into(NORMALS, instances, view, number)
-        return GBufferTextures(**textures)
+        lobes = (lobe.look for instance in instances for look in instance.looks for lobe in look.lobes[number:])
+        return GBufferTextures(**textures, has_sheen=any(look.kind == "sheen" for look in lobes))
 
     def _target(self, outputs, is_further: bool):
         """Textures by name and the frame buffer that `outputs` are drawn into; those of further lobes have no depth."""
@@ -277,7 +280,7 @@ def _shader(outputs, is_further: bool = False):
     info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
     samplers = []
     if outputs != EMISSION:
-        samplers += [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table"]
+        samplers += [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table", "sheen_table"]
     if is_further or outputs in _ADDED:
         samplers.append("positions")
     for slot, name in enumerate(samplers):

@@ -68,6 +68,7 @@ class GBufferTextures:
     diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
     smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
     shares: ShareGrid | None = None  # all of each light is seen
+    has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:
@@ -75,7 +76,7 @@ class GBufferTextures:
         sizes = {
             field.name: (texture.width, texture.height)
             for field in fields(self)
-            if field.name != "shares" and (texture := getattr(self, field.name)) is not None
+            if field.name not in ("shares", "has_sheen") and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
             raise ValueError(f"G-buffer: textures have the sizes {sizes}, expected one size for all")
@@ -109,10 +110,12 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
     dip = samples.specular_dip
     bumped = (samples.smooth_normal != samples.diffuse_normal).any()
     turned = bumped or (samples.diffuse_normal != samples.normal).any()
+    fuzzy = samples.sheen_a != 0.0
     return GBufferTextures(
+        has_sheen=bool(fuzzy.any()),
         position=texture(samples.position, 1.0 + samples.receiver),
-        normal=texture(samples.normal, samples.roughness),
-        base=texture(samples.diffuse_albedo, samples.ior),
+        normal=texture(samples.normal, np.where(fuzzy, samples.sheen_b, samples.roughness)),
+        base=texture(samples.diffuse_albedo, np.where(fuzzy, -samples.sheen_a, samples.ior)),
         f0=texture(samples.specular_f0, dip[:, 0]),
         f90=texture(samples.specular_f90, dip[:, 1]),
         dielectric=texture(samples.dielectric, dip[:, 2]),
@@ -328,7 +331,7 @@ def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
 FIRST_SLOT, SLOT_SIZE = 3, 6
 FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
 LAYERS = FIRST_TERM + 5
-LOOK_SIZE = LAYERS + 3
+LOOK_SIZE = LAYERS + 4
 VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
@@ -370,6 +373,8 @@ def look_values(look: Look) -> np.ndarray:
     if look.view_factor is not None:
         factor = look.view_factor
         data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
+    if look.sheen is not None:
+        data[LAYERS + 3, :2] = look.sheen
     if look.coat is not None:
         data[LAYERS, 1:] = look.coat.weight, look.coat.roughness, look.coat.ior
         data[LAYERS + 1] = *look.coat.tint, look.coat.follows_normal
@@ -408,6 +413,14 @@ def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
 def albedo_table() -> np.ndarray:
     """(33, 32): directional albedo of GGX by roughness and cosine, then its average by roughness."""
     return np.vstack(closures.albedo_tables())
+
+
+def sheen_table() -> np.ndarray:
+    """(N, N, 4): albedo, a and b of sheen by cosine, rows, and roughness, see `closures.sheen_lobe`."""
+    nodes = np.linspace(0.0, 1.0, closures.SHEEN_NODES)
+    cosine, roughness = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
+    found = np.concatenate([closures.sheen_lobe(cosine, roughness), np.zeros((1, len(cosine)))])
+    return found.T.reshape(len(nodes), len(nodes), 4)
 
 
 def blend_table() -> np.ndarray:

@@ -1,8 +1,24 @@
-struct diffuse_lobe { vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2; };
+struct diffuse_lobe {
+    vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2;
+#ifdef LTSH_SHEEN
+    /* Around the normal, with the view on the side of the first axis; 1 and 0 are Lambert's. */
+    ltsh_frame frame; float a; float b;
+#endif
+};
 /* Integral of the direction over a polygon, times 2. */
 struct diffuse_sum { vec3 total; };
 
-vec3 diffuse_warped(diffuse_lobe lobe, vec3 v) { return v; }
+vec3 diffuse_warped(diffuse_lobe lobe, vec3 v)
+{
+#ifdef LTSH_SHEEN
+    float x = dot(lobe.frame.tangent, v);
+    float z = dot(lobe.frame.normal, v);
+    float y = dot(lobe.frame.bitangent, v);
+    return (lobe.a * x + lobe.b * z) * lobe.frame.tangent + lobe.a * y * lobe.frame.bitangent + z * lobe.frame.normal;
+#else
+    return v;
+#endif
+}
 
 diffuse_sum diffuse_empty()
 {
@@ -51,6 +67,12 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     lobe.bump_alpha2 = all(equal(lobe.plane_0, lobe.plane_1)) ? 0.0 : normal.w;
 #elif defined(LTSH_TURNED)
     lobe.plane_0 = texelFetch(diffuse_normals, texel, 0).xyz;
+#endif
+#ifdef LTSH_SHEEN
+    bool fuzzy = point.ior < 0.0;
+    lobe.frame = ltsh_make_frame(lobe.plane_0, point.view);
+    lobe.a = fuzzy ? -point.ior : 1.0;
+    lobe.b = fuzzy ? point.roughness : 0.0;
 #endif
     return lobe;
 }

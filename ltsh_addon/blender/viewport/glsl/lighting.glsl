@@ -57,8 +57,10 @@ void main()
 #endif
     bool here = position.w > 0.0;
     vec3 radiance = vec3(0.0);
-#ifdef LTSH_SPECULAR
+#if defined(LTSH_SPECULAR) || defined(LTSH_SHEEN)
     point.view = view.w > 0.0 ? ltsh_unit(view.xyz - position.xyz) : view.xyz;
+#endif
+#ifdef LTSH_SPECULAR
     point.f0 = texelFetch(f0s, texel, 0);
     point.f90 = texelFetch(f90s, texel, 0);
     point.dielectric = texelFetch(dielectric_weights, texel, 0);

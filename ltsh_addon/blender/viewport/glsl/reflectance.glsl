@@ -64,6 +64,19 @@ float fresnel_of_dielectric(float cosine, float ior)
   return 0.5 * a * a * (1.0 + b * b);
 }
 
+/* Albedo, a and b of sheen. */
+vec3 sheen_at(float cosine, float roughness)
+{
+  int last = textureSize(sheen_table, 0).x - 1;
+  vec2 place = vec2(max(roughness, 1e-3), cosine) * float(last);
+  ivec2 low = min(ivec2(place), ivec2(last - 1));
+  vec2 share = place - vec2(low);
+  vec3 first = mix(texelFetch(sheen_table, low, 0).rgb, texelFetch(sheen_table, low + ivec2(1, 0), 0).rgb, share.x);
+  vec3 second = mix(texelFetch(sheen_table, low + ivec2(0, 1), 0).rgb,
+                    texelFetch(sheen_table, low + ivec2(1, 1), 0).rgb, share.x);
+  return mix(first, second, share.y);
+}
+
 /* What Fresnel and Layer Weight say: kind (0: 1), number, whether it is taken from 1. */
 float view_factor(vec3 factor, float cosine, bool backfacing)
 {
@@ -99,6 +112,7 @@ struct Lobe {
   vec3 dielectric;
   vec3 diffuse;
   float ior;
+  float roughness;
 };
 
 void add_metal(inout Lobe lobe, vec3 color, float share, vec2 albedo)
@@ -139,7 +153,7 @@ void add_dielectric(inout Lobe lobe, vec3 color, float share, float ior, float r
 
 Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float cosine)
 {
-  Lobe lobe = Lobe(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), 1.5);
+  Lobe lobe = Lobe(vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), vec3(0.0), 1.5, roughness);
   int kind = int(look.data[0].x + 0.5);
   vec2 albedo = lobe_albedo(roughness, cosine);
   if (kind == PRINCIPLED) {
@@ -169,6 +183,13 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
   else if (kind == COAT) {
     lobe.dielectric = look.data[LAYERS].y * scattering_boost(vec3(dielectric_average(ior)), albedo);
     lobe.ior = max(ior, 1.0);
+  }
+  else if (kind == SHEEN) {
+    vec3 fuzz = sheen_at(cosine, roughness);
+    lobe.diffuse = color * max(fuzz.x, 0.0);
+    /* As `GBufferTextures` has it. */
+    lobe.ior = -max(fuzz.y, 1e-6);
+    lobe.roughness = fuzz.z;
   }
   else {
     lobe.diffuse = color;

@@ -59,13 +59,15 @@ void main()
     }
     weight *= left_under_coat(clamp(dot(coat_normal, towards_eye), 0.0, 1.0));
   }
+  float fuzz = look.data[LAYERS + 3].x;
+  weight *= fuzz > 0.0 ? clamp(1.0 - fuzz * sheen_at(cosine, look.data[LAYERS + 3].y).x, 0.0, 1.0) : 1.0;
 #endif
 #ifdef DRAWS_THROUGH
   out_through = vec4(weight * let_through(color, metallic, ior, cosine), 0.0);
 #elif defined(DRAWS_SURFACES)
   Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
   out_position = vec4(v_position, 1.0 + placement.x);
-  out_normal = vec4(specular_normal, roughness);
+  out_normal = vec4(specular_normal, lobe.roughness);
   out_base = vec4(weight * lobe.diffuse, lobe.ior);
   out_f0 = vec4(weight * lobe.f0, weight.r * lobe.dip.r);
   out_f90 = vec4(weight * lobe.f90, weight.g * lobe.dip.g);

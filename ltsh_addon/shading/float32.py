@@ -20,7 +20,7 @@ from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local
 from .light_tree import FEWEST, LightTree, add_far_lights
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .lookup_table import MIN_ALPHA
-from .patch_tree import PatchTree
+from .patch_tree import SkyMap, interpolated
 from .polygon import convex_pieces, dot
 from .tails import SeenLight, TailLimits
 
@@ -32,9 +32,6 @@ CHUNK = 24592
 CORNERS = 4 * CHUNK
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
-# Pairs of samples and patches of a distant light at a time; and the share of small lights' size in that of patches that
-# are shaded by their centers: what is lost on one patch its neighbors gain.
-PAIR_CHUNK, PATCH_SHARE = 16384, 0.25
 # Points of lights with a profile at a time.
 POINT_CHUNK = 40960
 # The light of narrower cones, in rad, is too bright for the absolute error of single precision.
@@ -80,10 +77,12 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
-    if lights.trees and table.family == "ltsh":
-        far, sharp = sharp, np.zeros_like(sharp)
-    else:
-        far = sharp & False
+    far = sharp & False
+    if lights.skies:
+        far = sharp & ~float64.has_bent_fresnel(samples)
+    elif lights.trees and table.family == "ltsh":
+        far = sharp
+    sharp = sharp & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
         for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(chosen)[0]):
             for index in _chunks(members):
@@ -139,9 +138,9 @@ class Lobes:
     only_tails: bool = False  # elsewhere single precision does not suffice
 
     @cached_property
-    def clip_lengths(self) -> list[np.ndarray]:
+    def lengths(self) -> dict[int, np.ndarray]:
         """Lengths (Q,) of the rows that are clipped."""
-        return [np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows]
+        return {row: np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows}
 
 
 class Lights(list):
@@ -165,6 +164,15 @@ class Lights(list):
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
 
+    @cached_property
+    def skies(self) -> list[tuple[SkyMap, object, int]]:
+        """Maps of the distant lights with a detail, one of their lights, and the group."""
+        kinds: dict[tuple, list] = {}
+        for light, group, _ in self:
+            if float64.has_patches(light):
+                kinds.setdefault((group, light.receivers), []).append(light)
+        return [(SkyMap.of(lights), lights[0], group) for (group, _), lights in kinds.items()]
+
 
 class _Lighting:
     """Adds the light of `lights` at `samples` to radiance (G, P, 3); shade_in_float64(samples, lights, radiance) is
@@ -180,6 +188,7 @@ class _Lighting:
         samples, index, colors = self.samples, lobes.index, lobes.colors
         position = np.ascontiguousarray(samples.position[index].T)
         sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
+        self._add_skies(lobes, sums)
         left = self._add_far(lobes, position, sums)
         for number, (light, group, corners) in enumerate(self.lights):
             columns, needs_float64 = left.get(number), self.needs_float64[number]
@@ -187,7 +196,6 @@ class _Lighting:
                 continue
             allowed = light.receives(samples.receiver, index)
             if float64.has_patches(light):
-                self._add_patches(lobes, light, group, sums[group])
                 continue
             if light.is_focused or light.cone is not None:
                 near = may_reach(light, position)
@@ -199,9 +207,7 @@ class _Lighting:
             rest = columns
             if not light.is_profiled:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
-            elif light_cone.ConeRegions.suit(light) and not isinstance(
-                lobes.at_point, small_lights.ShadowedCosineAtPoint
-            ):
+            elif light_cone.ConeRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
             if rest is not None and len(rest) == 0:
                 continue
@@ -246,6 +252,17 @@ class _Lighting:
                 # Terms that cancel in the Fresnel factor may leave a rest below zero.
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[group, index] += reflected.T
+
+    def _add_skies(self, lobes, sums) -> None:
+        """Add the light of skies to the sums (F, 3, Q) by group."""
+        for sky, light, group in self.lights.skies:
+            allowed = light.receives(self.samples.receiver, lobes.index)
+            chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
+            if lobes.sharpest is None and len(lobes.clip_rows) == 1:
+                normals = self.samples.diffuse_normal[lobes.index[chosen]]
+                sums[group][0][:, chosen] += interpolated(sky.reflected, normals)
+            else:
+                sky.add(lobes, chosen, sums[group])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
         """Add to the sums (F, 3, Q) by group the light of those of many lights that are far away; by number of the
@@ -339,64 +356,6 @@ class _Lighting:
             return Lobe(_columns(samples.diffuse_normal, index))
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
         return Lobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
-
-    def _add_patches(self, lobes, light, group, total) -> None:
-        """Add the patches of a distant light to total (F, 3, Q)."""
-        tree, samples, is_specular = PatchTree.of(light), self.samples, lobes.sharpest is not None
-        names = ("normal", "geometric_normal") if is_specular else ("diffuse_normal", "smooth_normal")
-        columns = np.arange(len(lobes.index))
-        allowed = light.receives(samples.receiver, lobes.index)
-        columns = columns if allowed is None else columns[allowed]
-        horizons = [getattr(samples, name) for name in names]
-        if not is_specular and len(lobes.clip_rows) == 1:
-            total[0][:, columns] += tree.form_factors(samples.diffuse_normal[lobes.index[columns]])
-            return
-        redone = []
-        for chosen, patches in tree.pairs(samples, horizons, lobes.index[columns], is_specular):
-            for part in moments32.pieces(len(chosen), PAIR_CHUNK):
-                column, patch = columns[chosen[part]], patches[part]
-                found, redo = self._patch_integrals(lobes, tree, column, patch)
-                if redo.any():
-                    redone.append((lobes.index[column[redo]], patch[redo]))
-                low = int(column.min())
-                column, radiance = column - low, tree.radiance[:, patch]
-                width = int(column.max()) + 1
-                for integral, target in zip(found, total, strict=True):
-                    for channel in range(3):
-                        target[channel, low : low + width] += np.bincount(column, integral * radiance[channel], width)
-        for members, patches in redone:
-            target = np.zeros((len(samples), 3))
-            float64.shade_patches(samples, members, patches, tree, target, self._shade_one)
-            self.radiance[group] += target.astype(np.float32)
-
-    def _shade_one(self, samples, lights, radiance, _):
-        self.shade_in_float64(samples, lights, radiance)
-
-    def _patch_integrals(self, lobes, tree, column, patch):
-        """Integrals (F, Q) of the lobes `column` (Q,) over one patch each, and the mask (Q,) of those that are left to
-        float64, which are 0."""
-        offset, area = tree.center[:, patch], tree.area_vectors(patch)
-        half_u, half_v = tree.half_u[:, patch], tree.half_v[:, patch]
-        diagonal = dot(half_u, half_u) + dot(half_v, half_v)
-        rays = small_lights.Rays.along(offset, area, diagonal)
-        size = small_lights.seen_sizes(lobes, column, rays, np.sqrt(diagonal))
-        rays = replace(rays, slack=small_lights.VARIATION * size)
-        small, lit = small_lights.small_and_lit(lobes, column, rays, np.sqrt(diagonal), PATCH_SHARE * size)
-        found, redo = np.zeros((len(lobes.colors), len(column)), np.float32), np.zeros(len(column), bool)
-        chosen = np.flatnonzero(lit)
-        if len(chosen):
-            rays = replace(rays.take(chosen), diagonal=diagonal[chosen])
-            found[:, chosen] = lobes.at_point(column[chosen], rays)
-        chosen = np.flatnonzero(~small)
-        if len(chosen):
-            column, patch = column[chosen], patch[chosen]
-            axes = lobes.rows[:, :, column]
-            corners = tree.corners(patch)
-            polygons = np.stack([dot(row[:, None], corners) for row in axes])
-            facing, integrate = np.ones(len(column), bool), partial(lobes.integrate, column)
-            found[:, chosen], redo[chosen] = integrate_visible(polygons, facing, lobes.clip_rows, len(found), integrate)
-            found[:, redo] = 0.0
-        return found, redo
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""

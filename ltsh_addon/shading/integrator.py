@@ -6,7 +6,7 @@ A block is shaded by a `Task`, which is the same in this process and in a worker
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -29,6 +29,8 @@ _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
 _DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
 # About how many patches of a light a sample takes at most.
 PATCHES = 60
+# Half the side of a distant light, by its distance: smaller ones are too small for a `SkyMap`.
+SPOT = 0.3
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,12 @@ class Task:
     def _with_patches(self) -> dict[str, float32.Lights] | None:
         lights = [light for light in self.lights if float64.has_patches(light)]
         return self._by_pass(lights) if lights else None
+
+    def prepare(self) -> None:
+        """Make now what all processes need."""
+        if self.single:
+            for lights in (self._with_patches or {}).values():
+                _ = lights.skies
 
     def _by_pass(self, lights):
         lights = self._prepared(lights)
@@ -214,6 +222,7 @@ def shade(
     if is_own(technique):
         return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype))
     task = _task(tuple(lights), technique, passes, dtype)
+    task.prepare()
     count = len(samples)
     result = _Result(task, count, np.dtype(dtype))
     blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
@@ -313,6 +322,12 @@ def _check_passes(passes) -> None:
         raise ValueError(f"passes are {list(passes)}, expected some of {', '.join(PASSES)}")
 
 
+def _parts(light) -> tuple[AreaLight, ...]:
+    """The patches of a small distant light, each of which gets its own integral; others are whole."""
+    is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
+    return tuple(replace(patch, group=light.group) for patch in light.patches) if is_spot else (light,)
+
+
 def _task(lights, technique, passes, dtype) -> Task:
     _check_passes(passes)
     if np.dtype(dtype) not in (np.float32, np.float64):
@@ -324,6 +339,6 @@ def _task(lights, technique, passes, dtype) -> Task:
         # Workers get this matrix with the table: LAPACK need not give the same last bits in every process.
         _ = table.ridge_weights
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    lights = tuple(light for light in lights if light.area_vector.any())
+    lights = tuple(part for light in lights if light.area_vector.any() for part in _parts(light))
     fast = not isinstance(table, str) and table.degree <= moments32.MAX_DEGREE
     return Task(lights, groups, table, tuple(passes), fast and np.dtype(dtype) == np.float32)

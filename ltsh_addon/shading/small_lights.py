@@ -112,7 +112,7 @@ def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np
     """
     small = size < np.float32(LARGEST)
     lit = rays.flux > 0.0
-    for row, length in zip(lobes.clip_rows, lobes.clip_lengths, strict=True):
+    for row, length in lobes.lengths.items():
         height = dot(lobes.rows[row][:, part], rays.offset)
         small &= np.abs(height) > np.float32(radius) * length[part]
         lit &= height > 0.0
@@ -132,13 +132,18 @@ class CosineAtPoint:
         values /= rays.squares * rays.squares
         return values[None]
 
+    def at_nodes(self, part, nodes, toward):
+        """Values (1, N, ...) of the lobes at unit vectors (3, N, 1) along their axes."""
+        return (nodes[2] * np.float32(1.0 / np.pi))[None]
+
     def integral(self, part, coordinates, weights):
         """Sums (1, Q) over points with coordinates (C, S, T, Q) along the rows of the lobes `part` (Q,): of the lobe by
         the cubed distance times weights that broadcast to (S, T, Q)."""
-        return _sum(self._at(coordinates), weights)[None]
+        return _sum(self.at(coordinates), weights)[None]
 
     @staticmethod
-    def _at(coordinates):
+    def at(coordinates):
+        """The lobe (...) by the cubed distance at coordinates (C, ...)."""
         x, y, z = coordinates[:3]
         squares = x * x
         squares += y * y
@@ -157,10 +162,26 @@ class ShadowedCosineAtPoint:
         self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
 
     def __call__(self, part, rays: Rays):
-        along = np.maximum(dot(self.smooth[:, part], rays.offset), np.float32(1e-15) * rays.distance)
-        tangent2 = np.maximum(rays.squares / (along * along) - np.float32(1.0), np.float32(0.0))
+        along = dot(self.smooth[:, part], rays.offset)
+        return self.plain(part, rays) * self._shadowing(part, along, rays.squares)
+
+    def at_nodes(self, part, nodes, toward):
+        """As of `CosineAtPoint`, with the world directions `toward` (3, N, Q) of the nodes."""
+        along = dot(self.smooth[:, None, part], toward)
+        return self.plain.at_nodes(part, nodes, toward) * self._shadowing(part, along, dot(toward, toward))
+
+    def integral(self, part, coordinates, weights):
+        """As of `CosineAtPoint`; the coordinates are one more, along the smooth normal."""
+        values = self.plain.at(coordinates)
+        values *= self._shadowing(part, coordinates[3], dot(coordinates[:3], coordinates[:3]))
+        return _sum(values, weights)[None]
+
+    def _shadowing(self, part, along, squares):
+        """By the height (...) over the plane of the smooth normal and the squared distance (...)."""
+        along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
+        tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
         shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
-        return self.plain(part, rays) * (np.float32(2.0) / (np.float32(1.0) + shadowing))
+        return np.float32(2.0) / (np.float32(1.0) + shadowing)
 
 
 class LobeAtPoint:
@@ -192,6 +213,18 @@ class LobeAtPoint:
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         self.limits.apply_at_centers(values, part, rays)
+        return values
+
+    def at_nodes(self, part, nodes, toward):
+        """As of `CosineAtPoint`, (F, N, Q) and without limits."""
+        x, y, z = nodes
+        cosine = z * np.float32(1.0 / np.pi)
+        if self.is_cosine:
+            return self.terms[:, :, part] * cosine
+        leaning = None if self.bend is None else self._leaning(x, y, z)
+        values = np.stack([self._value(terms[:, None, part], x, z, leaning) for terms in self.terms])
+        np.maximum(values, np.float32(0.0), out=values)
+        np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         return values
 
     def integral(self, part, coordinates, weights):

@@ -202,14 +202,14 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
 
 
 def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
-    """The warning about reflections so sharp that they show the patches of a world."""
+    """The warning about reflections so sharp that they show how coarse a world is shaded."""
     sharp = shows_patches(samples, lights)
     if not sharp.any():
         return []
     sky = next(light for light in lights if light.is_distant and light.detail and light.affects_specular)
     return [
-        f"world {sky.name!r}: its patches show as facets of a degree or more in reflections sharper than "
-        f"roughness {SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have"
+        f"world {sky.name!r}: it is blurred by a degree or more in reflections sharper than roughness "
+        f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have, and in facets in reference"
     ]
 
 

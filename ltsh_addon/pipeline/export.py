@@ -37,7 +37,7 @@ def export_tables(
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another with -o") from error
+        raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another folder") from error
     files = {}
     for number, (given, table) in enumerate(tables.items(), start=1):
         files[given] = export_table(table, Path(given).stem, prefixes[given], folder)

@@ -102,7 +102,7 @@ def prepare(options) -> dict[str, Shader]:
     try:
         check_takes_files(Path(options.output))
     except OSError as error:
-        problem = f"cannot be written ({error.strerror}); choose another with -o"
+        problem = f"cannot be written ({error.strerror}); choose another folder"
         raise OSError(f"output folder {options.output}: {problem}") from error
     return tables
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
+import queue
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
@@ -22,19 +24,33 @@ from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, Sc
 from ...shading import TableError
 from ..materials.looks import world_radiance
 from ..process import client
+from ..render_settings import picture_size
 from ..saving import save_working_copy
 from ..ui import comparison
+from ..ui.job import (
+    START_SECONDS,
+    STARTING,
+    Plan,
+    Step,
+    finished_steps,
+    progress_text,
+    shading_steps,
+    stage_title,
+)
 from ..ui.preview import ENGINE
 from . import view
 from .view import EngineView
 
-# Share of the progress bar that taking the samples gets.
-EXTRACTION_SHARE = 0.7
 PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
+# Passes of the samples themselves, under Blender's names: channels and type, and the setting of the view layer.
+DEPTH, NORMAL, POSITION = "Depth", "Normal", "Position"
+DATA_PASSES = {DEPTH: ("Z", "VALUE"), NORMAL: ("XYZ", "VECTOR"), POSITION: ("XYZ", "VECTOR")}
+DATA_SETTINGS = {DEPTH: "use_pass_z", NORMAL: "use_pass_normal", POSITION: "use_pass_position"}
+BEHIND = 1e10  # depth of the background, as in Cycles
 EMISSION = "LTSH Emission"
 ASK_SECONDS = 0.05
-# Blender redraws its status bar as often as it is told something.
-REPORT_SECONDS = 0.1
+# A line in the console each.
+REPORT_SECONDS = 1.0
 _logger = logging.getLogger(__name__)
 
 
@@ -100,34 +116,49 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     def _render(self, depsgraph) -> None:
         job = _job_of(self, depsgraph)
         scene_file = saved_copy()
-        picture = stoppable(lambda report: final_picture(job, scene_file, report), self._progress())
+        for name, channels, _ in _passes_of(depsgraph.scene, depsgraph.view_layer):
+            self.add_pass(name, len(channels), channels, layer=job.view_layer)
+        pictures: queue.SimpleQueue = queue.SimpleQueue()
+
+        def show_new() -> None:
+            while not pictures.empty():
+                self._show(pictures.get(), job.view_layer)
+
+        progress = self._progress(Plan(job.steps()), show_new)
+        picture = stoppable(lambda report: final_picture(job, scene_file, report, pictures.put), progress)
         for problem in picture.problems:
             self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:
             self.report({"WARNING"}, warning)
-        for name, channels, _ in _passes_of(depsgraph.scene, depsgraph.view_layer):
-            self.add_pass(name, len(channels), channels, layer=job.view_layer)
+        self._show(picture, job.view_layer)
+        if picture.lights is not None:
+            comparison.mix_render(job.scene, picture.lights)
+
+    def _show(self, picture: FinalPicture, view_layer: str) -> None:
+        """Let Blender have the picture: the last one stays."""
         height, width = picture.combined.shape[:2]
-        result = self.begin_result(0, 0, width, height, layer=job.view_layer)
+        result = self.begin_result(0, 0, width, height, layer=view_layer)
         passes = result.layers[0].passes
         passes["Combined"].rect.foreach_set(blender_pixels(picture.combined))
         for name, image in picture.passes.items():
             if name in passes:
                 passes[name].rect.foreach_set(blender_pixels(image))
         self.end_result(result)
-        if picture.lights is not None:
-            comparison.mix_render(job.scene, picture.lights)
 
-    def _progress(self):
+    def _progress(self, plan: Plan, show_new: Callable[[], None]):
         """A progress callback that shows where the render stands, and stops it when the user does."""
-        last = [0.0]
+        began, told, last = time.monotonic(), [float("-inf")], [("", 0.0)]
 
         def progress(stage: str, fraction: float) -> bool:
+            if (stage, fraction) != last[0]:
+                last[0] = stage, fraction
+                plan.report(stage, fraction)
+            show_new()
+            self.update_progress(plan.share())
             now = time.monotonic()
-            if now - last[0] >= REPORT_SECONDS:
-                last[0] = now
-                self.update_progress(min(max(fraction, 0.0), 1.0))
-                self.update_stats("", f"LTSH: {stage}")
+            if now - told[0] >= REPORT_SECONDS:
+                told[0] = now
+                self.update_stats("", f"LTSH: {stage_title(stage)}  {progress_text(plan, now - began)}")
             return not self.test_break()
 
         return progress
@@ -137,7 +168,8 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
     """Name, channels and type of all passes but Combined."""
     settings = scene.ltsh_view
     if not settings.complete:
-        return [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
+        own = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
+        return own + [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
     own = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
     return own + [one for one in _passes_of_cycles(scene, layer) if one[0] != "Combined"]
 
@@ -160,6 +192,7 @@ def _prefixes(settings) -> list[str]:
 def _job_of(engine, depsgraph) -> FinalJob:
     scene = depsgraph.scene
     settings = scene.ltsh_view
+    camera = None if scene.camera is None else scene.camera.matrix_world.normalized().inverted()
     return FinalJob(
         scene=scene.name,
         view_layer=depsgraph.view_layer.name,
@@ -174,6 +207,9 @@ def _job_of(engine, depsgraph) -> FinalJob:
         cycles_samples=settings.cycles_samples if settings.complete else 0,
         cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
         keeps_lights=scene.ltsh.keep_lights and not engine.is_animation,
+        resolution=picture_size(scene),
+        data_passes=any(getattr(depsgraph.view_layer, name) for name in DATA_SETTINGS.values()),
+        to_camera=None if camera is None else np.array(camera),
     )
 
 
@@ -194,6 +230,19 @@ class FinalJob:
     cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
     cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
     keeps_lights: bool = False  # for the light mixer
+    resolution: tuple[int, int] = (1920, 1080)  # about, for the time that it takes
+    data_passes: bool = False  # also those of `DATA_PASSES`
+    to_camera: np.ndarray | None = None  # (4, 4) from the world; None: no depth
+
+    def steps(self) -> list[Step]:
+        """What the render goes through."""
+        pixels, techniques = 1e-6 * math.prod(self.resolution), dict.fromkeys(self.shaded_as().values())
+        # What is not direct light has shadows in any case.
+        shadows = self.shadows == "on" or self.cycles_samples > 0
+        sampling, shading = shading_steps(pixels * self.sub_samples, self.sub_samples, shadows, techniques)
+        rest = finished_steps(pixels, self.cycles_samples) if self.cycles_samples else []
+        rest += [Step("lights", shading[-1].cost)] if self.keeps_lights else []
+        return [Step(STARTING, START_SECONDS), *sampling, *shading, *rest]
 
     def shaded_as(self) -> dict[str, str]:
         """Names of passes start with -> technique."""
@@ -216,10 +265,13 @@ class FinalPicture:
     lights: LightPictures | None = None
 
 
-def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
+def final_picture(
+    job: FinalJob, scene_file: Path, progress: Progress, show: Callable[[FinalPicture], None] = lambda picture: None
+) -> FinalPicture:
     """Take samples of the .blend `scene_file` and shade them. Uses no bpy.
 
-    `progress(stage, fraction of the whole)` returns False to stop. Raises SceneError, TableError, Cancelled, OSError.
+    `progress(stage, fraction of the stage)` returns False to stop; `show` gets the picture whenever more of it is
+    there. Raises SceneError, TableError, Cancelled, OSError.
     """
     if job.cycles_samples:
         return _complete_picture(job, scene_file, progress)
@@ -232,37 +284,56 @@ def final_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalP
         emission=True,
         shadows=job.shadows,
     )
-    extraction = client.extract(options, progress=_part(progress, 0.0, EXTRACTION_SHARE))
-    names = list(dict.fromkeys(job.shaded_as().values()))
-    share, start = (1.0 - EXTRACTION_SHARE) / (len(names) + 1 + job.keeps_lights), EXTRACTION_SHARE
-    shadows, warnings = None, extraction.warnings
-    if extraction.occluders is not None:
-        shadows = trace_shadows(extraction, PASSES, job.shadow_rays, _part(progress, start, share))
-        warnings += shadows.warnings
-    images = {
-        name: _images(extraction, name, shadows, _part(progress, start + (index + 1) * share, share))
-        for index, name in enumerate(names)
-    }
-    passes = {
-        f"{prefix} {label}": images[name][part]
-        for prefix, name in job.shaded_as().items()
-        for part, label in PASS_LABELS.items()
-    }
+    extraction = client.extract(options, progress=progress)
     emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
-    passes[EMISSION] = emission
-    shown = PASSES if job.shown == "combined" else (job.shown,)
-    color = sum(images[job.technique][part] for part in shown)
-    if job.shown == "combined":
-        color = color + emission
     coverage = inside_border(extraction.film.coverage(), extraction.border)
-    combined = _over_background(color, coverage, job, extraction.exposure)
-    lights = None
-    if job.keeps_lights:
-        glow = extraction.exposure * extraction.emission * (job.shown == "combined")
-        rest = _over_background(glow, extraction.film.coverage(), job, extraction.exposure)
-        kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
-        lights = light_pictures(kept, _part(progress, 1.0 - share, share))
-    return FinalPicture(combined, passes, warnings, extraction.problems, lights)
+    passes, warnings = {EMISSION: emission}, extraction.warnings
+    if job.data_passes:
+        passes |= data_passes(extraction, job.to_camera)
+
+    def picture() -> FinalPicture:
+        """What there is so far."""
+        shown = PASSES if job.shown == "combined" else (job.shown,)
+        color = emission if job.shown == "combined" else np.zeros_like(emission)
+        color = sum((passes[name] for part in shown if (name := f"LTSH {PASS_LABELS[part]}") in passes), color)
+        combined = _over_background(color, coverage, job, extraction.exposure)
+        return FinalPicture(combined, dict(passes), warnings, extraction.problems)
+
+    show(picture())
+    shadows = None
+    if extraction.occluders is not None:
+        shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
+        warnings += shadows.warnings
+    for technique in dict.fromkeys(job.shaded_as().values()):
+        for number, part in enumerate(PASSES):
+            image = _image(extraction, technique, part, shadows, _part(progress, number / len(PASSES), 1 / len(PASSES)))
+            prefixes = [prefix for prefix, name in job.shaded_as().items() if name == technique]
+            passes.update({f"{prefix} {PASS_LABELS[part]}": image for prefix in prefixes})
+            show(picture())
+    if not job.keeps_lights:
+        return picture()
+    shown = PASSES if job.shown == "combined" else (job.shown,)
+    glow = extraction.exposure * extraction.emission * (job.shown == "combined")
+    rest = _over_background(glow, extraction.film.coverage(), job, extraction.exposure)
+    kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
+    return replace(picture(), lights=light_pictures(kept, progress))
+
+
+def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Depth (H, W, 1), normal and position (H, W, 3) of what the samples see, as Cycles has them: of the first hit of a
+    pixel, but for the normal, which is the mean. Depth is that of the camera `to_camera` (4, 4) is for."""
+    film, samples = extraction.film, extraction.samples
+    weight = np.ones(len(samples)) if film.first is None else film.first.astype(float)
+    normal = film.image(samples.normal * weight[:, None])
+    pixel, first = np.unique(film.pixel, return_index=True)
+    position = np.zeros((film.width * film.height, 3))
+    position[pixel] = samples.position[first]
+    found = {NORMAL: normal, POSITION: position.reshape(film.height, film.width, 3)}
+    if to_camera is not None:
+        depth = np.full(film.width * film.height, BEHIND)
+        depth[pixel] = -(samples.position[first] @ to_camera[2, :3] + to_camera[2, 3])
+        found[DEPTH] = depth.reshape(film.height, film.width, 1)
+    return {name: inside_border(image, extraction.border) for name, image in found.items()}
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
@@ -301,22 +372,17 @@ def _part(progress: Progress, start: float, share: float) -> Progress:
     return lambda stage, fraction: progress(stage, start + share * fraction)
 
 
-def _images(extraction, technique: str, shadows, progress: Progress) -> dict[str, np.ndarray]:
-    """Radiance (H, W, 3) of each pass times the film's exposure."""
-    images = {}
-    for index, name in enumerate(PASSES):
-        part = _part(progress, index / len(PASSES), 1.0 / len(PASSES))
-        (lit,) = shade_lights(
-            extraction.samples,
-            extraction.lights,
-            technique,
-            (name,),
-            (shadows,),
-            progress=lambda fraction, part=part: part(TECHNIQUES[technique].label, fraction),
-        )
-        image = extraction.film.image(extraction.exposure * lit.combined)
-        images[name] = inside_border(image, extraction.border)
-    return images
+def _image(extraction, technique: str, part: str, shadows, progress: Progress) -> np.ndarray:
+    """Radiance (H, W, 3) of a pass times the film's exposure."""
+    (lit,) = shade_lights(
+        extraction.samples,
+        extraction.lights,
+        technique,
+        (part,),
+        (shadows,),
+        progress=lambda fraction: progress(TECHNIQUES[technique].title, fraction),
+    )
+    return inside_border(extraction.film.image(extraction.exposure * lit.combined), extraction.border)
 
 
 def _over_background(color: np.ndarray, coverage: np.ndarray, job: FinalJob, exposure: float) -> np.ndarray:

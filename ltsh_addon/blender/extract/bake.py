@@ -137,7 +137,7 @@ def _read(ob, mesh, matrix, uv_name):
     if layer is None:
         names = ", ".join(repr(other.name) for other in mesh.uv_layers) or "none"
         wanted = f"no UV map {uv_name!r}" if uv_name else "no UV map"
-        raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or name another with --uv")
+        raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or choose another UV map")
     loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
     positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
     normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)

@@ -56,7 +56,7 @@ BSDFS = {
         not_shaded={
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
             "Anisotropic": AS_ZERO,
-            "Transmission Weight": (0.0, "lets no light through, only the reflection is shaded"),
+            "Transmission Weight": (0.0, "lets no light through: only the reflection is shaded"),
             "Thin Wall": (0.0, "is shaded as off"),
             "Thin Film Thickness": AS_ZERO,
         },
@@ -67,7 +67,7 @@ BSDFS = {
     (GLASS, ""): Bsdf(
         "glass",
         {**COLOR, **ROUGHNESS, "ior": "IOR"},
-        "lets no light through, only its reflection is shaded",
+        "lets no light through: only its reflection is shaded",
         {"Thin Film Thickness": AS_ZERO},
     ),
     (METALLIC, "F82"): Bsdf("metal", {**ROUGHNESS, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),

@@ -26,7 +26,7 @@ from . import preflight
 from .settings import preferences
 
 STARTING = "Starting"
-SURE_SECONDS = 3.0  # before, nobody knows how long it will take
+SURE_SECONDS = 3.0
 SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
 ENDING_SECONDS = 10.0
 NO_CYCLES = "Not complete: without Cycles"
@@ -36,6 +36,8 @@ STAGE_TITLES = {
     "samples": "Sample Surfaces",
     "Cycles A": "Cycles, First Half",
     "Cycles B": "Cycles, Second Half",
+    "shadows": "Trace Shadows",
+    "denoise": "Denoise",
     **{technique.title: technique.label for technique in TECHNIQUES.values()},
     "write": "Write Files",
     "images": "Make Pictures",
@@ -51,7 +53,8 @@ MOST = 0.99
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
 SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, "ltsh4c": 7.5, REFERENCE: 100.0}
-SHADOW_SECONDS = 8.0
+SHADOW_SECONDS, DENOISE_SECONDS = 8.0, 4.0
+PATHS = 2.0  # a sample of all light costs so many of direct light
 REFERENCE_POINTS = 0.15
 
 
@@ -160,15 +163,33 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     pixels = 1e-6 * math.prod(options.resolution)
     points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
     half = rendered + SAMPLE_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
+    sampling, shading = shading_steps(points, options.sub_samples, options.shadows == "on", options.techniques)
     return [
-        Step("open scene", OPEN_SECONDS),
-        Step("samples", rendered + SAMPLE_SECONDS * points),
+        *sampling,
         *(Step(f"Cycles {name}", half) for name in ("A", "B") if with_cycles),
-        *([Step("shadows", SHADOW_SECONDS * points)] if options.shadows == "on" else []),
-        *(Step(TECHNIQUES[name].title, _shading(name, points)) for name in options.techniques),
+        *shading,
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
         *([Step("lights", _shading("ltsh4", points))] if options.keep_visibility else []),
+    ]
+
+
+def shading_steps(points: float, sub_samples: int, shadows: bool, techniques) -> tuple[list[Step], list[Step]]:
+    """How so many million points are sampled, and how they are shaded."""
+    sampling = [
+        Step("open scene", OPEN_SECONDS),
+        Step("samples", RENDER_SECONDS * sub_samples + SAMPLE_SECONDS * points),
+    ]
+    shading = [Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques]
+    return sampling, [*([Step("shadows", SHADOW_SECONDS * points)] if shadows else []), *shading]
+
+
+def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
+    """How Cycles adds the rest to a picture of so many million pixels."""
+    return [
+        Step("open scene", OPEN_SECONDS),
+        Step("Cycles", RENDER_SECONDS + PATHS * SAMPLE_SECONDS * pixels * cycles_samples),
+        Step("denoise", DENOISE_SECONDS * pixels),
     ]
 
 
@@ -357,10 +378,6 @@ class Job:
 
     # -- what is shown ------------------------------------------------------------------------------------------------
 
-    def seconds_left(self) -> float | None:
-        """Until the end; None where nothing can be said yet."""
-        return None if self.seconds() < SURE_SECONDS else self.plan.seconds_left()
-
     def seconds(self) -> float:
         """Since the start."""
         return time.monotonic() - self.started
@@ -384,13 +401,13 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def stage_title(job: Job) -> str:
-    """What the job does now."""
-    return translated(STAGE_TITLES.get(job.stage, job.stage))
+def stage_title(stage: str) -> str:
+    """What a job does in that stage."""
+    return translated(STAGE_TITLES.get(stage, stage))
 
 
-def progress_text(job: Job) -> str:
-    """Percent and time left of the whole job."""
-    text = f"{100.0 * job.plan.share():.0f} %"
-    left = job.seconds_left()
-    return text if left is None else f"{text}, {clock(left)} {translated('left')}"
+def progress_text(plan: Plan, seconds: float) -> str:
+    """Percent and time left of a whole job that began so many seconds ago."""
+    text = f"{100.0 * plan.share():.0f} %"
+    # Before, nobody knows how long it will take.
+    return text if seconds < SURE_SECONDS else f"{text}, {clock(plan.seconds_left())} {translated('left')}"

@@ -126,7 +126,7 @@ class _JobOperator:
     def _show_progress(self, context) -> None:
         """Draw progress again where it has changed, at most a few times per second."""
         job = self._job
-        done = f"{job.title}: {stage_title(job)}  {progress_text(job)}"
+        done = f"{job.title}: {stage_title(job.stage)}  {progress_text(job.plan, job.seconds())}"
         text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
         shown = text, clock(job.seconds())
         if shown != self._progress:

@@ -18,7 +18,7 @@ LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
 MARGIN_PIXELS = 70.0  # icon, scroll bar and borders
 BUTTON_PIXELS = 50.0  # of a button beside text, without its label
 TEXT_PIXELS = 110.0  # the least width of text beside a button
-TOGGLE_PIXELS = 85.0
+TOGGLE_PIXELS, SHORT_PIXELS = 85.0, 62.0  # of a button, of one with a short name
 SPLIT_PIXELS = 250.0
 
 
@@ -59,9 +59,9 @@ def _draw_problem(layout, context, problem) -> None:
             setattr(fix, name, value)
 
 
-def toggles(layout, context, count: int):
-    """A layout for `count` buttons of a set of choices: one row where they fit, else two columns."""
-    fits = region_width(context) >= TOGGLE_PIXELS * count
+def toggles(layout, context, count: int, width: float = TOGGLE_PIXELS):
+    """A layout for `count` buttons of a set of choices, each so wide: one row where they fit, else two columns."""
+    fits = region_width(context) >= width * count
     return layout.grid_flow(row_major=True, columns=count if fits else 2, even_columns=True, align=True)
 
 
@@ -85,9 +85,9 @@ def draw_job(layout) -> bool:
     row = column.row()
     row.label(text=job.title, icon="RENDER_STILL")
     draw_right(row, clock(job.seconds()))
-    column.progress(factor=job.plan.share(), text=progress_text(job))
+    column.progress(factor=job.plan.share(), text=progress_text(job.plan, job.seconds()))
     row = gray(column)
-    row.label(text=stage_title(job), translate=False)
+    row.label(text=stage_title(job.stage), translate=False)
     draw_right(row, f"{job.plan.number} / {job.plan.count}")
     column.operator("ltsh.cancel", text="Cancel", icon="X")
     return True
@@ -163,7 +163,7 @@ def draw_view_settings(layout, context) -> None:
     """What shades, and what of it is seen where the engine is ours."""
     scene, view = context.scene, context.scene.ltsh_view
     column = layout.column()
-    toggles(column, context, 3).prop(view, "technique", expand=True)
+    toggles(column, context, 4, SHORT_PIXELS).prop(view, "technique", expand=True)
     if scene.render.engine == ENGINE:
         toggles(column, context, 3).prop(view, "shown", expand=True)
         toggles(column, context, 3).prop(view, "mode", expand=True)
@@ -243,14 +243,12 @@ class _Final:
         return context.scene.render.engine == ENGINE
 
     def draw(self, context):
-        draw_final_settings(self.layout, context.scene)
-
-
-def draw_final_settings(layout, scene) -> None:
-    """What F12 renders with our engine."""
-    view = scene.ltsh_view
-    layout.prop(view, "complete")
-    layout.prop(view, "cycles_samples" if view.complete else "technique_passes")
+        layout, view, layer = self.layout, context.scene.ltsh_view, context.view_layer
+        layout.prop(view, "complete")
+        layout.prop(view, "cycles_samples" if view.complete else "technique_passes")
+        row = layout.row(align=True)
+        for name, label in (("use_pass_z", "Depth"), ("use_pass_normal", "Normal"), ("use_pass_position", "Position")):
+            row.prop(layer, name, text=label, toggle=True)
 
 
 class _Quality:

@@ -3,6 +3,7 @@
 import tempfile
 import threading
 import time
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -18,6 +19,7 @@ from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.ui import results
+from ltsh_addon.blender.ui.job import STARTING, Plan
 from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
@@ -254,7 +256,7 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
         asked.append(stage)
         return False
 
-    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_progress", lambda self: stop)
+    monkeypatch.setattr(render_module.LTSH_RenderEngine, "_progress", lambda self, *plan: stop)
     monkeypatch.setattr(render_module.LTSH_RenderEngine, "_fail", lambda self, error: failures.append(error))
     bpy.ops.render.render()
     assert asked and not failures
@@ -266,15 +268,79 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
     assert not any(tmp_path.glob("ltsh-*"))
 
 
-def test_progress_grows_to_the_end_and_can_stop(scene, tmp_path):
-    path, stages = parts.save(tmp_path / "scene.blend"), []
-    job = render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", ("ltc", "ltsh4"))
-    render_module.final_picture(job, path, lambda stage, fraction: stages.append((fraction, stage)))
-    fractions = [fraction for fraction, _ in stages]
-    assert fractions == sorted(fractions) and fractions[0] >= 0.0 and 0.9 < fractions[-1] <= 1.0
-    assert {"LTC", "LTSH 2", "LTSH 4", "LTSH 4c"} <= {stage for _, stage in stages}
+def final_job(scene, **options):
+    return render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", **options)
+
+
+def test_progress_follows_the_plan_to_its_end_and_can_stop(scene, tmp_path):
+    path, stages = parts.save(tmp_path / "scene.blend"), {}
+    job = final_job(scene, other_techniques=("ltc", "ltsh4"), shadows="on", shadow_rays=8)
+    plan, shares = Plan(job.steps()), []
+
+    def progress(stage, fraction):
+        stages.setdefault(stage, []).append(fraction)
+        plan.report(stage, fraction)
+        shares.append(plan.share())
+
+    render_module.final_picture(job, path, progress)
+    assert [STARTING, *stages] == [step.stage for step in job.steps()]
+    for fractions in stages.values():
+        assert fractions == sorted(fractions) and 0.0 <= fractions[0] <= fractions[-1] <= 1.0
+    assert shares == sorted(shares) and plan.number == plan.count
     with pytest.raises(Cancelled):
-        render_module.final_picture(job, path, lambda stage, fraction: fraction < 0.9)
+        render_module.final_picture(job, path, lambda stage, fraction: stage != "LTSH N=4")
+
+
+def test_the_picture_is_shown_as_its_passes_come(scene, tmp_path):
+    path, shown = parts.save(tmp_path / "scene.blend"), []
+    job = final_job(scene, background=np.array([0.1, 0.2, 0.3]))
+    whole = render_module.final_picture(job, path, lambda stage, fraction: True, shown.append)
+    assert [len(picture.passes) for picture in shown] == [1, 2, 3]
+    for earlier, name in zip(shown, ("LTSH Specular", "LTSH Diffuse"), strict=False):
+        assert name not in earlier.passes
+    left_out = whole.combined[..., :3] - shown[1].combined[..., :3]
+    np.testing.assert_allclose(left_out, whole.passes["LTSH Diffuse"], **SAME)
+    np.testing.assert_array_equal(shown[-1].combined, whole.combined)
+
+
+def test_a_render_tells_a_line_a_second_and_shows_every_picture(scene, monkeypatch):
+    told, pictures, now = [], [], [100.0]
+    engine = SimpleNamespace(update_progress=told.append, update_stats=lambda first, text: told.append(text),
+                             test_break=lambda: False)  # fmt: skip
+    monkeypatch.setattr(render_module.time, "monotonic", lambda: now[0])
+    plan = Plan(final_job(scene).steps(), now=lambda: now[0])
+    progress = render_module.LTSH_RenderEngine._progress(engine, plan, lambda: pictures.append(now[0]))
+    for _ in range(200):
+        now[0] += 0.05
+        assert progress("samples", 0.5) is True
+    lines = [text for text in told if isinstance(text, str)]
+    assert len(lines) in (10, 11) and len(pictures) == 200
+    # Half of the samples took 10 s by now: as long again, and the shading of some pixels.
+    assert lines[-1].startswith("LTSH: Sample Surfaces  ") and "left" in lines[-1] and " %" in lines[-1]
+
+
+def test_depth_normal_and_position_are_those_of_cycles(scene, tmp_path):
+    layer = bpy.context.view_layer
+    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_position = True
+    found = render_passes(scene, tmp_path / "ours.exr")
+    scene.render.engine = "CYCLES"
+    # Pixel centers, as one point per pixel has them.
+    scene.cycles.samples, scene.cycles.pixel_filter_type, scene.cycles.filter_width = 1, "BLACKMAN_HARRIS", 0.01
+    scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
+    expected = render_passes(scene, tmp_path / "cycles.exr")
+
+    def layer_of(channels, name):
+        keys = sorted(key for key in channels if key.startswith(f"ViewLayer.{name}."))
+        return np.stack([channels[key] for key in keys], axis=-1)
+
+    hit = layer_of(expected, "Depth")[..., 0] < 1e9
+    assert 0.3 < hit.mean()
+    for name in ("Depth", "Normal", "Position"):
+        ours, theirs = layer_of(found, name), layer_of(expected, name)
+        assert ours.shape == theirs.shape
+        # Of pixels that an edge crosses, rounding decides.
+        off = np.abs(ours - theirs).max(axis=-1) > 1e-3 * max(1.0, np.abs(theirs[hit]).max())
+        assert off.mean() < 0.02, name
 
 
 @pytest.mark.parametrize(

@@ -145,7 +145,7 @@ def test_scenes_that_cannot_be_baked_say_why(tmp_path):
         baked(path, tmp_path / "out", objects=("Wall",))
     report, _ = baked(path, tmp_path / "out", uv="Lightmap")
     assert report["problems"] == [
-        "object 'Plane' has no UV map 'Lightmap', found 'UVMap': unwrap it, or name another with --uv"
+        "object 'Plane' has no UV map 'Lightmap', found 'UVMap': unwrap it, or choose another UV map"
     ]
     with pytest.raises(ValueError, match="size is 32x8192, expected 64 to 8192 each"):
         baked(path, tmp_path / "out", size=(32, 8192))

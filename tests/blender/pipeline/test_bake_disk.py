@@ -116,7 +116,7 @@ def test_a_read_only_disk_is_named_before_anything_starts(scene, small_disk, cap
     start = "ltsh_addon.blender.process.blender_process.start"
     monkeypatch.setattr(start, lambda *_: pytest.fail("Blender was started"))
     assert cli.main([command, str(scene), "-o", str(small_disk / "out"), "--quiet"]) == 1
-    expected = f"output folder {small_disk}/out: cannot be written (Read-only file system); choose another with -o"
+    expected = f"output folder {small_disk}/out: cannot be written (Read-only file system); choose another folder"
     assert capsys.readouterr().err == f"ltsh: {expected}\n"
 
 

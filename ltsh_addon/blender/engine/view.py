@@ -126,7 +126,8 @@ class EngineView:
         if not error and not self.mirror.lights and not self.mirror.sky.sides:
             notes = [NO_LIGHTS, *notes]
         show(region, error, [*notes, *self.mirror.notes, *self._notes_of_shadows(size)], captions)
-        if not error and self._renderer.samples < REFINEMENTS:
+        is_waiting = self._renderer is not None and self._renderer.shadows is not None and self._shadows.waits
+        if not error and self._renderer.samples < REFINEMENTS and not is_waiting:
             _redraw_later(start, self._renderer.samples)
         _drawn[0] = time.monotonic()
         if self._shadows.is_busy and not bpy.app.timers.is_registered(_look_for_shadows):

@@ -217,8 +217,8 @@ class ViewRenderer:
             self.samples = 0
         if self.samples < len(points):
             self._still = None  # until all of the sample is there
-            self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
-            self._still, self.samples = still, self.samples + 1
+            is_drawn = self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
+            self._still, self.samples = still, self.samples + is_drawn
         self._show([self._targets[number][0] for number in range(pictures)], view, shown, frame_buffer)
 
     def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
@@ -235,8 +235,11 @@ class ViewRenderer:
 
     def _draw_sample(
         self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool
-    ) -> None:
-        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all."""
+    ) -> bool:
+        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all.
+
+        False: it was not drawn, since its shadows are on their way.
+        """
         surfaces_changed = self._draw_surfaces(mirror, view, size)
         lights_changed = self._upload_lights(mirror, view, world)
         layers = [self._surfaces, self._glass] if mirror.has_glass else [self._surfaces]
@@ -246,11 +249,13 @@ class ViewRenderer:
         targets = [self._target(self._targets, number, size) for number in range(len(wanted))]
         first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
         if not mirror.has_glass:
-            self._light(self._surfaces, wanted, targets, (mirror, view), first)
+            if not self._light(self._surfaces, wanted, targets, (mirror, view), first):
+                return False
             self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
-            return
+            return True
         behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
-        self._light(self._surfaces, wanted, behind, (mirror, view), "NONE")
+        if not self._light(self._surfaces, wanted, behind, (mirror, view), "NONE"):
+            return False
         self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
         through = self._glass.through(mirror.instances, view)
         glass = self._glass.lobe(0, mirror, view, self._lights).position
@@ -259,6 +264,7 @@ class ViewRenderer:
             self._veil.draw((texture, through, glass, self._background), target, view, is_seen, first)
         self._light(self._glass, wanted, targets, (mirror, view), "ADDITIVE")
         self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
+        return True
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
         """Draw the G-buffers if anything has changed, and tell that."""
@@ -294,9 +300,9 @@ class ViewRenderer:
         self._uploaded = lights, wanted, view.origin
         return True
 
-    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> None:
+    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> bool:
         """Light a layer into the buffers of techniques and passes, with the blending `first`, as of a `seen` mirror and
-        view; surfaces and shadows of a lobe are those of all."""
+        view; surfaces and shadows of a lobe are those of all. False where shadows have to be waited for."""
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
@@ -305,14 +311,18 @@ class ViewRenderer:
         shadows = None if layer is self._glass and isinstance(self.shadows, LiveShadows) else self.shadows
         for lighting in lightings:
             lighting.number = self.samples
+        shares = None
         for number in range(max(mirror.most_lobes, 1)):
             gbuffer = layer.lobe(number, mirror, view, self._lights)
-            if shadows is not None:
+            if shadows is not None and (number == 0 or shadows.traces_lobes):
                 whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
                 shares = shadows.shares(whole, view, self._lights.lights, sides, self.samples)
-                gbuffer = replace(gbuffer, shares=shares)
+                if shadows.waits:
+                    return False
+            gbuffer = replace(gbuffer, shares=shares)
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
+        return True
 
     def _add_emission(self, layer: _Layer, wanted, buffers, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen

@@ -43,7 +43,7 @@ class _Tracing:
 class ShadowRays:
     """Traces the shares of lights that the pixels of G-buffers see past `occluders`, with at most `rays` for each."""
 
-    version = 0
+    version, waits, traces_lobes = 0, False, True
 
     def take_news(self) -> None:
         """There are none: all is traced at once."""
@@ -93,8 +93,10 @@ def _upload(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
 
 # What is traced one after another while nothing changes: pixels between points in either direction (None: so many that
 # there are `COARSE_POINTS`), and rays of a light and a point.
-LEVELS = ((None, 8), (1, 32), (1, 256))
+LEVELS = ((None, 8), (1, 32))
 COARSE_POINTS = 8000
+# Then the further points of pixels get rays of their own, so many of them together: new rays from new places.
+GROUP, GROUP_RAYS = 4, 64
 # Occluders that take longer to collect are collected when no object moves any more.
 QUICK_SECONDS = 0.03
 
@@ -105,7 +107,8 @@ class _Request:
     counts as one light are the sides of a sky."""
 
     state: tuple
-    level: int
+    level: int  # of LEVELS, or the next one: for a group of points
+    group: int
     numbers: tuple
     keys: tuple
     lights: tuple[Lights, ...]
@@ -136,11 +139,16 @@ class _Request:
 class LiveShadows:
     """Shadows while an artist works: a thread traces them, coarse at first, finer while nothing changes.
 
-    Until new ones are there, the old ones are seen where the same surfaces are. Recoloring a light traces nothing.
+    Until new ones are there, the old ones are seen where the same surfaces are. Recoloring a light traces nothing but
+    what refines the view at rest.
     """
+
+    traces_lobes = False  # all lobes have the shadows of the first
 
     def __init__(self):
         self.version, self.problem = 0, ""
+        self.waits = False  # for the thread: the picture for which shares were asked last cannot be drawn yet
+        self._own: tuple[int, ShareGrid | None] = (0, None)  # of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._request: _Request | None = None
@@ -186,7 +194,15 @@ class LiveShadows:
         if not self.has_news:
             return
         request, outcome, self._thread = self._request, self._outcome, None
-        self.version += 1
+        is_own = request.level == len(LEVELS)
+        if is_own and not isinstance(outcome, Exception):
+            if (request.state, request.keys) == (self._wanted, self._keys):
+                height, width = outcome.shape[1:3]
+                positions, projection = self._new_points
+                grid = ShareGrid(_upload(outcome, (width, height)), float_texture(positions), projection)
+                self._own = request.group, grid
+            return
+        self.version += not (is_own and isinstance(outcome, Cancelled))
         if isinstance(outcome, Exception):
             self.problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
             return
@@ -214,6 +230,8 @@ class LiveShadows:
                 self._show()
         if number == 0:
             self._wanted = (self._scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
+            self._own = (0, None)
+        self.waits = False
         level = self._next_level()
         if self._thread is None and level is not None and self._may_begin(level, number):
             try:
@@ -222,12 +240,22 @@ class LiveShadows:
                 self.problem = f"shadows: {error_line(error)}"
         elif self._thread is not None and self._request.level > 0 and self._request.state != self._wanted:
             self._stop.set()
+        if number > 0 and not self._is_off:
+            if number // GROUP == self._own[0] and self._own[1] is not None:
+                return self._own[1]
+            if self._thread is None and level is None and number >= GROUP:
+                self._begin_own(number // GROUP, gbuffer, view)
+            self.waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         return self._grid if fits else None
 
+    @property
+    def _is_off(self) -> bool:
+        return not self._keys or bool(self.problem) or bool(too_many(len(self._keys), self._wanted[-1]))
+
     def _next_level(self) -> int | None:
         """The coarsest level that a light does not have for what is wanted; None: all is there."""
-        if not self._keys or self.problem or too_many(len(self._keys), self._wanted[-1]):
+        if self._is_off:
             return None
         if self._state != self._wanted:
             return 0
@@ -251,10 +279,19 @@ class LiveShadows:
         known = self._known if self._wanted == self._state else {}
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
         step, rays = LEVELS[level]
-        samples, film, self._new_points = _every(step or coarse_step(gbuffer.size), gbuffer, view)
+        self._start(level, numbers, (step or coarse_step(gbuffer.size), rays), gbuffer, view)
+
+    def _begin_own(self, group: int, gbuffer: GBufferTextures, view: View) -> None:
+        self._start(len(LEVELS), tuple(range(len(self._keys))), (1, GROUP_RAYS), gbuffer, view, group)
+
+    def _start(self, level: int, numbers: tuple, effort: tuple[int, int], gbuffer, view: View, group: int = 0) -> None:
+        """Let the thread trace lights with an effort: every so many pixels, so many rays."""
+        step, rays = effort
+        samples, film, self._new_points = _every(step, gbuffer, view)
         self._request = _Request(
             state=self._wanted,
             level=level,
+            group=group,
             numbers=numbers,
             keys=tuple(self._keys[n] for n in numbers),
             lights=tuple(self._lights[n] for n in numbers),

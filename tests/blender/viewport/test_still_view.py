@@ -196,12 +196,12 @@ class LiveView:
         self.view = view_of_camera(self.camera, self.depsgraph, SIZE)
         self.live = LiveShadows()
 
-    def drawn(self, shadows):
+    def drawn(self, shadows, points=CENTERS):
         """The diffuse picture (H, W, 3)."""
         self.live.follow((0,), self.occluders)
         self.renderer.shadows = shadows
         shown = ShownPicture("ltsh4", "diffuse", "single", "ltc", 0.5, 1.0, 1.0, True)
-        self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer)
+        self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer, points)
         return self.renderer.read()[..., :3].astype(np.float64)
 
     def occluders(self):
@@ -219,7 +219,7 @@ def live_pictures():
     try:
         plain, exact = scene.drawn(None), scene.drawn(ShadowRays(scene.occluders(), 256))
         first = scene.drawn(scene.live)
-        levels = [scene.traced() for _ in range(3)]
+        levels = [scene.traced() for _ in range(2)]
         rest = scene.live.is_busy
         lights = scene.mirror.lights
         scene.mirror.lights = tuple(replace(light, radiance=2.0 * light.radiance) for light in lights)
@@ -245,14 +245,47 @@ def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
     plain, exact, first, levels, rest, (recolored, traces), after_move, problem = with_graphics(live_pictures)
     np.testing.assert_array_equal(first, plain)
     without = relative(plain, exact)
-    coarse, fine, finest = (relative(picture, exact) for picture, _, _ in levels)
+    coarse, fine = (relative(picture, exact) for picture, _, _ in levels)
     # Two lights, and the two sides of the sign.
-    assert [(numbers, level) for _, numbers, level in levels] == [((0, 1, 2, 3), level) for level in range(3)]
+    assert [(numbers, level) for _, numbers, level in levels] == [((0, 1, 2, 3), level) for level in range(2)]
     assert without > 0.1 and coarse < 0.7 * without and fine < 0.05 and fine < coarse
-    # Half precision, and the same rays.
-    assert finest < 1e-3
     assert not rest and not traces, "at rest, and for other colors, nothing is traced"
     np.testing.assert_allclose(recolored, 2.0 * levels[-1][0], rtol=1e-3, atol=1e-5)
     # Of the other lights all is known.
     assert after_move == ((0,), 0)
     assert problem == "shadows: division by zero"
+
+
+def refined_pictures():
+    """A view at rest with live shadows: its picture, how many points it has, how often it waited, its versions and
+    points over time, and what many rays at every point give."""
+    scene, points = LiveView(), filter_points("BLACKMAN_HARRIS", 1.5, 12)
+    try:
+        waited, versions = 0, []
+        for _ in range(80):
+            live = scene.drawn(scene.live, points)
+            versions.append((scene.live.version, scene.renderer.samples))
+            if scene.live._thread is not None:
+                waited += scene.live.waits and scene.live._request.level == 2
+                scene.live._thread.join()
+            elif scene.renderer.samples == len(points):
+                break
+        samples, rays = scene.renderer.samples, ShadowRays(scene.occluders(), 256)
+        for _ in points:
+            exact = scene.drawn(rays, points)
+        return live, samples, waited, versions, exact
+    finally:
+        scene.live.stop()
+        scene.renderer.free()
+
+
+@edits_with_graphics
+def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
+    live, samples, waited, versions, exact = with_graphics(refined_pictures)
+    assert samples == 12
+    # The first four points have the shadows of the centers, the others those of their groups: each waits once.
+    assert waited == 2
+    # But for the two levels at the start, no picture has fewer points than the one before.
+    counts = [count for version, count in versions if version == 2]
+    assert versions[-1][0] == 2 and counts == sorted(counts)
+    assert relative(live, exact) < 0.02

@@ -306,7 +306,9 @@ def round_outline(count: int) -> np.ndarray:
 
 
 # Fields of SurfaceSamples with one number per sample; all others are vectors or colors.
-SCALAR_FIELDS = ("roughness", "ior", "bump_alpha2", "receiver", "diffuse_roughness", "sheen_a", "sheen_b")
+SCALAR_FIELDS = (
+    "roughness", "ior", "bump_alpha2", "receiver", "diffuse_roughness", "sheen_a", "sheen_b", "anisotropy",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -322,7 +324,8 @@ class SurfaceSamples:
     bump-mapped diffuse lobe at the horizon of the smooth normal; toward that it is shadowed by
     2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)), theta_i the angle of the light from the smooth normal (Estevez,
     Lecocq and Stein 2019). The diffuse lobe is Lambert's, but that of a rough surface where there is a
-    `diffuse_roughness`, and that of sheen where there is a `sheen_a` (see `shading.diffuse`).
+    `diffuse_roughness`, and that of sheen where there is a `sheen_a` (see `shading.diffuse`). With an `anisotropy` the
+    alpha of GGX is roughness^2 / (1 - anisotropy) along the `tangent` and roughness^2 (1 - anisotropy) across it.
     """
 
     position: np.ndarray  # (P, 3) m
@@ -344,6 +347,8 @@ class SurfaceSamples:
     sheen_a: np.ndarray | None = None  # (P,) left out, or 0: no sheen
     sheen_b: np.ndarray | None = None  # (P,)
     receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; left out: 0
+    anisotropy: np.ndarray | None = None  # (P,) in (-1, 1); left out: 0
+    tangent: np.ndarray | None = None  # (P, 3); what of it runs along `normal` does not matter; left out: 0
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
@@ -357,6 +362,8 @@ class SurfaceSamples:
             "sheen_a": np.broadcast_to(0.0, (count,)),
             "sheen_b": np.broadcast_to(0.0, (count,)),
             "receiver": np.broadcast_to(0, (count,)),
+            "anisotropy": np.broadcast_to(0.0, (count,)),
+            "tangent": np.broadcast_to(0.0, (count, 3)),
         }
         for name, value in defaults.items():
             if getattr(self, name) is None:
@@ -372,6 +379,14 @@ class SurfaceSamples:
 
     def __len__(self) -> int:
         return self.position.shape[0]
+
+    @property
+    def sharpest_roughness(self) -> np.ndarray:
+        """Roughness (P,) by the smaller alpha of GGX."""
+        if not self.anisotropy.any():
+            return self.roughness
+        across = np.maximum(1.0 - self.anisotropy, 1e-6)
+        return self.roughness * np.sqrt(np.minimum(across, 1.0 / across))
 
     def take(self, index) -> SurfaceSamples:
         """The samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""

@@ -36,6 +36,9 @@ LOBE_AOVS = {
     "normal": ("COLOR", (0.0, 0.0, 0.0)),  # the Normal socket; zero: the smooth normal
     "color": ("COLOR", None),  # of conductors the refractive index
     "roughness": ("VALUE", None),
+    "anisotropy": ("VALUE", 0.0),
+    "rotation": ("VALUE", 0.0),  # of the tangent, in turns
+    "tangent": ("COLOR", (0.0, 0.0, 0.0)),
     "metallic": ("VALUE", 0.0),
     "ior": ("VALUE", 1.5),
     "diffuse_roughness": ("VALUE", 0.0),
@@ -142,6 +145,42 @@ class LobeSlot:
         self.specular_normal = self._bent(self.normal)
         self.roughness = np.clip(self.value("roughness", 1.0), 0.0, 1.0)
 
+    @cached_property
+    def alphas(self) -> np.ndarray:
+        """Alpha (2, Q) of GGX along the tangent and across it."""
+        alpha = self.roughness**2
+        if not self._has_anisotropy():
+            return np.stack([alpha, alpha])
+        anisotropy = self.value("anisotropy")
+        layered = np.sqrt(1.0 - 0.9 * np.clip(anisotropy, 0.0, 1.0))
+        share = np.clip(anisotropy, -0.99, 0.99)
+        glossy = np.where(share < 0.0, 1.0 + share, 1.0 / (1.0 - share))
+        aspect = np.where(self.of("glossy")[:, 0], np.where(np.abs(share) > 1e-4, glossy, 1.0), layered)
+        kinds = [self.of(kind)[:, 0] for kind in ("glossy", "principled", "metal", "conductor", "conductor_4_5")]
+        aspect = np.where(np.logical_or.reduce(kinds), aspect, 1.0)
+        return np.minimum(np.stack([alpha / aspect, alpha * aspect]), 1.0)
+
+    @cached_property
+    def gloss(self) -> np.ndarray:
+        """Roughness (Q,) of all but what is transmitted: by the mean of both alphas."""
+        return np.sqrt(np.sqrt(self.alphas[0] * self.alphas[1]))
+
+    def _has_anisotropy(self):
+        return "anisotropy" in self.lobe and bool((np.abs(self.value("anisotropy")) > 0.0).any())
+
+    def stretch(self) -> dict[str, np.ndarray]:
+        """Anisotropy and tangent as `SurfaceSamples` have them, {} without."""
+        along, across = self.alphas
+        if (along == across).all():
+            return {}
+        ratio = np.sqrt(np.divide(across, along, out=np.ones_like(along), where=along > 0.0))
+        # Cycles turns the tangent of a Glossy BSDF around the normal that it has bent.
+        axis = np.where(self.of("glossy"), self.specular_normal, self.normal)
+        tangent, angle = self.value("tangent"), 2.0 * np.pi * self.value("rotation")[:, None]
+        beside = np.sum(axis * tangent, axis=1, keepdims=True) * axis
+        turned = beside + np.cos(angle) * (tangent - beside) + np.sin(angle) * np.cross(axis, tangent)
+        return {"anisotropy": np.where(ratio > 0.0, 1.0 - ratio, 0.0), "tangent": turned}
+
     def value(self, name: str, default=None) -> np.ndarray:
         """The quantity `name`, or what changes nothing, or `default` where there is no such value."""
         if name in self.lobe:
@@ -198,7 +237,7 @@ class LobeSlot:
     @cached_property
     def albedos(self) -> tuple[np.ndarray, np.ndarray]:
         """Directional and average albedo (Q,) of the lobe without Fresnel."""
-        return closures.albedos(self.roughness, self.cosine(self.specular_normal))
+        return closures.albedos(self.gloss, self.cosine(self.specular_normal))
 
     def scattered(self, mean: np.ndarray) -> np.ndarray:
         """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 where there is none."""
@@ -208,8 +247,11 @@ class LobeSlot:
         return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
 
 
-# What of SurfaceSamples makes another diffuse lobe than Lambert's.
-DIFFUSE_SHAPE = ("diffuse_roughness", "diffuse_rebound", "sheen_a", "sheen_b")
+# What of SurfaceSamples makes another diffuse lobe than Lambert's, and another specular one than isotropic GGX; how
+# many numbers each is.
+SHAPE = {
+    "diffuse_roughness": 1, "diffuse_rebound": 3, "sheen_a": 1, "sheen_b": 1, "anisotropy": 1, "tangent": 3,
+}  # fmt: skip
 
 
 @dataclass
@@ -224,7 +266,7 @@ class _Part:
     specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, dip, dielectric
     diffuse: np.ndarray = field(default=None)  # (Q, 3) estimate of the diffuse albedo
     behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is that of the other side
-    shape: dict[str, np.ndarray] = field(default_factory=dict)  # those of DIFFUSE_SHAPE that are not 0
+    shape: dict[str, np.ndarray] = field(default_factory=dict)  # those of SHAPE that are not 0
 
     def __post_init__(self):
         count = len(self.index)
@@ -264,9 +306,9 @@ def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]
     at_hit = hits.take(index)
     smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
     shape = {}
-    for name in DIFFUSE_SHAPE:
+    for name, count in SHAPE.items():
         if any(name in part.shape for part in parts):
-            width = (3,) if name == "diffuse_rebound" else ()
+            width = (3,) if count == 3 else ()
             own = [part.shape.get(name, np.zeros((len(part.index), *width))) for part in parts]
             shape[name] = np.concatenate(own)[order]
     samples = SurfaceSamples(
@@ -333,7 +375,8 @@ def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
         return None
     base.specular[:, at] -= terms[:, at]
     normal = slot.specular_normal[at]
-    return _Part(slot.index[at], normal, normal, slot.roughness[at], np.ones(len(at)), terms[:, at])
+    shape = {name: values[at] for name, values in slot.stretch().items()}
+    return _Part(slot.index[at], normal, normal, slot.gloss[at], np.ones(len(at)), terms[:, at], shape=shape)
 
 
 def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_Part]]) -> Hits:
@@ -451,7 +494,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
         if slot.of(kind).any():
             albedo = albedo_of(slot.cosine(slot.normal), slot.roughness)[:, None]
             diffuse = np.where(slot.of(kind), slot.color * albedo, diffuse)
-    shape = _diffuse_shape(slot)
+    shape = _diffuse_shape(slot) | slot.stretch()
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
     for kind in ("conductor", "conductor_4_5"):
         if slot.of(kind).any():
@@ -472,7 +515,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
         slot.specular_normal,
         # Cycles bends the normal of translucent lobes too.
         np.where(behind, -slot.specular_normal, slot.normal),
-        slot.roughness,
+        slot.gloss,
         ior,
         specular * under,
         diffuse * under,
@@ -482,7 +525,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
 
 
 def _diffuse_shape(slot: LobeSlot) -> dict[str, np.ndarray]:
-    """What of DIFFUSE_SHAPE the base of the slot has."""
+    """What of the diffuse SHAPE the base of the slot has."""
     shape = {}
     if slot.has("diffuse_roughness"):
         roughness = np.clip(slot.value("diffuse_roughness"), 0.0, 1.0)
@@ -522,7 +565,7 @@ def _dielectric_terms(slot: LobeSlot):
     f0 = np.clip(f0[:, None] * np.maximum(slot.value("tint"), 0.0), 0.0, 1.0)
     factor = slot.scattered(closures.dielectric_blend_average(f0, ior))
     cosine = slot.cosine(slot.specular_normal)
-    albedo = closures.dielectric_albedo(f0, ior, slot.roughness, cosine)
+    albedo = closures.dielectric_albedo(f0, ior, slot.gloss, cosine)
     scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
     albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
     left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)

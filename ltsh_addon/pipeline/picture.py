@@ -57,6 +57,8 @@ SAMPLE_LAYERS = {
     "sheen_a": "V",
     "sheen_b": "V",
     "receiver": "V",
+    "anisotropy": "V",
+    "tangent": "XYZ",
 }
 
 

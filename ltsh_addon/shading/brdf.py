@@ -1,8 +1,31 @@
-"""GGX microfacet reflection and Fresnel curves, in the local frame (see the package's conventions)."""
+"""GGX microfacet reflection and Fresnel curves, in the local frame (see the package's conventions).
+
+Anisotropic GGX, exactly, in the space of stretched half vectors.
+
+A surface with alpha_x along a tangent and alpha_y across it is the one of alpha = 1, stretched (Heitz 2014). So is its
+half vector h: with h' along (h_x / alpha_x, h_y / alpha_y, h_z) the lobe BRDF times cosine is, per solid angle of h',
+
+    P(h') = 2 mu_i (o'.h') / (pi (mu_o S_i + mu_i S_o)),  o' = (alpha_x o_x, alpha_y o_y, o_z), S_o = |o'|,
+
+S_i likewise, o the view and i its mirror image at h. That is a smooth function on the hemisphere, however narrow and
+long the lobe is: a linear one, visible normals, times masking. The edges of a light become arcs of conics in h'.
+
+In the frame of the view h' is along (h_x, v h_x + u h_y, a h_z) with u = k^2 cos^2(phi) + sin^2(phi) / k^2,
+v = (k^2 - 1 / k^2) cos(phi) sin(phi), a = roughness^2 sqrt(u); phi is the azimuth of the view from the tangent and
+k = 1 / (1 - anisotropy). It is turned so that o' has y = 0. Isotropic lobes have u = 1, v = 0.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+
+from .lookup_table import MIN_ALPHA
+from .polygon import dot, project_to_sphere
+
+# Halvings of each edge of a light before it is integrated along; round lights have short edges.
+HALVINGS, MANY_EDGES = 2, 16
 
 
 def ggx_brdf_cosine(cos_theta_o, alpha, directions):
@@ -98,3 +121,123 @@ def dielectric_reflectance(cosine, ior):
     perpendicular = (g - cosine) / np.maximum(g + cosine, 1e-30)
     plus, minus = cosine * (g + cosine) - 1.0, cosine * (g - cosine) + 1.0
     return 0.5 * perpendicular * perpendicular * (1.0 + (plus / minus) ** 2)
+
+
+@dataclass(frozen=True)
+class HalfVectors:
+    """How directions in the local frames of P samples become stretched half vectors."""
+
+    sine: np.ndarray  # (P,) of theta_o
+    cosine: np.ndarray  # (P,)
+    alpha: np.ndarray  # (P,) in the plane of incidence
+    across: np.ndarray  # (P,) u, positive
+    along: np.ndarray  # (P,) v
+
+    @classmethod
+    def of(cls, samples, frame, cosine) -> HalfVectors:
+        """Those of SurfaceSamples (P) in local frames (3, 3, P): rows tangent, bitangent, normal."""
+        x, y = (sum(row[axis] * samples.tangent[:, axis] for axis in range(3)) for row in frame[:2])
+        squared = x * x + y * y
+        # Without a tangent there is no direction to be stretched in.
+        flat = squared <= 1e-12
+        squared, share = np.where(flat, 1.0, squared), np.square(1.0 / (1.0 - samples.anisotropy))
+        across = np.where(flat, 1.0, (share * x * x + y * y / share) / squared)
+        along = np.where(flat, 0.0, (1.0 / share - share) * x * y / squared)
+        alpha = np.maximum(samples.roughness**2 * np.sqrt(across), MIN_ALPHA)
+        cosine = np.clip(cosine, 0.0, 1.0)
+        return cls(np.sqrt(1.0 - cosine * cosine), cosine, alpha, across, along)
+
+    def take(self, index) -> HalfVectors:
+        """Those of the samples `index`."""
+        values = self.sine, self.cosine, self.alpha, self.across, self.along
+        return HalfVectors(*(value[index] for value in values))
+
+    def to_original_domain(self, vectors: np.ndarray) -> np.ndarray:
+        """Stretched half vectors (3, ..., P), of any length, for vectors (3, ..., P) in local frames."""
+        return self._stretched(vectors, np.sqrt(dot(vectors, vectors)))
+
+    def _stretched(self, vectors, length):
+        x, y, z = vectors
+        x = x + length * self.sine
+        return np.stack([x, self.along * x + self.across * y, self.alpha * (z + length * self.cosine)])
+
+    def lobe(self, stretched):
+        """P (...) at unit stretched half vectors [x, y, z] (..., P), the cosine (...) of the half angle, and the unit
+        directions (..., 3)."""
+        x, z = stretched[0], stretched[2] / self.alpha
+        y = (stretched[1] - self.along * x) / self.across
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        half = x * self.sine + z * self.cosine
+        direction = np.stack([2.0 * half * x - self.sine, 2.0 * half * y, 2.0 * half * z - self.cosine], axis=-1)
+        mu = np.maximum(direction[..., 2], 0.0)
+        slopes = direction[..., 0] - self.along / self.across * direction[..., 1], direction[..., 1] / self.across
+        masked = np.sqrt(mu * mu + self.alpha**2 * (slopes[0] ** 2 + slopes[1] ** 2))
+        view = np.hypot(self.alpha * self.sine, self.cosine)
+        visible = self.alpha * self.sine * stretched[0] + self.cosine * stretched[2]
+        values = 2.0 / np.pi * mu * visible / np.maximum(self.cosine * masked + mu * view, 1e-300)
+        return values, half, direction
+
+
+@dataclass(frozen=True)
+class HalfBoundary:
+    """The boundaries of polygons as stretched half vectors see them: edges from `start` in local frames."""
+
+    halves: HalfVectors
+    start: np.ndarray  # (3, E, P)
+    step: np.ndarray  # (3, E, P) to the next corner
+
+    @classmethod
+    def of(cls, halves: HalfVectors, polygon: np.ndarray) -> HalfBoundary:
+        """Of polygons (3, V, P) above the horizon of local frames."""
+        for _ in range(HALVINGS if polygon.shape[1] < MANY_EDGES else 0):
+            following = np.roll(polygon, -1, axis=1)
+            near, far = (np.sqrt(dot(*[halves.to_original_domain(ends)] * 2)) for ends in (polygon, following))
+            # In the middle of the arc that an edge is, where the length of vectors changes evenly.
+            middle = polygon + near / np.maximum(near + far, 1e-300) * (following - polygon)
+            polygon = np.stack([polygon, middle], axis=2).reshape(3, -1, polygon.shape[2])
+        return cls(halves, polygon, np.roll(polygon, -1, axis=1) - polygon)
+
+    pieces = property(lambda self: self.start.shape[1])
+
+    def take(self, index) -> HalfBoundary:
+        """Those of the points `index` (Q,)."""
+        return HalfBoundary(self.halves.take(index), self.start[:, :, index], self.step[:, :, index])
+
+    def corners(self) -> np.ndarray:
+        """Unit vectors (3, E, P)."""
+        return project_to_sphere(self.halves.to_original_domain(self.start))
+
+    def nodes(self, order: int):
+        """As `reference.PolygonBoundary.nodes`."""
+        nodes, weights = np.polynomial.legendre.leggauss(order)
+        fractions, weights = 0.5 * (nodes + 1.0)[:, None], 0.5 * weights[:, None]
+        near = self.halves.to_original_domain(self.start)
+        far = np.roll(near, -1, axis=1)
+        normal = np.cross(near, far, axis=0)
+        angle = np.arctan2(np.sqrt(dot(normal, normal)), dot(near, far))[:, None]
+        near, far = (np.sqrt(dot(ends, ends))[:, None] for ends in (near, far))
+        # Where an arc between both ends has gone these shares of its angle, were the edge straight in h'.
+        first, last = (
+            _share(part * angle, angle, part) / end for part, end in ((1.0 - fractions, near), (fractions, far))
+        )
+        total = first + last
+        speed = 1.0 / (_sinc(angle) * near * far * total * total)
+        place = self.start[:, :, None] + (last / total) * self.step[:, :, None]
+        length = np.sqrt(dot(place, place))
+        stretched = self.halves._stretched(place, length)
+        step = self.step[:, :, None]
+        moved = self.halves._stretched(np.broadcast_to(step, place.shape), dot(place, step) / length)
+        squared = dot(stretched, stretched)
+        measure = np.cross(stretched, moved, axis=0) * (speed * weights / squared)
+        count = place.shape[-1]
+        return (stretched / np.sqrt(squared)).reshape(3, -1, count), measure.reshape(3, -1, count)
+
+
+def _sinc(angle):
+    return np.sinc(angle / np.pi)
+
+
+def _share(part, angle, fraction):
+    """sin(part) / sin(angle), of which part = fraction angle."""
+    return fraction * _sinc(part) / _sinc(angle)

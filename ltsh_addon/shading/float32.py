@@ -75,14 +75,15 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     reflective = np.logical_or.reduce([_any_component(term) for term in terms])
     lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
+    anisotropic = lit & (samples.anisotropy != 0.0)
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     far = sharp & False
     if lights.skies:
-        far = sharp & ~float64.has_bent_fresnel(samples)
+        far = sharp & ~(anisotropic | float64.has_bent_fresnel(samples))
     elif lights.trees and table.family == "ltsh":
-        far = sharp
-    sharp = sharp & ~far
+        far = sharp & ~anisotropic
+    sharp = (sharp | anisotropic) & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
         for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(chosen)[0]):
             for index in _chunks(members):

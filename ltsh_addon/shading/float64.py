@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -171,7 +172,7 @@ def _receiving(samples, light, index):
 
 def lobe_width(samples, index) -> np.ndarray:
     """About how many radians (Q,) wide the specular lobes are: alpha."""
-    return np.maximum(samples.roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
+    return np.maximum(samples.sharpest_roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
 def _profiled(light, view, effort, index, polygon, integral, count):
@@ -200,6 +201,8 @@ def shade_specular(samples, lights, table, radiance, error=None):
     lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
     cosine = np.clip(cosine, 0.0, 1.0)
     lobe, bent = None, np.zeros(len(samples), bool)
+    is_anisotropic = samples.anisotropy[lit] != 0.0
+    anisotropic = lit[is_anisotropic]
     if table != REFERENCE and len(lit):
         bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
@@ -222,21 +225,21 @@ def shade_specular(samples, lights, table, radiance, error=None):
         if table == REFERENCE:
             parts = reference_integrals(samples, cosine, frame, light, corners, lit, error)
         else:
-            width = lobe_width(samples, lit)
-            visible = seen_parts(samples, frame, light, corners, lit, width, samples.geometric_normal)
+            plain = lit[~is_anisotropic]
+            width = lobe_width(samples, plain)
+            visible = seen_parts(samples, frame, light, corners, plain, width, samples.geometric_normal)
             parts = (
                 (index, _table_integrals(table, lobe, samples, frame, light, effort, index, polygon))
                 for index, polygon, effort in visible
             )
             if light.is_profiled and light.shape == "POLYGON":
                 parts = _joined(parts, len(samples))
+            parts = _finished(parts, table, samples, light)
+            if len(anisotropic):
+                estimates = np.zeros(len(samples))
+                others = reference_integrals(samples, cosine, frame, light, corners, anisotropic, estimates)
+                parts = chain(parts, others)
         for index, integrals in parts:
-            if table != REFERENCE and table.family == "ltsh":
-                _limit(integrals, samples, index, light)
-            if table != REFERENCE and light.is_facing:
-                alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
-                own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
-                integrals *= _mean_emission(light, samples, index, own)
             plain, schlick, dip, dielectric = integrals[:4, :, None]
             f0, f90 = samples.specular_f0[index], samples.specular_f90[index]
             reflected = f0 * plain + (f90 - f0) * schlick + samples.dielectric[index] * dielectric
@@ -247,6 +250,18 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 mean = _bent_reflectance(samples, frame, light, corners, index[chosen])
                 reflected[chosen] = plain[chosen] * mean
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
+
+
+def _finished(parts, table, samples, light):
+    """Yield (index, integrals (4, Q)) of the `parts` of a light with all that is not of the polygon."""
+    for index, integrals in parts:
+        if table.family == "ltsh":
+            _limit(integrals, samples, index, light)
+        if light.is_facing:
+            alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
+            own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
+            integrals *= _mean_emission(light, samples, index, own)
+        yield index, integrals
 
 
 def has_bent_fresnel(samples) -> np.ndarray:

@@ -357,7 +357,7 @@ def _sizes(patch, samples, specular) -> np.ndarray:
 
 def _lobe_width(samples) -> np.ndarray:
     cosine = np.abs((samples.normal * samples.view).sum(axis=1))
-    return LOBE_WIDTH * np.square(samples.roughness) * np.maximum(cosine, LEAST_COSINE)
+    return LOBE_WIDTH * np.square(samples.sharpest_roughness) * np.maximum(cosine, LEAST_COSINE)
 
 
 def _angle_from_peak(samples, direction, size) -> np.ndarray:

@@ -43,6 +43,7 @@ _ONLY_DIFFUSE = {
 }  # fmt: skip
 _ONLY_SPECULAR = {
     "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
+    "anisotropy", "tangent",
 }  # fmt: skip
 _ALIGNMENT = 64
 

@@ -193,7 +193,8 @@ class _Peaks:
         normal, view = (np.ascontiguousarray(values[index].T, np.float32) for values in (samples.normal, samples.view))
         cosine = dot(normal, view)
         self.mirrored = np.float32(2.0) * cosine * normal - view
-        width = np.square(samples.roughness[index].astype(np.float32)) * np.maximum(np.abs(cosine), LEAST_COSINE)
+        alpha = np.square(samples.sharpest_roughness[index].astype(np.float32))
+        width = alpha * np.maximum(np.abs(cosine), LEAST_COSINE)
         self.width = np.maximum(LOBE_WIDTH * width, LEAST_WIDTH).astype(np.float32)
 
     def lengths(self, column, toward, size) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 
 from ..scene import AreaLight
 from . import brdf, light_cone
+from .brdf import HalfBoundary, HalfVectors
 from .edge_integrals import arc_factors
 from .facing import FacingDisk, emission
 from .light_polygons import in_front, light_view, to_local, visible_parts
@@ -43,7 +44,9 @@ class PolygonBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
-        """Of polygons (3, V, P) in the local frame."""
+        """Of polygons (3, V, P) in the local frame; those of HalfVectors are HalfBoundary."""
+        if isinstance(warp, HalfVectors):
+            return HalfBoundary.of(warp, polygon)
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
@@ -196,6 +199,7 @@ def lobe_integrals(
     tolerance=1e-4,
     cone: Cone | FacingEmission | None = None,
     metal=None,
+    halves: HalfVectors | None = None,
 ):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
@@ -203,11 +207,12 @@ def lobe_integrals(
     cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
     `ior` (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6;
     the estimate is the last difference. Lights must be convex. With a `cone` the integrand has its factor, too. With a
-    `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance falls below 0.
+    `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance falls below 0. Anisotropic lobes are
+    those of `halves`, whatever `alpha` is; they take no exact ellipses.
     """
-    warp = limit_warp(cos_theta_o, alpha)
+    warp = limit_warp(cos_theta_o, alpha) if halves is None else halves
     boundary = make_boundary(warp)
-    apex = boundary.apex()
+    apex = (boundary if halves is None else PolygonBoundary(boundary.corners())).apex()
     if cone is not None:
         apex = np.where(cone.at_foot, project_to_sphere(warp.to_original_domain(cone.axis)), apex)
     count = len(cos_theta_o)
@@ -256,7 +261,10 @@ def _fixed_order(order, boundary, apex, setting, cone, metal):
     near, far = np.sin(rho * (1.0 - fractions)) / sine, inner_sine / sine  # (B, m, P)
     weight = wedge[:, None] * weights[:, None] * rho / sine * far
     warped = [near * apex[axis] + far * points[axis][:, None] for axis in range(3)]
-    values, half, direction = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
+    if isinstance(warp, HalfVectors):
+        values, half, direction = warp.lobe(warped)
+    else:
+        values, half, direction = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
     values *= weight
     if cone is not None:
         values *= cone.factor(np.moveaxis(direction, -1, 0))
@@ -305,13 +313,27 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
 
     Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
     """
+    is_anisotropic = samples.anisotropy[candidates] != 0.0
+    if is_anisotropic.any():
+        plain = candidates[~is_anisotropic]
+        if len(plain):
+            yield from _integrals(samples, (cosine, None), frame, light, corners, plain, error)
+        halves = HalfVectors.of(samples, frame, cosine)
+        yield from _integrals(samples, (cosine, halves), frame, light, corners, candidates[is_anisotropic], error)
+    else:
+        yield from _integrals(samples, (cosine, None), frame, light, corners, candidates, error)
+
+
+def _integrals(samples, lobes, frame, light, corners, candidates, error):
+    """As `reference_integrals` for `lobes`: cosines (P,) of theta_o, and the HalfVectors of anisotropic ones."""
+    cosine, halves = lobes
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
     clipped = brdf.clipped_metals(samples)
     if light.is_round:
         corners = light.polygon(_ROUND_CORNERS)
     if light.is_focused:
         batches = _cone_parts(samples, cosine, frame, light, corners, candidates)
-    elif light.is_round:
+    elif light.is_round and halves is None:
         batches = _ellipses(samples, frame, light, corners, candidates)
     else:
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
@@ -323,9 +345,9 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
         elif cone is None and light.has_falloff:
             cone = _whole_cone(samples, frame, light, index, profile)
         alpha = samples.roughness[index] ** 2
-        setting = (cosine[index], alpha, samples.ior[index])
+        setting, own = (cosine[index], alpha, samples.ior[index]), None if halves is None else halves.take(index)
         metal = [term[index] * clipped[index, None] for term in terms] if clipped[index].any() else None
-        integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal)
+        integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal, halves=own)
         if light.is_facing:
             integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
         error[index] += estimate

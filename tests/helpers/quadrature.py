@@ -55,7 +55,9 @@ def lambert(directions, samples):
 
 
 def ggx(directions, samples):
-    """Specular BRDF times cosine (P, S, 3): GGX, height-correlated Smith, Fresnel as in `SurfaceSamples`."""
+    """Specular BRDF times cosine (P, S, 3): GGX, height-correlated Smith, Fresnel as in `SurfaceSamples`.
+
+    Anisotropic lobes by the formulas for alpha_x and alpha_y of Heitz 2014, all samples or none."""
     alpha2 = samples.roughness[:, None] ** 4
     cos_o = np.sum(samples.normal * samples.view, axis=-1)[:, None]
     cos_i = _dot(directions, samples.normal)
@@ -65,6 +67,19 @@ def ggx(directions, samples):
     distribution = alpha2 / (np.pi * (cos_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
     lit = (cos_i > 0.0) & (cos_o > 0.0)
     smith = 1.0 / (1.0 + _smith(alpha2, cos_o) + _smith(alpha2, np.where(lit, cos_i, 1.0)))
+    if samples.anisotropy.any():
+        along, across = _tangents(samples)
+        alpha = samples.roughness[:, None] ** 2
+        x, y = alpha / (1.0 - samples.anisotropy[:, None]), alpha * (1.0 - samples.anisotropy[:, None])
+        slopes = (_dot(half, along) / x) ** 2 + (_dot(half, across) / y) ** 2 + cos_h**2
+        distribution = 1.0 / (np.pi * x * y * slopes**2)
+        projected = [
+            (_dot(vectors, along) * x) ** 2 + (_dot(vectors, across) * y) ** 2
+            for vectors in (samples.view[:, None], directions)
+        ]
+        cosines = cos_o, np.where(lit, cos_i, 1.0)
+        masking = [0.5 * (np.sqrt(1.0 + p / c**2) - 1.0) for p, c in zip(projected, cosines, strict=True)]
+        smith = 1.0 / (1.0 + masking[0] + masking[1])
     value = np.where(lit, distribution * smith / (4.0 * cos_o), 0.0)
     schlick = (1.0 - cos_d[..., None]) ** 5
     f0, f90 = samples.specular_f0[:, None], samples.specular_f90[:, None]
@@ -73,6 +88,13 @@ def ggx(directions, samples):
     metal = f0 + (f90 - f0) * schlick - dip
     alone = ~samples.dielectric.any(axis=1)[:, None, None]
     return value[..., None] * (np.where(alone, np.maximum(metal, 0.0), metal) + dielectric)
+
+
+def _tangents(samples):
+    """Unit vectors (P, 3) along the tangent and across it."""
+    across = np.cross(samples.normal, samples.tangent)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    return np.cross(across, samples.normal), across
 
 
 def dielectric_fresnel(cosine, ior):

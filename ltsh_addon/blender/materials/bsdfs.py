@@ -36,10 +36,11 @@ class Bsdf:
 
 
 COLOR, ROUGHNESS = {"color": "Color"}, {"roughness": "Roughness"}
+BRUSHED = {**ROUGHNESS, "anisotropy": "Anisotropy", "rotation": "Rotation"}
 PRINCIPLED_SOCKETS = {
     "color": "Base Color", "roughness": "Roughness", "metallic": "Metallic", "ior": "IOR", "tint": "Specular Tint",
     "specular_level": "Specular IOR Level", "transmission": "Transmission Weight",
-    "diffuse_roughness": "Diffuse Roughness",
+    "diffuse_roughness": "Diffuse Roughness", "anisotropy": "Anisotropic", "rotation": "Anisotropic Rotation",
     "sheen_weight": "Sheen Weight", "sheen_tint": "Sheen Tint", "sheen_roughness": "Sheen Roughness",
     "coat_weight": "Coat Weight", "coat_roughness": "Coat Roughness", "coat_ior": "Coat IOR", "coat_tint": "Coat Tint",
     "coat_normal": "Coat Normal",
@@ -47,7 +48,7 @@ PRINCIPLED_SOCKETS = {
 CONDUCTOR = "conductor" if bpy.app.version >= (5, 0, 0) else "conductor_4_5"
 AS_ZERO = (0.0, "is shaded as 0")
 AS_DIFFUSE = "is not supported, it is shaded as a Diffuse BSDF"
-OF_METALLIC = {"Anisotropy": AS_ZERO, "Thin Film Thickness": AS_ZERO}
+OF_METALLIC = {"Thin Film Thickness": AS_ZERO}
 # (node, value of its property of VARIANTS) -> its row.
 BSDFS = {
     (PRINCIPLED, ""): Bsdf(
@@ -55,13 +56,12 @@ BSDFS = {
         PRINCIPLED_SOCKETS,
         not_shaded={
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
-            "Anisotropic": AS_ZERO,
             "Transmission Weight": (0.0, "lets no light through: only the reflection is shaded"),
             "Thin Wall": (0.0, "is shaded as off"),
             "Thin Film Thickness": AS_ZERO,
         },
     ),
-    ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", {**COLOR, **ROUGHNESS}, "", {"Anisotropy": AS_ZERO}),
+    ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", {**COLOR, **BRUSHED}),
     ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", {**COLOR, "diffuse_roughness": "Roughness"}),
     ("ShaderNodeBsdfTranslucent", ""): Bsdf("translucent", COLOR),
     (GLASS, ""): Bsdf(
@@ -70,9 +70,9 @@ BSDFS = {
         "lets no light through: only its reflection is shaded",
         {"Thin Film Thickness": AS_ZERO},
     ),
-    (METALLIC, "F82"): Bsdf("metal", {**ROUGHNESS, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
+    (METALLIC, "F82"): Bsdf("metal", {**BRUSHED, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
     (METALLIC, "PHYSICAL_CONDUCTOR"): Bsdf(
-        CONDUCTOR, {**ROUGHNESS, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
+        CONDUCTOR, {**BRUSHED, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
     (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}),
     (SHEEN, "ASHIKHMIN"): Bsdf(
@@ -111,6 +111,8 @@ def lobe_values(node) -> dict:
     normal = live_link(node.inputs["Normal"])
     if normal is not None:
         values["normal"] = normal.from_socket
+    if "anisotropy" in values:
+        _add_tangent(node, values)
     if bsdf.kind == "principled":
         _drop_absent_layers(node, values)
     if bsdf.is_scattered:
@@ -123,6 +125,18 @@ def lobe_values(node) -> dict:
 def _is_neutral(name, value) -> bool:
     kind, neutral = LOBE_AOVS[name]
     return neutral is not None and is_constant(value, neutral)
+
+
+def _add_tangent(node, values) -> None:
+    """Add the tangent of an anisotropic node; without anisotropy leave out what belongs to it."""
+    if _is_neutral("anisotropy", values["anisotropy"]):
+        del values["rotation"]
+        return
+    tangent = live_link(node.inputs["Tangent"])
+    if tangent is None:
+        values["tangent"] = node.id_data.nodes.new("ShaderNodeNewGeometry").outputs["Tangent"]
+    else:
+        values["tangent"] = tangent.from_socket
 
 
 def _drop_absent_layers(node, values) -> None:

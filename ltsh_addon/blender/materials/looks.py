@@ -303,6 +303,9 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
+        brushed = constant_inputs(source, names["anisotropy"]) if "anisotropy" in names else [[0.0]]
+        if brushed is None or brushed[0][0] != 0.0:
+            self.note("anisotropy is not shown")
         rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
         if rough is None or rough[0][0] > 0.0:
             self.note("rough diffuse reflection is shown as smooth")

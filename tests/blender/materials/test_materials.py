@@ -139,7 +139,6 @@ def test_transparency_is_cut_in_samples_and_reference(tmp_path, kind):
 def test_every_unsupported_input_is_named_once(tmp_path):
     wanted = {
         "Subsurface Weight": 0.2,
-        "Anisotropic": 0.3,
         "Transmission Weight": 0.1,
         "Thin Film Thickness": 100.0,
     }

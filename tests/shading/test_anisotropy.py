@@ -1,0 +1,76 @@
+"""Anisotropic GGX against the textbook's formulas on small patches of the light."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import quadrature
+import random_surfaces
+
+from ltsh_addon.scene import AreaLight
+from ltsh_addon.shading import shade
+
+COUNT = 60
+HALF_U, HALF_V = np.array([1.5, 0.2, 0.1]), np.array([-0.15, -0.6, 1.0])
+LIGHT = AreaLight(
+    "Key", "RECTANGLE", [0.3, 2.5, 2.2], HALF_U, HALF_V, random_surfaces.unit(np.cross(HALF_U, HALF_V)), [2.0, 1.5, 1.0]
+)
+
+
+def surfaces(anisotropy, seed=1, lowest=0.3):
+    """COUNT samples under the light, with lobes that 128 x 128 patches of it resolve."""
+    random = np.random.default_rng(seed)
+    samples = random_surfaces.samples("plain", COUNT, random)
+    tangent = random.normal(size=(COUNT, 3))
+    roughness = lowest + (1.0 - lowest) * samples.roughness
+    normal = random_surfaces.unit(samples.normal + [0.0, 0.0, 1.5])
+    own = {"normal": normal, "geometric_normal": None, "roughness": roughness, "tangent": tangent}
+    return replace(samples, anisotropy=np.full(COUNT, anisotropy), **own)
+
+
+def specular(samples, technique, light=LIGHT, **options):
+    return shade(samples, [light], technique, passes=("specular",), workers=1, **options).specular[0]
+
+
+@pytest.mark.parametrize("anisotropy", [0.2, 0.62, 0.9, -0.5])
+def test_reference_is_the_integral_of_anisotropic_ggx(anisotropy):
+    """0.62 is that of a Principled BSDF with 0.95, 0.9 that of a Glossy BSDF."""
+    samples = surfaces(anisotropy, lowest=0.6 if anisotropy > 0.8 else 0.3)
+    expected = quadrature.radiance(samples, [LIGHT], quadrature.ggx, count=192)
+    found = specular(samples, "reference")
+    assert (expected.max(axis=1) > 1e-4).sum() > COUNT // 2
+    # The patches leave 2e-4 of the largest light; lobes narrow in one direction more.
+    assert np.abs(found - expected).max() < 5e-4 * expected.max()
+
+
+def test_a_tangent_turned_by_a_right_angle_swaps_both_alphas():
+    samples = surfaces(0.5)
+    across = np.cross(samples.normal, samples.tangent)
+    other = replace(samples, tangent=across, anisotropy=np.full(COUNT, 1.0 - 1.0 / 0.5))
+    for technique in ("reference", "ltsh4"):
+        first, second = specular(samples, technique), specular(other, technique)
+        assert np.allclose(first, second, rtol=1e-3, atol=2e-4 * first.max())
+
+
+@pytest.mark.parametrize("technique", ["reference", "ltsh4"])
+def test_neither_the_length_nor_the_sign_of_a_tangent_matters(technique):
+    samples = surfaces(0.5)
+    first = specular(samples, technique)
+    second = specular(replace(samples, tangent=-3.0 * samples.tangent), technique)
+    assert np.allclose(first, second, rtol=1e-6, atol=1e-9)
+
+
+def test_hardly_anisotropic_is_isotropic():
+    samples = surfaces(1e-9)
+    plain = replace(samples, anisotropy=np.zeros(COUNT))
+    first, second = specular(samples, "reference"), specular(plain, "reference")
+    assert np.allclose(first, second, rtol=1e-3, atol=1e-4 * first.max())
+
+
+@pytest.mark.parametrize("technique", ["ltc", "ltsh2", "ltsh4"])
+def test_isotropic_samples_beside_anisotropic_ones_stay_what_they_are(technique):
+    samples = surfaces(0.5)
+    plain = np.arange(COUNT) % 2 == 0
+    mixed = replace(samples, anisotropy=np.where(plain, 0.0, samples.anisotropy))
+    alone = specular(mixed.take(plain), technique)
+    assert np.array_equal(specular(mixed, technique)[plain], alone)

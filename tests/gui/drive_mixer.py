@@ -14,7 +14,7 @@ def main(rig):
     yield from hands.open_panel(rig)
     yield 1
     settings = hands.settings()
-    settings.techniques, settings.resolution_percentage = {"ltsh4"}, 100
+    settings.anti_aliasing = 1
     hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
     yield from hands.job_started(rig, "shading starts")
     yield from hands.wait_for_job(rig, 600)
@@ -24,6 +24,7 @@ def main(rig):
     yield from changed(rig)
     yield from applied(rig)
     yield from moved(rig)
+    yield from rendered(rig)
 
 
 def items():
@@ -76,3 +77,19 @@ def moved(rig):
     rig.fact("a moved light, once more, s", round(time.perf_counter() - start, 2))
     yield 1
     rig.shot("6_moved.png")
+
+
+def rendered(rig):
+    """F12, and its lights changed in the window of the render."""
+    bpy.context.scene.render.engine = "LTSH"
+    yield from hands.over(rig)
+    yield from hands.keys(rig, "F12")
+    results = hands.module("ui.results")
+    yield from hands.until(lambda: results._rendered, 400)
+    rig.check(bool(results._rendered), "the mixer has the lights of the final render")
+    yield 2
+    rig.shot("7_rendered.png")
+    rig.check(hands.settings().mixed[-1].name == "Everything else", f"the rest is a row: {list(items())}")
+    hands.settings().mixed[1].muted = True
+    yield 2
+    rig.shot("8_render_mixed.png")

@@ -196,8 +196,8 @@ def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
 # -- the mixer --------------------------------------------------------------------------------------------------------
 
 MIXER_FILE = "lights.npz"
-# Rows of a mixer: of more lights the weakest are one.
-MOST_ROWS = 64
+# Rows of a mixer, and of large pictures: of more lights the weakest are one. Values of all of its pictures.
+MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 64, 8, 1 << 28
 REST = "Everything else"
 # Pairs of a sample and a row whose radiance is kept at a time.
 MOST_PAIRS = 1 << 23
@@ -256,8 +256,9 @@ class LightPictures:
 def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> LightPictures:
     """The pictures of the lights of `kept`, shaded anew by its most accurate table. Raises TableError, Cancelled."""
     extraction, shadows = kept.extraction, kept.shadows
-    members, technique = _members(extraction.lights, shadows), technique_of(kept)
-    shape = extraction.film.height, extraction.film.width
+    shape, technique = (extraction.film.height, extraction.film.width), technique_of(kept)
+    most = min(max(MOST_VALUES // (4 * shape[0] * shape[1]), FEWEST_ROWS), MOST_ROWS)
+    members = _members(extraction.lights, shadows, most)
     layers = np.zeros((len(members), *shape, 3), np.float32)
     (table,) = picture.load_tables((technique,)).values()
     most = max(1, MOST_PAIRS // max(1, len(extraction.samples)))
@@ -286,8 +287,8 @@ def technique_of(kept: KeptPicture) -> str:
     return names[-1] if names else "ltsh4"
 
 
-def _members(lights: Sequence[AreaLight], shadows: Shadows | None) -> list[list[int]]:
-    """Numbers of the lights of each row: those of one name, and those that share their rays."""
+def _members(lights: Sequence[AreaLight], shadows: Shadows | None, most: int = MOST_ROWS) -> list[list[int]]:
+    """Numbers of the lights of each of at most `most` rows: those of one name, and those that share their rays."""
     root = {light.name: light.name for light in lights}
 
     def first(name):
@@ -303,10 +304,10 @@ def _members(lights: Sequence[AreaLight], shadows: Shadows | None) -> list[list[
     for number, light in enumerate(lights):
         members.setdefault(first(light.name), []).append(number)
     rows = list(members.values())
-    if len(rows) <= MOST_ROWS:
+    if len(rows) <= most:
         return rows
     power = [sum(np.linalg.norm(lights[n].area_vector) * lights[n].radiance.sum() for n in own) for own in rows]
-    strong = set(np.argsort(power)[::-1][: MOST_ROWS - 1].tolist())
+    strong = set(np.argsort(power)[::-1][: most - 1].tolist())
     weak = [number for row, own in enumerate(rows) if row not in strong for number in own]
     return [*(own for row, own in enumerate(rows) if row in strong), weak]
 

@@ -15,16 +15,28 @@ def main(rig):
     yield 1
     settings = hands.settings()
     settings.anti_aliasing = 1
+    yield from beside_the_view(rig)
     hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
     yield from hands.job_started(rig, "shading starts")
     yield from hands.wait_for_job(rig, 600)
-    yield from hands.results_opened(rig)
     yield 2
     rig.shot("1_shaded.png")
     yield from changed(rig)
     yield from applied(rig)
     yield from moved(rig)
     yield from rendered(rig)
+
+
+def beside_the_view(rig):
+    """An Image Editor with our tab, in which results appear."""
+    hands.operate(rig, bpy.ops.screen.area_split, direction="VERTICAL", factor=0.55)
+    yield 1
+    area = next(area for area in rig.window.screen.areas if area.type == "VIEW_3D")
+    area.ui_type = "IMAGE_EDITOR"
+    area.spaces.active.show_region_ui = True
+    yield 1
+    rig.region("IMAGE_EDITOR", "UI").active_panel_category = "LTSH"
+    yield 1
 
 
 def items():

@@ -110,6 +110,7 @@ def test_lights_that_change_together_are_one_row(capsys, monkeypatch, room, out)
     many = [replace(lights[0], name=f"M{n}", radiance=[100.0 - n] * 3) for n in range(100)]
     members = relight._members(many, None)
     assert len(members) == 64 and members[-1] == list(range(63, 100))
+    assert [len(own) for own in relight._members(many, None, 8)] == [1] * 7 + [93]
     row = relight._row(replace(kept.extraction, lights=tuple(many)), members[-1])
     assert row.name == "M63 and 36 more" and row.note == relight.WEAKEST
 

@@ -88,6 +88,10 @@ class ShadowTracer:
     def __exit__(self, *error):
         return self._ending.__exit__(*error)
 
+    def starts(self, samples: SurfaceSamples) -> visibility.Starts:
+        """Where rays from `samples` start, the same for all lights."""
+        return self._tracer.starts(replace(samples, position=samples.position - self._origin))
+
     def trace(
         self,
         samples: SurfaceSamples,
@@ -97,6 +101,7 @@ class ShadowTracer:
         film: Film | None = None,
         workers: int | None = None,
         progress: Progress | None = None,
+        starts: visibility.Starts | None = None,
     ) -> Shadows:
         """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
@@ -111,6 +116,7 @@ class ShadowTracer:
             is_baked=self._is_baked,
             workers=workers,
             progress=progress,
+            starts=starts,
         )
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}

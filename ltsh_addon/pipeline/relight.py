@@ -1,7 +1,7 @@
 """Finished pictures in another light: `relight` writes them anew, a `Mixer` changes their lights while one looks.
 
 Radiance is linear in that of each light: a picture is the sum of the pictures of its lights, each times a factor per
-color. No ray is traced, but by `moved_picture` for a light that has moved.
+color. No ray is traced, but by `MovedLights` for those that have moved.
 """
 
 from __future__ import annotations
@@ -419,24 +419,33 @@ class Mixer:
 # -- lights that have moved -------------------------------------------------------------------------------------------
 
 
-def load_kept(path: Path) -> tuple[KeptPicture, Occluders | None]:
-    """What was kept of a picture in `path`, and what stands in the way of its light. Raises OSError, ValueError."""
-    kept, occluders = KeptPicture.load(path), None
-    if kept.shadows is not None:
-        occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
-    return kept, occluders
+class MovedLights:
+    """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
 
-
-def moved_picture(kept: KeptPicture, occluders: Occluders | None, light: AreaLight) -> np.ndarray:
-    """The picture (H, W, 3) of one light of `kept` where it is now, by its own rays and lobes alone.
-
-    Raises SceneError, TableError.
+    Where rays start is found once, for the first of them.
     """
-    extraction, passes, shadows = kept.extraction, kept.options["passes"], None
-    if occluders is not None:
-        with ShadowTracer(occluders, (light,), extraction.origin) as tracer:
-            rays = rays_of_point(kept.options["shadow_rays"], extraction.film.sub_samples)
-            shadows = tracer.trace(extraction.samples, passes, rays, film=extraction.film)
-    (table,) = picture.load_tables((technique_of(kept),)).values()
-    alone = replace(kept, extraction=replace(extraction, lights=(light,)), shadows=shadows)
-    return _layers(alone, table, [[0]], None)[0]
+
+    def __init__(self, kept: KeptPicture, occluders: Occluders | None):
+        self._kept, self._occluders, self._starts = kept, occluders, None
+        (self._table,) = picture.load_tables((technique_of(kept),)).values()
+
+    @classmethod
+    def load(cls, path: Path) -> MovedLights:
+        """Those of the picture that kept its samples in `path`. Raises OSError, ValueError."""
+        kept, occluders = KeptPicture.load(path), None
+        if kept.shadows is not None:
+            occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
+        return cls(kept, occluders)
+
+    def picture(self, light: AreaLight) -> np.ndarray:
+        """The picture (H, W, 3) of one light. Raises SceneError."""
+        extraction, options, shadows = self._kept.extraction, self._kept.options, None
+        if self._occluders is not None:
+            rays = rays_of_point(options["shadow_rays"], extraction.film.sub_samples)
+            with ShadowTracer(self._occluders, (light,), extraction.origin) as tracer:
+                if self._starts is None:
+                    self._starts = tracer.starts(extraction.samples)
+                known = {"film": extraction.film, "starts": self._starts}
+                shadows = tracer.trace(extraction.samples, options["passes"], rays, **known)
+        alone = replace(self._kept, extraction=replace(extraction, lights=(light,)), shadows=shadows)
+        return _layers(alone, self._table, [[0]], None)[0]

@@ -29,7 +29,7 @@ class Errand:
 
 
 class ChildSide:
-    """Answers each block (samples, film) with what the task finds."""
+    """Answers each block (samples, film, starts) with what the task finds."""
 
     def __init__(self, errand: Errand):
         self._task, self._tracer = errand.task, open_tracer(errand.occluders, [errand.library])

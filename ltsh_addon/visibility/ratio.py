@@ -37,6 +37,7 @@ from .directions import (
     seeds_of,
     unit_points,
 )
+from .starts import Starts
 
 # Rays of the first look at a pair, and between two looks at the memory.
 PROBES = 8
@@ -119,13 +120,15 @@ def visible_shares(
     is_baked: bool = False,
     workers: int | None = None,
     progress: Progress | None = None,
+    starts: Starts | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
 
     `film` says which samples are neighbors; left out: those before and after. Where the passes are baked, each by
     itself, Cycles chooses rays by its lobes alone. `tracer` is as `visibility.open_tracer`
     returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
-    process. `progress` may return False to stop: Cancelled is raised.
+    process. `progress` may return False to stop: Cancelled is raised. `starts` are as of `tracer.starts(samples)`, for
+    callers that know them.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
@@ -133,7 +136,7 @@ def visible_shares(
     typical = dict.fromkeys(passes, 1.0)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical, is_baked)
     start = time.thread_time()
-    typical, looked_at = typical_radiance(samples, task, tracer)
+    typical, looked_at = typical_radiance(samples, task, tracer, starts)
     seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
     task = replace(task, typical=typical)
     shape = len(emitters), len(samples)
@@ -141,7 +144,7 @@ def visible_shares(
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
     blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
-    parts = ((samples.take(block), None if film is None else film.take(block)) for block in blocks)
+    parts = (tuple(None if one is None else one.take(block) for one in (samples, film, starts)) for block in blocks)
     wanted = workers if seconds > SECONDS_WORTH_A_CHILD else 1
     for number, found in crew.run(task, tracer, list(parts), wanted, progress):
         block = blocks[number]
@@ -163,13 +166,13 @@ class ShadowTask:
     typical: dict[str, float]
     is_baked: bool
 
-    def shares(self, samples: SurfaceSamples, film: Film | None, tracer) -> Visibility:
+    def shares(self, samples: SurfaceSamples, film: Film | None, starts: Starts | None, tracer) -> Visibility:
         """Those of a block, all in this thread."""
         shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
-        surface, neighbors = Surface(samples, self.passes, tracer), Neighbors.of(film, shape[1])
+        surface, neighbors = Surface(samples, self.passes, tracer, starts), Neighbors.of(film, shape[1])
         choices, first = Choices(samples, [one for each in self.emitters for one in each.chosen_as], self.is_baked), 0
         for number, emitter in enumerate(self.emitters):
             pairs = Pairs(surface, emitter, first, choices)
@@ -188,11 +191,12 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple[dict[str, float], int]:
+def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer, starts=None) -> tuple[dict[str, float], int]:
     """By pass, the root mean square of what samples reflect, from some of them and the first rays alone; how many."""
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
-    some = samples.take(slice(None, None, -(-len(samples) // most) or 1))
-    found = replace(task, rays=PROBES).shares(some, None, tracer)
+    chosen = slice(None, None, -(-len(samples) // most) or 1)
+    some = samples.take(chosen)
+    found = replace(task, rays=PROBES).shares(some, None, None if starts is None else starts.take(chosen), tracer)
     squares = {name: np.square(found.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 
@@ -228,8 +232,8 @@ class Neighbors:
 class Surface:
     """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
 
-    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer):
-        self.tracer, self.starts = tracer, tracer.starts(samples)
+    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer, starts: Starts | None = None):
+        self.tracer, self.starts = tracer, tracer.starts(samples) if starts is None else starts
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)

@@ -121,6 +121,11 @@ class Starts:
     lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
     terminator: np.ndarray  # (P,) as Occluders.terminators, 0 for all that is flat
 
+    def take(self, index) -> Starts:
+        """Those of the samples at `index`: integers (Q,) or a slice."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Starts(**{name: values[:, index] if name == "lift" else values[index] for name, values in own.items()})
+
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
         return self.origins_of_rows(index, directions.T[:, None])[:, 0].T

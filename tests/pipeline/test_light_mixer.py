@@ -10,8 +10,7 @@ from fake_scene import run, wall
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.lighting import KeptPicture
-from ltsh_addon.pipeline.relight import LightPictures, Mixer, light_pictures, moved_picture
-from ltsh_addon.visibility import Occluders
+from ltsh_addon.pipeline.relight import LightPictures, Mixer, MovedLights, light_pictures
 
 # float32 sums of three lights in another order, and what EXR files hold of them.
 ROUNDING = 1e-5
@@ -181,9 +180,10 @@ def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
 
     shade(capsys, monkeypatch, room, out / "second", **occluders, change=move)
     kept, expected = kept_in(out / "first"), light_pictures(kept_in(out / "second"))
-    (path,) = (out / "first").glob("*.occluders.npz")
     mixer = Mixer(light_pictures(kept))
-    moved = moved_picture(kept, Occluders.load(path), move(kept.extraction.lights)[0])
+    lights = MovedLights.load(out / "first" / "shade.samples.npz")
+    moved = lights.picture(move(kept.extraction.lights)[0])
+    assert np.array_equal(moved, lights.picture(move(kept.extraction.lights)[0]))
     # Rays of both are as many as the share of the light in all light, which differs, asks for.
     assert np.abs(moved - expected.layers[0]).mean() < 0.02 * expected.layers[0].mean()
     mixer.replace(0, mixer.rows[0], moved)

@@ -11,7 +11,7 @@ import numpy as np
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
 from ...pipeline.lighting import KEPT_SUFFIX
-from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, Row, load_kept, moved_picture, tint
+from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, MovedLights, Row, tint
 from ...scene import AreaLight, SceneError
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
@@ -254,10 +254,10 @@ def update_moved(scene, moved: dict[int, AreaLight]) -> None:
         raise SceneError("lights of a final render: render again, or shade a picture, whose lights can be moved")
     result, mixer = result_of(scene), mixer_of(scene)
     if _mixer["kept"] is None:
-        _mixer["kept"] = load_kept((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
+        _mixer["kept"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
     for number, light in moved.items():
         row = replace(mixer.rows[number], light=light.record())
-        mixer.replace(number, row, moved_picture(*_mixer["kept"], light))
+        mixer.replace(number, row, _mixer["kept"].picture(light))
     path = result.folder / MIXER_FILE
     mixer.pictures.save(path)
     _mixer["stamp"] = str(path), path.stat().st_mtime_ns

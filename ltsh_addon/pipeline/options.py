@@ -348,14 +348,20 @@ def _scripts() -> Any:
 
 
 @dataclass(frozen=True)
-class PictureOptions:
-    """What to shade and how; None means as in the file."""
+class CameraOptions:
+    """Through which camera to look; None means as in the file."""
 
     scene: Path = _scene("one or more; left out when Blender has a file open")
     frame: int | None = _frame()
     camera: str | None = _camera()
     name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
     output: Path = _output()
+
+
+@dataclass(frozen=True)
+class PictureOptions(CameraOptions):
+    """What to shade and how; None means as in the file."""
+
     # Names, paths of tables, or from Python a `shading.OwnTechnique`.
     techniques: tuple[Any, ...] = _techniques(tuple(TECHNIQUES))
     passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
@@ -420,14 +426,9 @@ class BakeOptions:
 
 
 @dataclass(frozen=True)
-class ViewOptions:
+class ViewOptions(CameraOptions):
     """What to draw as the viewport does; None means as in the file."""
 
-    scene: Path = _scene("one or more; left out when Blender has a file open")
-    frame: int | None = _frame()
-    camera: str | None = _camera()
-    name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
-    output: Path = _output()
     techniques: tuple[str, ...] = option(
         "--techniques", default=("ltsh4",), type=tables, metavar="T",
         help=f"{', '.join(SHIPPED_TABLES)} or paths of tables (.npz), separated by commas (default: ltsh4)",
@@ -443,14 +444,9 @@ class ViewOptions:
 
 
 @dataclass(frozen=True)
-class RenderOptions:
+class RenderOptions(CameraOptions):
     """What to finish and how; None means as in the file."""
 
-    scene: Path = _scene("one or more; left out when Blender has a file open")
-    frame: int | None = _frame()
-    camera: str | None = _camera()
-    name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
-    output: Path = _output()
     techniques: tuple[str, ...] = option(
         "--techniques", default=("ltsh4",), type=one_table, metavar="T",
         help=f"of the direct light: {', '.join(SHIPPED_TABLES)} or the path of a table (.npz) (default: ltsh4)",

@@ -50,6 +50,7 @@ CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
 NOTE_COLOR = (0.95, 0.85, 0.45, 0.95)
+QUIET_COLOR, POINTED_COLOR = (0.7, 0.7, 0.7, 0.95), (1.0, 1.0, 1.0, 1.0)
 CAPTION_COLOR = (1.0, 1.0, 1.0, 0.95)
 BRIGHTER_COLOR, DARKER_COLOR = (1.0, 0.45, 0.4, 1.0), (0.5, 0.6, 1.0, 1.0)
 _logger = logging.getLogger(__name__)
@@ -125,7 +126,8 @@ class EngineView:
                 frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
         if not error and not self.mirror.lights and not self.mirror.sky.sides:
             notes = [NO_LIGHTS, *notes]
-        show(region, error, [*notes, *self.mirror.notes, *self._notes_of_shadows(size)], captions)
+        lines = [*notes, *self.mirror.notes, *self._notes_of_shadows(size)]
+        show(region, error, lines, captions, left_out(self.mirror, depsgraph.scene))
         is_waiting = self._renderer is not None and self._renderer.shadows is not None and self._shadows.waits
         if not error and self._renderer.samples < REFINEMENTS and not is_waiting:
             _redraw_later(start, self._renderer.samples)
@@ -211,6 +213,10 @@ def _captions(settings, mode: str) -> Captions:
     return Captions()
 
 
+# Panels that say more of what is left out.
+MATERIALS, LIGHTS = "LTSH_PT_VIEW3D_materials", "LTSH_PT_VIEW3D_lights"
+# The region whose quiet line the mouse points at.
+_pointed: dict[str, int | None] = {}
 Rectangle = tuple[float, float, float, float]  # left, bottom, right, top in pixels of the region
 
 
@@ -415,14 +421,36 @@ def _tag_views() -> None:
                 area.tag_redraw()
 
 
-# Region -> (error, notes, captions).
-_texts: dict[int, tuple[str, list[str], Captions]] = {}
+@dataclass(frozen=True)
+class QuietLine:
+    """What a view leaves out, and the panel that says more."""
+
+    text: str = ""
+    panel: str = MATERIALS
+
+
+def left_out(mirror, scene) -> QuietLine:
+    """What no view of this scene shows, but its Cycles pictures do."""
+    parts = ["No bounces"]
+    if mirror.has_glass:
+        parts.append("glass without refraction")
+    if not scene.ltsh.shadows:
+        parts.append("no shadows")
+    if not scene.ltsh_view.world and mirror.sky.sides:
+        parts.append("no light of the world")
+    is_about_lights = len(mirror.notes) > len(set(mirror.material_notes)) and not mirror.material_notes
+    return QuietLine("; ".join(parts), LIGHTS if is_about_lights else MATERIALS)
+
+
+# Region -> (error, notes, captions, quiet line), and where the last of these is: left, bottom, right, top.
+_texts: dict[int, tuple[str, list[str], Captions, QuietLine]] = {}
+_places: dict[int, Rectangle] = {}
 _handle = []
 
 
-def show(region, error: str, notes: list[str], captions: Captions) -> None:
+def show(region, error: str, notes: list[str], captions: Captions, quiet: QuietLine) -> None:
     """What `region` says from now on."""
-    _texts[region.as_pointer()] = (error, list(dict.fromkeys(notes)), captions)
+    _texts[region.as_pointer()] = (error, list(dict.fromkeys(notes)), captions, quiet)
 
 
 def lines_of(error: str, notes: list[str]) -> list[tuple[str, tuple]]:
@@ -443,32 +471,47 @@ def wrapped(lines: list[tuple[str, tuple]], width: float, width_of) -> list[tupl
     return broken
 
 
+def is_drawn(context) -> bool:
+    """True in 3D views that show the picture of the engine."""
+    space = context.space_data
+    is_view = space is not None and space.type == "VIEW_3D"
+    return is_view and context.engine == ENGINE and space.shading.type == "RENDERED"
+
+
 def _draw() -> None:
     context = bpy.context
-    space, region = context.space_data, context.region
-    if context.engine != ENGINE or space is None or space.shading.type != "RENDERED":
+    region = context.region
+    if not is_drawn(context):
         return
-    error, notes, captions = _texts.get(region.as_pointer(), ("", [], Captions()))
+    error, notes, captions, quiet = _texts.get(region.as_pointer(), ("", [], Captions(), QuietLine()))
     lines = lines_of(error, notes)
     scale = context.preferences.system.ui_scale
     font, size = 0, TEXT_SIZE * scale
     blf.size(font, size)
     sides = _covered(context)
-    free = region.width - sides["TOOLS"] - sides["UI"] - 2.0 * MARGIN * scale
+    # Blender's own boxes are at the left and above.
+    right = region.width - sides["UI"] - MARGIN * scale
+    free = right - max(sides["TOOLS"], sides["HUD"]) - MARGIN * scale
     lines = wrapped(lines, free, lambda text: blf.dimensions(font, text)[0])
+    if quiet.text:
+        pointed = _pointed.get("region") == region.as_pointer()
+        lines.append((quiet.text, POINTED_COLOR if pointed else QUIET_COLOR))
+        width, bottom = blf.dimensions(font, quiet.text)[0], MARGIN * scale
+        _places[region.as_pointer()] = right - width - 0.5 * size, bottom - 0.35 * size, right, bottom + 1.05 * size
     for number, (line, color) in enumerate(reversed(lines)):
-        _write(font, line, sides["TOOLS"] + MARGIN * scale, MARGIN * scale + number * 1.4 * size, size, color)
+        width = blf.dimensions(font, line)[0]
+        _write(font, line, right - width, MARGIN * scale + number * 1.4 * size, size, color)
     blf.size(font, CAPTION_SIZE * scale)
     _draw_captions(font, captions, region, sides, scale)
 
 
 def _covered(context) -> dict[str, int]:
     """Pixels that other regions of the area cover, by their type."""
-    covered = {"TOOLS": 0, "UI": 0, "HEADER": 0, "TOOL_HEADER": 0}
+    covered = {"TOOLS": 0, "UI": 0, "HUD": 0, "HEADER": 0, "TOOL_HEADER": 0}
     if context.preferences.system.use_region_overlap:
         for part in context.area.regions:
             if part.type in covered and part.width > 1 and part.height > 1:
-                covered[part.type] = part.width if part.type in ("TOOLS", "UI") else part.height
+                covered[part.type] = part.width if part.type in ("TOOLS", "UI", "HUD") else part.height
     return covered
 
 
@@ -504,8 +547,48 @@ def _write(font: int, text: str, x: float, y: float, size: float, color) -> None
     blf.draw(font, text)
 
 
+class LTSH_GT_left_out(bpy.types.Gizmo):
+    """The quiet line as a button."""
+
+    bl_idname = "LTSH_GT_left_out"
+
+    def test_select(self, context, location):
+        left, bottom, right, top = _places.get(context.region.as_pointer(), (0.0, 0.0, 0.0, 0.0))
+        return 0 if left <= location[0] <= right and bottom <= location[1] <= top else -1
+
+    def draw(self, context):
+        """The text is drawn with the notes."""
+        _pointed["region"] = context.region.as_pointer() if self.is_highlight else None
+
+
+class LTSH_GGT_left_out(bpy.types.GizmoGroup):
+    """The quiet line in every view that has one; a click shows the panel that says more."""
+
+    bl_idname = "LTSH_GGT_left_out"
+    bl_label = "LTSH what is left out"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "WINDOW"
+    bl_options = {"PERSISTENT"}
+
+    @classmethod
+    def poll(cls, context):
+        return is_drawn(context)
+
+    def setup(self, context):
+        self.line = self.gizmos.new(LTSH_GT_left_out.bl_idname)
+
+    def draw_prepare(self, context):
+        texts = _texts.get(context.region.as_pointer())
+        self.line.target_set_operator("wm.call_panel").name = MATERIALS if texts is None else texts[3].panel
+
+
+CLASSES = (LTSH_GT_left_out, LTSH_GGT_left_out)
+_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
+
+
 def register() -> None:
     """Add the drawing to all 3D views."""
+    _add_classes()
     if not bpy.app.background:
         _handle.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
 
@@ -519,4 +602,6 @@ def unregister() -> None:
         shadows.stop()
     while _handle:
         bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
+    _remove_classes()
     _texts.clear()
+    _places.clear()

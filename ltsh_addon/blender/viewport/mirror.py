@@ -239,8 +239,12 @@ class SceneMirror:
     @property
     def notes(self) -> list[str]:
         """What is not shown as Cycles has it, each once."""
-        found = [note for shown in self._looks.values() for note in shown.look.notes]
-        return list(dict.fromkeys([*found, *self._light_notes, *self._world_note]))
+        return list(dict.fromkeys([*self.material_notes, *self._light_notes, *self._world_note]))
+
+    @property
+    def material_notes(self) -> list[str]:
+        """Those of `notes` that are about materials."""
+        return [note for shown in self._looks.values() for note in shown.look.notes]
 
     @property
     def triangles(self) -> int:

@@ -1,5 +1,8 @@
 """Materials in the viewport: every lobe and texture that Cycles samples, and what is not shown is named."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
@@ -9,10 +12,13 @@ from view_pictures import SIZE, image, normal_map, patches_too_far, textured, vi
 
 from ltsh_addon import shading
 from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.materials.looks import look_of
-from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.ui import panels
+from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.sky import constant_sky
 from ltsh_addon.blender.viewport.surfaces import View
 from ltsh_addon.cycles.closures import velvet_albedo
 
@@ -260,6 +266,29 @@ def test_an_image_that_is_turned_out_of_its_plane_is_not_resolved():
     assert look_of(material).notes == ()
     material.node_tree.nodes["Mapping"].inputs["Rotation"].default_value = (0.5, 0.0, 0.0)
     assert look_of(material).notes == (f"{material.name}: Base Color is not resolved",)
+
+
+@pytest.mark.parametrize(
+    ("glass", "shadows", "world", "text"),
+    [
+        (False, True, True, "No bounces"),
+        (True, True, True, "No bounces; glass without refraction"),
+        (False, False, False, "No bounces; no shadows; no light of the world"),
+    ],
+)
+def test_one_line_says_what_a_view_leaves_out(glass, shadows, world, text):
+    mirror = SceneMirror()
+    mirror.take_sky(constant_sky(light_of_world(parts.add_world()[0]), np.ones(3), np.ones(3)))
+    shown = look_of(made("Pane", "BsdfGlass" if glass else "BsdfDiffuse", {})())
+    mirror._looks = {"Pane": ShownLook(shown, None)}
+    scene = SimpleNamespace(ltsh=SimpleNamespace(shadows=shadows), ltsh_view=SimpleNamespace(world=world))
+    assert view.left_out(mirror, scene) == view.QuietLine(text, view.MATERIALS)
+    # Where nothing but lights is approximated, a click shows the lights.
+    mirror._light_notes = ("Lamp: its nodes are not resolved",)
+    assert view.left_out(mirror, scene).panel == view.LIGHTS
+    mirror._looks["Pane"] = ShownLook(replace(shown, notes=("Pane: odd",)), None)
+    assert view.left_out(mirror, scene).panel == view.MATERIALS
+    assert {view.LIGHTS, view.MATERIALS} <= {panel.bl_idname for panel in panels.CLASSES if hasattr(panel, "bl_idname")}
 
 
 def test_long_lines_of_the_view_are_broken():

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.special import erf
 
 from ltsh_addon.shading import brdf, spherical_harmonics
-from ltsh_addon.shading.lookup_table import basis_integrals, basis_values
+from ltsh_addon.shading.lookup_table import basis_integrals, basis_values, bent
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,9 @@ class Family:
     kind "ltc": the clamped cosine, whose axis may tilt (fourth parameter of the warp). kind "ltsh": the polynomials in
     x, z of a degree, which are the spherical harmonics even in y; `powers` restricts them to some monomials
     x^p z^q: their integral needs fewer terms per edge. A table stores spherical harmonics coefficients in any case.
-    With a `bend` the two functions of `lookup_table.bent_cosines` are added to the spherical harmonics.
+    With a `bend` the two functions of `lookup_table.bent_cosines` are added to the spherical harmonics. With a `second`
+    family its lobe is added, under one more warp of three parameters (log xx, xz / xx, log yy) in the original domain:
+    a sum of two lobes, for which there are no tables.
     """
 
     name: str
@@ -29,16 +31,17 @@ class Family:
     degree: int
     powers: tuple[tuple[int, int], ...] = ()
     bend: tuple[float, float, float] | None = None
+    second: Family | None = None
 
     @property
     def parameters(self) -> int:
         """Number of warp channels."""
-        return 4 if self.kind == "ltc" else 3
+        return 4 if self.kind == "ltc" else 3 if self.second is None else 6
 
     @property
     def size(self) -> int:
         """Number of free coefficients."""
-        return len(self.span)
+        return len(self.span) + (0 if self.second is None else self.second.size)
 
     @cached_property
     def span(self) -> np.ndarray:
@@ -66,7 +69,15 @@ class Family:
         return np.abs(self.span[:, ~np.array(zonal)]).max(axis=1, initial=0.0) < 1e-9
 
     def basis(self, unit, tilt):
-        """Basis functions (P, S, size) at unit directions (P, S, 3) of the original domain; tilt (P,)."""
+        """Basis functions (P, S, size) at unit directions (P, S, 3) of the original domain; tilt (P,), or (P, 3): the
+        warp of the second lobe."""
+        if self.second is not None:
+            xx, xz, yy = np.exp(tilt[:, 0]), np.exp(tilt[:, 0]) * tilt[:, 1], np.exp(tilt[:, 2])
+            warped = np.moveaxis(bent((xx[:, None], xz[:, None], yy[:, None]), np.moveaxis(unit, -1, 0)), 0, -1)
+            length = np.sqrt((warped * warped).sum(axis=-1, keepdims=True))
+            second = self.second.basis(warped / length, np.zeros(len(tilt)))
+            second = second * (xx * yy)[:, None, None] / length**3
+            return np.concatenate([replace(self, second=None).basis(unit, tilt), second], axis=-1)
         if self.kind == "ltc":
             toward_axis = np.sin(tilt)[:, None] * unit[..., 0] + np.cos(tilt)[:, None] * unit[..., 2]
             return np.maximum(toward_axis, 0.0)[..., None] / np.pi
@@ -75,6 +86,9 @@ class Family:
 
     def basis_albedo(self, tilt):
         """Integrals (P, size) of the basis functions over the upper hemisphere."""
+        if self.second is not None:
+            parts = [family.basis_albedo(np.zeros(len(tilt))) for family in (replace(self, second=None), self.second)]
+            return np.concatenate(parts, axis=1)
         if self.kind == "ltc":
             return 0.5 * (1.0 + np.cos(tilt))[:, None]
         integrals = self.span @ basis_integrals(self.span.shape[1])
@@ -104,7 +118,11 @@ def odd_in_z(degree: int) -> Family:
 
 
 def family_named(name: str) -> Family:
-    """The family "ltc", "ltshN", "ltshNc", "ridgesN", "zonalN" or "oddN" of degree N = 1..8. Raises ValueError."""
+    """The family "ltc", "ltshN", "ltshNc", "ridgesN", "zonalN" or "oddN" of degree N = 1..8, or a sum of two lobes,
+    "ltshN+ltshM" or "ltshN+ltc". Raises ValueError."""
+    if re.fullmatch(r"ltsh[1-8]\+(ltsh[1-8]|ltc)", name):
+        first, second = (family_named(part) for part in name.split("+"))
+        return replace(first, name=name, second=second)
     if name == "ltc":
         return Family("ltc", "ltc", 1)
     makers = {"ltsh": lambda n: Family(f"ltsh{n}", "ltsh", n), "ridges": two_ridges, "zonal": zonal, "odd": odd_in_z}

@@ -11,7 +11,7 @@ nothing of lights and the fit of the tables does, so ratios below 1 are possible
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,18 +22,22 @@ from ltsh_addon.shading.lookup_table import LookupTable
 from .families import GGX, family_named
 from .projection import FLAT, Points, project, relative_error, warped_basis
 from .validate import disks, grid, hemisphere_samples
-from .walk import HIGHEST, LOWEST, minimize, warp_of
+from .walk import bounds, minimize, warp_of
 
 COUNT = 12
 # Start of a search: beta as a share of -theta_o, and the logarithms of a cos^2(beta) / (2 alpha) and c / (2 alpha).
 STARTS = ((1.0, 0.0), (0.8, -0.3), (0.5, -0.6), (0.2, -1.0))
+# Of the warp of a second lobe, beside the best one of the first lobe alone.
+SECOND_STARTS = ((1, 0, 1), (-1, 0, -1), (-1, 0.7, 0.2), (0.5, -0.2, -0.4), (-1.5, 1, -1.5), (2, 0, 2))
 # Grazing views at which tables are set beside solved lobes, and the ratio of their errors that is good.
 ROUGHNESS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)
 COSINES = (0.04, 0.06, 0.09, 0.13, 0.2)
 GOAL = 1.2
 CURVES = {
     "clamped cosine (LTC)": ["ltc"],
-    "spherical harmonics": ["ltsh1", "ltsh2", "ltsh3", "ltsh4", "ltsh6"],
+    "spherical harmonics": ["ltsh1", "ltsh2", "ltsh3", "ltsh4", "ltsh5", "ltsh6"],
+    "the same and a bent cosine": ["ltsh1c", "ltsh2c", "ltsh3c", "ltsh4c"],
+    "sum of two lobes": ["ltsh1+ltc", "ltsh2+ltc", "ltsh2+ltsh2", "ltsh3+ltc", "ltsh4+ltc"],
     "two ridges, h(x) + h(z)": ["ridges3", "ridges4", "ridges6"],
     "zonal, h(z)": ["zonal2", "zonal4", "zonal6"],
     "odd in z": ["odd3", "odd4", "odd6"],
@@ -76,7 +80,11 @@ def best_lobes(family, cosine, roughness, shape, starts=()):
             better = errors < best[part]
             found[part[better]], best[part[better]] = parameters[better], errors[better]
 
-    for share, logarithm in STARTS:
+    if family.second is not None:
+        _, first = best_lobes(replace(family, second=None), cosine, roughness, shape)
+        second = [np.broadcast_to(np.array(start, dtype=float), (len(first), 3)) for start in SECOND_STARTS]
+        starts = [*(np.concatenate([first, start], axis=1) for start in second), *starts]
+    for share, logarithm in STARTS if family.second is None else ():
         start = np.zeros_like(found)
         start[:, :2], start[:, 2] = logarithm, -share * theta
         search(start)
@@ -90,7 +98,7 @@ def best_lobes(family, cosine, roughness, shape, starts=()):
 def _search(family, cosine, roughness, start):
     """Errors (P,) and warp parameters (P, n) of the minima next to `start`."""
     points = Points.at(GGX, cosine, roughness**2, FLAT)
-    start = np.clip(start, LOWEST[: family.parameters], HIGHEST[: family.parameters])
+    start = np.clip(start, *bounds(family))
     found = minimize(family, points, start, np.zeros(start.shape, dtype=bool), penalty=0.0, iterations=40)
     entries, tilt = warp_of(family, points, found)
     coefficients = project(family, points, entries, tilt)[0][:, 0]
@@ -103,6 +111,8 @@ def edge_terms(name: str) -> int:
     family = family_named(name)
     if family.kind == "ltc":
         return 1
+    if family.second is not None:
+        return sum(map(edge_terms, name.split("+")))
     if family.bend is not None:
         return family.size
     used = np.abs(family.span @ ridge_matrix(family.degree)) > 1e-9

@@ -16,7 +16,7 @@ from . import optimum, validate
 matplotlib.use("Agg")
 
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 110}
-COLORS = {"ltc": "tab:gray", "ltsh2": "tab:blue", "ltsh4": "tab:red"}
+COLORS = {"ltc": "tab:gray", "ltsh2": "tab:blue", "ltsh4": "tab:red", "ltsh4c": "tab:green"}
 # Lobes at grazing angle: (roughness, theta_o in degrees)
 LOBES = [(0.25, 80.0), (0.5, 80.0), (0.5, 87.0), (0.8, 80.0)]
 

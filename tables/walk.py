@@ -22,6 +22,15 @@ MAX_BETA = 1.5705
 # Where the lobe is cut by the horizon on the scale of alpha, free parameters would run away for no gain.
 LOWEST = np.array([-2.0, -2.5, -MAX_BETA, -1.5])
 HIGHEST = np.array([6.0, 2.0, 0.5, 1.5])
+# The same for the warp of a second lobe.
+MOST_OF_SECOND = np.array([4.0, 30.0, 4.0])
+
+
+def bounds(family):
+    """The least and the greatest values (n,) of the warp parameters."""
+    if family.second is None:
+        return LOWEST[: family.parameters], HIGHEST[: family.parameters]
+    return np.concatenate([LOWEST[:3], -MOST_OF_SECOND]), np.concatenate([HIGHEST[:3], MOST_OF_SECOND])
 
 
 def minimize(family, points, start, frozen, *, penalty=PENALTY, iterations=14):
@@ -30,7 +39,7 @@ def minimize(family, points, start, frozen, *, penalty=PENALTY, iterations=14):
     `penalty` times the squared distance to `start` is added to the squared relative error; `frozen` (P, n) stay.
     """
     identity = np.eye(family.parameters)
-    lowest, highest = LOWEST[: family.parameters], HIGHEST[: family.parameters]
+    lowest, highest = bounds(family)
 
     def residuals(parameters):
         return project(family, points, *warp_of(family, points, parameters))[1][..., 0]
@@ -65,9 +74,12 @@ def minimize(family, points, start, frozen, *, penalty=PENALTY, iterations=14):
 
 
 def warp_of(family, points, parameters):
-    """Entries (xx, xz, yy, zz) of W and the tilt, (P,) each, for parameters (P, n)."""
+    """Entries (xx, xz, yy, zz) of W and the tilt, (P,) each, for parameters (P, n); for sums of two lobes the
+    parameters (P, 3) of the second one in place of the tilt."""
     xx = np.exp(-parameters[:, 0]) * np.cos(parameters[:, 2]) ** 2
     entries = (xx, -xx * np.tan(parameters[:, 2]), np.exp(-parameters[:, 1]), 2.0 * points.alpha)
+    if family.second is not None:
+        return entries, parameters[:, 3:]
     return entries, parameters[:, 3] if family.kind == "ltc" else np.zeros(len(parameters))
 
 
@@ -111,7 +123,7 @@ def _search(family, points, prediction, symmetric):
     prediction[:, 2] = np.clip(prediction[:, 2], -MAX_BETA, 0.0)
     frozen = symmetric[:, None] & (np.arange(family.parameters) >= 2)
     prediction[frozen] = 0.0
-    prediction = np.clip(prediction, LOWEST[: family.parameters], HIGHEST[: family.parameters])
+    prediction = np.clip(prediction, *bounds(family))
     return minimize(family, points, prediction, frozen)
 
 

@@ -157,7 +157,7 @@ class LookupTable:
 
 def bent(bend, vectors) -> np.ndarray:
     """Vectors (3, ...) under the warp of `bent_cosines`."""
-    xx, xz, yy = (vectors.dtype.type(entry) for entry in bend)
+    xx, xz, yy = (np.asarray(entry, vectors.dtype) for entry in bend)
     return np.stack([xx * vectors[0] + xz * vectors[2], yy * vectors[1], vectors[2]])
 
 

@@ -19,6 +19,7 @@ WRONG = [
     ([], "required: fit|validate|optimum|plot"),
     (["polish"], "invalid choice: 'polish'"),
     (["fit", "ltsh9"], "table 'ltsh9' is unknown, expected ltc"),
+    (["fit", "ltsh2+ltc"], "a sum of two lobes cannot be fitted"),
     (["fit", "--size"], "expected one argument"),
     (["fit", "--size", "3"], "size is '3', expected a whole number of at least 4"),
     (["fit", "--jobs", "0"], "number of jobs is '0', expected a whole number of at least 1"),

@@ -344,7 +344,7 @@ class SurfaceSamples:
     specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0
     diffuse_roughness: np.ndarray | None = None  # (P,) sigma of Oren and Nayar in [0, 1]; left out: 0
     diffuse_rebound: np.ndarray | None = None  # (P, 3) multiple scattering of such a surface; left out: 0
-    sheen_a: np.ndarray | None = None  # (P,) left out, or 0: no sheen
+    sheen_a: np.ndarray | None = None  # (P,) left out, or 0: no sheen; below 0 the sigma of velvet, times -1
     sheen_b: np.ndarray | None = None  # (P,)
     receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; left out: 0
     anisotropy: np.ndarray | None = None  # (P,) in (-1, 1); left out: 0

@@ -38,7 +38,8 @@ def _parser():
     actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot")
     default = f"default: {', '.join(SHIPPED_TABLES)}"
     fitting = actions.add_parser("fit", help="fit tables; goes on where a fit of the same settings was stopped")
-    fitting.add_argument("names", nargs="*", type=_fitted_name, metavar="TABLE", help=f"ltc, ltsh1 to ltsh8, or these with a c; {default}")
+    names = f"ltc, ltsh1 to ltsh8, or these with a c; {default}"
+    fitting.add_argument("names", nargs="*", type=_fitted_name, metavar="TABLE", help=names)
     fitting.add_argument("-o", dest="output", type=Path, default=FOLDER, metavar="OUT", help="folder; default: tables")
     fitting.add_argument("--brdf", choices=BRDFS, default="ggx", help="other BRDFs get the name <brdf>_<table>")
     fitting.add_argument("--size", type=_size, default=64, metavar="N", help="nodes per axis, default 64")

@@ -11,7 +11,7 @@ from ..scene import SurfaceSamples
 from ..shading import diffuse as rough_diffuse
 from ..shading.brdf import is_clipped
 from . import closures
-from .closures import sheen_albedo, sheen_lobe, velvet_albedo
+from .closures import sheen_albedo, sheen_lobe
 from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal
 
 AOV_PREFIX = "ltsh_"
@@ -112,6 +112,7 @@ def lobe_names(channels: dict[str, np.ndarray]) -> list[list[str]]:
     return [names for names in slots if names]
 
 
+LEAST_VELVET = 0.01  # of its roughness, as in Cycles
 # Below this weight Cycles drops a closure.
 SMALLEST_WEIGHT = 1e-5
 
@@ -425,7 +426,9 @@ def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
     """
     expected = np.zeros_like(hits.diffuse_albedo)
     for part in parts:
-        expected[part.index] += part.diffuse
+        # To Cycles velvet is no diffuse lobe.
+        is_velvet = np.broadcast_to(np.asarray(part.shape.get("sheen_a", 0.0)) < 0.0, len(part.index))
+        expected[part.index] += np.where(is_velvet[:, None], 0.0, part.diffuse)
     change = slot.weight[:, None] * shine - shine.max(axis=1, keepdims=True) * base.diffuse
     missing = (hits.diffuse_albedo - expected)[base.index]
     square = (change * change).sum(axis=1)
@@ -489,11 +492,10 @@ def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
 def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
     """Everything but coat and transmission."""
     specular = _metal_terms(slot)
-    diffuse = np.where(slot.of("diffuse") | slot.of("translucent"), slot.color, 0.0)
-    for kind, albedo_of in (("sheen", sheen_albedo), ("velvet", velvet_albedo)):
-        if slot.of(kind).any():
-            albedo = albedo_of(slot.cosine(slot.normal), slot.roughness)[:, None]
-            diffuse = np.where(slot.of(kind), slot.color * albedo, diffuse)
+    diffuse = np.where(slot.of("diffuse") | slot.of("translucent") | slot.of("velvet"), slot.color, 0.0)
+    if slot.of("sheen").any():
+        albedo = sheen_albedo(slot.cosine(slot.normal), slot.roughness)[:, None]
+        diffuse = np.where(slot.of("sheen"), slot.color * albedo, diffuse)
     shape = _diffuse_shape(slot) | slot.stretch()
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
     for kind in ("conductor", "conductor_4_5"):
@@ -532,9 +534,11 @@ def _diffuse_shape(slot: LobeSlot) -> dict[str, np.ndarray]:
         roughness = np.where((slot.of("diffuse") | slot.of("principled"))[:, 0], roughness, 0.0)
         shape["diffuse_roughness"] = roughness
         shape["diffuse_rebound"] = rough_diffuse.rebound(slot.color, slot.cosine(slot.normal), roughness)
-    if slot.of("sheen").any():
+    if slot.of("sheen").any() or slot.of("velvet").any():
         _, a, b = sheen_lobe(slot.cosine(slot.normal), slot.roughness)
-        shape |= {"sheen_a": np.where(slot.of("sheen")[:, 0], _tilted(a), 0.0), "sheen_b": b}
+        a = np.where(slot.of("sheen")[:, 0], _tilted(a), 0.0)
+        a = np.where(slot.of("velvet")[:, 0], -np.clip(slot.roughness, LEAST_VELVET, 1.0), a)
+        shape |= {"sheen_a": a, "sheen_b": b}
     return shape
 
 

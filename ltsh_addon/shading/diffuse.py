@@ -1,4 +1,4 @@
-"""Diffuse lobes that are not Lambert's, over polygons: sheen, and rough surfaces.
+"""Diffuse lobes that are not Lambert's, over polygons: sheen, velvet, and rough surfaces.
 
 Sheen is a linearly transformed cosine (Zeltner, Burley and Chiang 2022). Rough surfaces are Fujii's variant of Oren and
 Nayar 1994 with multiple scattering, as in OpenPBR and in Cycles. With the normal z and the view direction
@@ -10,6 +10,8 @@ A = 1 / (pi + sigma (pi / 2 - 2 / 3)), B = sigma A, E(z) = pi A + B G(z) the alb
 d omega = dz dphi, so that by Green's theorem the integral of x h(z) is that of y h(z) dz around the polygon, and the
 integral of h(z) that of the normal's z times (integral of h above z) / (1 - z^2) along its arcs: integrals over arcs of
 functions without poles, which Gauss-Legendre nodes do. What t has for x > 0 needs the polygon cut there.
+
+Velvet, Ashikhmin's sheen, has no closed form: Gauss-Legendre nodes in the triangles of the polygon.
 """
 
 from __future__ import annotations
@@ -23,6 +25,8 @@ from .polygon import project_to_sphere, split_at_horizon
 
 # Of an arc: integrals are off by 4e-4 at the ends of t, where z = cos(theta_o), and by 1e-9 elsewhere (median 1e-10).
 ARC_NODES = 8
+# Along both sides of a triangle.
+VELVET_NODES = 16
 _ANGLES = 2048
 
 
@@ -30,6 +34,39 @@ def sheen_form_factor(polygon: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.n
     """Signed integral (P,) of z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2 over polygons (3, V, P) in z >= 0."""
     x, y, z = polygon
     return form_factor(np.stack([a * x + b * z, a * y, z]))
+
+
+def velvet_lobe(x, z, cosine, sigma):
+    """BRDF times cosine of velvet, in sr^-1, toward unit directions with x toward the view and z, of surfaces seen
+    under the cosine; all arrays broadcast.
+
+    Ashikhmin, Premoze and Shirley 2000, "A microfacet-based BRDF generator", section 4.3, without Fresnel.
+    """
+    cosine = np.maximum(cosine, 1e-4)
+    # Squared cosines of half the angle between both rays, and of the normal to the half vector.
+    half = np.maximum(0.5 * (1.0 + cosine * z + np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) * x), 1e-12)
+    normal = np.clip((cosine + z) ** 2 / (4.0 * half), 0.0, 1.0 - 1e-9)
+    masked = np.minimum(1.0, 2.0 * np.sqrt(normal / half) * np.minimum(cosine, z))
+    density = np.exp(-normal / ((1.0 - normal) * sigma**2)) / (np.pi * (sigma * (1.0 - normal)) ** 2)
+    return density * masked / (4.0 * cosine)
+
+
+def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Integral (P,) of `velvet_lobe` over polygons (3, V, P) in z >= 0, either way around."""
+    corners, total = project_to_sphere(polygon), 0.0
+    count = VELVET_NODES if corners.shape[1] <= 8 else VELVET_NODES // 2
+    nodes, weights = np.polynomial.legendre.leggauss(count)
+    nodes, weights = 0.5 * (nodes[:, None] + 1.0), 0.5 * weights[:, None]
+    for place in range(1, corners.shape[1] - 1):
+        first, second, third = corners[:, 0], corners[:, place], corners[:, place + 1]
+        volume = (first * np.cross(second, third, axis=0)).sum(axis=0)
+        for share, weight in zip(nodes[:, 0], weights[:, 0], strict=True):
+            # Toward the second corner, and from there toward the third.
+            x, y, z = first[:, None] + share * ((second - first)[:, None] + nodes * (third - second)[:, None])
+            inverse = 1.0 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-30))
+            values = velvet_lobe(x * inverse, z * inverse, cosine, sigma) * inverse**3
+            total = total + share * weight * volume * (weights * values).sum(axis=0)
+    return np.abs(total)
 
 
 def rough_terms(roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -117,7 +154,8 @@ def _slope_table():
 
 def diffuse_factor(directions, height, normal, view, shape):
     """Lobe over cosine, times pi (S, Q), toward unit directions (3, S, Q) of the cosines `height` (S, Q), of Q samples
-    with the axes (3, Q) and the `shape` (4, Q): sigma, a and b of sheen, R. It is 1 where all these are 0."""
+    with the axes (3, Q) and the `shape` (4, Q): sigma, a and b of sheen, R. It is 1 where all these are 0; velvet has
+    a below 0."""
     sigma, sheen_a, sheen_b, scattered = shape
     cosine = (normal * view).sum(axis=0)
     # The part of the view along the surface, of a length that is the sine.
@@ -127,6 +165,9 @@ def diffuse_factor(directions, height, normal, view, shape):
     squared = np.maximum(1.0 - height * height - x * x, 0.0)
     q = (sheen_a * x + sheen_b * height) ** 2 + sheen_a * sheen_a * squared + height * height
     sheen = (sheen_a / np.maximum(q, 1e-12)) ** 2
+    if (sheen_a < 0.0).any():
+        velvet = np.pi * velvet_lobe(x, np.maximum(height, 1e-6), cosine, np.maximum(-sheen_a, 1e-2))
+        sheen = np.where(sheen_a < 0.0, velvet / np.maximum(height, 1e-6), sheen)
     a, b = rough_terms(sigma)
     t = np.where(along > 0.0, along / np.maximum(np.maximum(height, cosine), 1e-6), along)
     rough = np.pi * (a + b * t + scattered * (1.0 - np.pi * a - b * albedo_slope(height)))

@@ -142,6 +142,10 @@ def _diffuse_kinds(samples, frame, lit):
     def sheen(polygon, index):
         return np.abs(diffuse.sheen_form_factor(polygon, samples.sheen_a[index], samples.sheen_b[index]))[None]
 
+    def velvet(polygon, index):
+        cosine = (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1)
+        return diffuse.velvet_integral(polygon, cosine, -samples.sheen_a[index])[None]
+
     def rough(polygon, index):
         cosine = (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1)
         return diffuse.rough_integrals(polygon, cosine, samples.diffuse_roughness[index])
@@ -150,9 +154,10 @@ def _diffuse_kinds(samples, frame, lit):
         return lambda polygon, index: lobe(polygon, index) * _bump_shadowing(samples, frame, index, polygon)
 
     bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
-    shiny = samples.sheen_a[lit] != 0.0
-    coarse = (samples.diffuse_roughness[lit] != 0.0) & ~shiny
-    for count, lobe, chosen in ((1, lambert, ~(shiny | coarse)), (1, sheen, shiny), (2, rough, coarse)):
+    shiny, soft = samples.sheen_a[lit] > 0.0, samples.sheen_a[lit] < 0.0
+    coarse = (samples.diffuse_roughness[lit] != 0.0) & ~(shiny | soft)
+    plain = ~(shiny | soft | coarse)
+    for count, lobe, chosen in ((1, lambert, plain), (1, sheen, shiny), (1, velvet, soft), (2, rough, coarse)):
         yield lit[chosen & ~bumped], None, count, lobe
         yield lit[chosen & bumped], samples.smooth_normal, count, shadowed(lobe)
 

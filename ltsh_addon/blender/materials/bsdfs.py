@@ -76,14 +76,19 @@ BSDFS = {
     ),
     (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}),
     (SHEEN, "ASHIKHMIN"): Bsdf(
-        "velvet", {**COLOR, **ROUGHNESS}, f"{AS_DIFFUSE} of the same albedo, and in Cycles' passes it is specular"
+        "velvet", {**COLOR, **ROUGHNESS}, "is in the diffuse pass, in Cycles its Ashikhmin sheen is specular"
     ),
     # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
-    (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo"),
+    (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo, 27 to 72 % off"),
     (SUBSURFACE, ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),
 }
 # Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
 NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
+# What that is off, of the light of a ball and a floor under two area lights (root mean square).
+NEAREST_ERROR = {
+    "BECKMANN": "5 % off at roughness 0.2, 11 % at 0.5, 28 % at 1",
+    "ASHIKHMIN_SHIRLEY": "5 % off at roughness 0.2, 9 % at 0.5, 83 % at 1",
+}
 
 
 def bsdf_of(node) -> Bsdf | None:
@@ -183,7 +188,7 @@ def notes_of(node) -> list[str]:
             notes.append(f"{name} of {node.name!r} {done}")
     distribution = getattr(node, "distribution", "")
     if distribution in NEAREST_ALPHA:
-        alpha = f"{NEAREST_ALPHA[distribution]} times its alpha"
+        alpha = f"{NEAREST_ALPHA[distribution]} times its alpha, {NEAREST_ERROR[distribution]}"
         notes.append(f"distribution {distribution} of {node.name!r} is shaded as GGX of {alpha}")
     return notes
 

@@ -1,5 +1,7 @@
 """Every kind of material against Cycles: exact ones to 0.3 %, approximated ones to what was measured."""
 
+import re
+
 import bpy
 import material_scenes
 import numpy as np
@@ -8,6 +10,7 @@ import scene_parts
 from scene_parts import bsdf_material
 
 from ltsh_addon.cycles import gbuffer
+from ltsh_addon.imaging import unbiased_relative_error
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.brdf import dielectric_reflectance
@@ -116,6 +119,8 @@ def test_an_approximated_material_is_named_and_near(tmp_path, name):
     kind, tolerances = APPROXIMATED[name]
     prepared = material_scenes.prepared_scene(lambda: material(**kind))
     assert len(prepared[3]) == 1 and "'Material'" in prepared[3][0] and "BSDF'" in prepared[3][0]
+    if kind.get("node_type") == GLOSSY:
+        assert re.search(r"\d+ % off", prepared[3][0])
     found = material_scenes.errors(tmp_path, prepared, CYCLES_SAMPLES, techniques=("reference",))
     for lobe, tolerance in zip(("specular", "diffuse"), tolerances, strict=True):
         squared = found[lobe, "reference"][0]
@@ -123,15 +128,16 @@ def test_an_approximated_material_is_named_and_near(tmp_path, name):
         assert tolerance is None or percent(squared) < tolerance, (lobe, percent(squared))
 
 
-def test_velvet_is_shaded_as_diffuse_light_of_its_albedo(tmp_path):
-    """Cycles counts it as specular; beside a dielectric, whose diffuse part stays what it is in Cycles. The lobe itself
-    is not diffuse: 25 % as measured."""
+@pytest.mark.parametrize("roughness", [0.5, 1.0])
+def test_velvet_is_shaded_as_cycles_does(tmp_path, roughness):
+    """Cycles counts it as specular; beside a dielectric, whose diffuse part stays what it is in Cycles. Cycles samples
+    velvet uniformly, which leaves noise."""
     scene_parts.empty_scene(*material_scenes.SIZE)
-    velvet = material("ShaderNodeBsdfSheen", settings=(("distribution", "ASHIKHMIN"),), Roughness=1.0)
+    velvet = material("ShaderNodeBsdfSheen", settings=(("distribution", "ASHIKHMIN"),), Roughness=roughness)
     material_scenes.build(velvet)
     bpy.data.objects["Plane"].data.materials[0] = material(name="Floor")
     prepared = scene_parts.prepare()
-    assert len(prepared[3]) == 1 and "shaded as a Diffuse BSDF of the same albedo" in prepared[3][0]
+    assert len(prepared[3]) == 1 and "is in the diffuse pass" in prepared[3][0]
     ((samples, pixel, _),), _ = scene_parts.sample(tmp_path, prepared)
     halves = scene_parts.reference(tmp_path, prepared, 256)
     samples, film = gbuffer.join([(samples, pixel)], *material_scenes.SIZE)
@@ -140,7 +146,9 @@ def test_velvet_is_shaded_as_diffuse_light_of_its_albedo(tmp_path):
     cycles = {name: image.mean(axis=0) for name, image in halves.items()}
     ball = (cycles["diffuse"] == 0.0).all(axis=-1) & (film.coverage() > 0.0)
     assert ball.sum() > 10 and not ours["specular"][ball].any()
-    assert ours["diffuse"][ball].sum() == pytest.approx(cycles["specular"][ball].sum(), rel=0.25)
+    assert ours["diffuse"][ball].sum() == pytest.approx(cycles["specular"][ball].sum(), rel=0.01)
+    _, squared = unbiased_relative_error(ours["diffuse"], *halves["specular"], ball)
+    assert percent(squared) < 1.5
     assert ours["diffuse"][~ball].sum() == pytest.approx(cycles["diffuse"][~ball].sum(), rel=0.01)
 
 

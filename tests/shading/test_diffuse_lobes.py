@@ -109,6 +109,11 @@ def test_velvet_is_integrated_as_its_formula_says():
         # The kink of the masking crosses some polygons.
         assert found[number] == pytest.approx(expected, rel=2e-3, abs=1e-6)
         assert turned[number] == pytest.approx(expected, rel=2e-3, abs=1e-6)
+        # By which rays to lights are weighed.
+        direction = np.array([0.6, 0.0, 0.8])[:, None, None]
+        rows = np.array([0.0, 0.0, 1.0])[:, None], view[:, None], np.array([[0.0], [-sigma[number]], [0.0], [0.0]])
+        factor = diffuse.diffuse_factor(direction, direction[2], *rows)
+        assert factor[0, 0] * 0.8 / np.pi == pytest.approx(lobe(direction[:, 0, 0]), rel=1e-6)
 
 
 def test_all_light_is_the_albedo():

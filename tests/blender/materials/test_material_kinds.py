@@ -152,6 +152,19 @@ def test_velvet_is_shaded_as_cycles_does(tmp_path, roughness):
     assert ours["diffuse"][~ball].sum() == pytest.approx(cycles["diffuse"][~ball].sum(), rel=0.01)
 
 
+@pytest.mark.parametrize("name", ["coat", "coat over bumps", "sheen", "transmission"])
+def test_the_backs_of_faces_are_shaded_as_cycles_does(tmp_path, name):
+    """Of a ball and a floor whose normals point away from the camera; 0.4 % of noise."""
+    kind = EXACT[name] if name in EXACT else APPROXIMATED[name][0]
+    scene_parts.empty_scene(*material_scenes.SIZE)
+    material_scenes.build(material(**kind))
+    for mesh in bpy.data.meshes:
+        mesh.flip_normals()
+    found = material_scenes.errors(tmp_path, scene_parts.prepare(), 1024, techniques=("reference",))
+    for lobe in ("specular", "diffuse"):
+        assert percent(found[lobe, "reference"][0]) < 0.8, lobe
+
+
 def test_backs_of_glass_reflect_like_the_inside(tmp_path):
     """A camera inside a large ball of glass: total reflection beyond the critical angle."""
     scene_parts.empty_scene(*material_scenes.SIZE)

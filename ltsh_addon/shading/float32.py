@@ -166,6 +166,12 @@ class Lights(list):
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
 
     @cached_property
+    def alone(self) -> list[int]:
+        """The positions here of lights that are in no tree."""
+        taken = {number for _, numbers in self.trees for number in numbers}
+        return [number for number in range(len(self)) if number not in taken]
+
+    @cached_property
     def skies(self) -> list[tuple[SkyMap, object, int]]:
         """Maps of the distant lights with a detail, one of their lights, and the group."""
         kinds: dict[tuple, list] = {}
@@ -188,13 +194,14 @@ class _Lighting:
         """Add the light that `lobes` reflect."""
         samples, index, colors = self.samples, lobes.index, lobes.colors
         position = np.ascontiguousarray(samples.position[index].T)
-        sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for _, group, _ in self.lights}
+        extent = np.abs(position).sum(axis=0)
+        groups = {group for _, group, _ in self.lights}
+        sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for group in groups}
         self._add_skies(lobes, sums)
         left = self._add_far(lobes, position, sums)
-        for number, (light, group, corners) in enumerate(self.lights):
-            columns, needs_float64 = left.get(number), self.needs_float64[number]
-            if columns is not None and len(columns) == 0:
-                continue
+        for number in sorted([*self.lights.alone, *left]):
+            (light, group, corners), columns = self.lights[number], left.get(number)
+            needs_float64 = self.needs_float64[number]
             allowed = light.receives(samples.receiver, index)
             if float64.has_patches(light):
                 continue
@@ -226,7 +233,7 @@ class _Lighting:
                     offset, facing = seen.offset, np.ones(offset.shape[1], bool)
                 else:
                     toward = dot(offset, light.direction.astype(np.float32))
-                    facing = toward < -off_plane(light.center, origins)
+                    facing = toward < -off_plane(light.center, 0.0 if light.is_distant else extent[part])
                 if allowed is not None:
                     facing &= allowed[part]
                 axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
@@ -267,14 +274,14 @@ class _Lighting:
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
         """Add to the sums (F, 3, Q) by group the light of those of many lights that are far away; by number of the
-        light the columns (Q',) for which it is left to do. Lights without an entry are left for all."""
+        light the columns (Q',) for which it is left to do."""
         left = {}
         for tree, numbers in self.lights.trees:
             light, group, _ = self.lights[numbers[0]]
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
             near = add_far_lights(tree, lobes, position, chosen, sums[group]) if len(chosen) else {}
-            left.update({number: near.get(place, chosen[:0]) for place, number in enumerate(numbers)})
+            left.update({numbers[place]: columns for place, columns in near.items()})
         return left
 
     def _add_small(self, lobes, light, position, among, total) -> np.ndarray | None:
@@ -360,6 +367,8 @@ class _Lighting:
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""
+        if len(members) == 0:
+            return
         has_patches = any(float64.has_patches(light) for light, _, _ in self.lights)
         if not has_patches and len(members) * len(self.lights) < FLOAT64_CHUNK:
             for (light, _, _), needs_float64 in zip(self.lights, self.needs_float64, strict=True):

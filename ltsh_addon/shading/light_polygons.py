@@ -183,17 +183,17 @@ def in_front(samples, light, candidates):
     ahead = np.ones(len(candidates), bool)
     if not light.is_facing:
         origins = light.origins(position)
-        ahead = ((origins - center) * direction).sum(axis=1) > off_plane(center.T, origins.T)
+        ahead = ((origins - center) * direction).sum(axis=1) > off_plane(center.T, np.abs(origins).sum(axis=1))
     if light.is_facing or light.is_focused:
         ahead &= may_reach(light, position.T)
     allowed = light.receives(samples.receiver, candidates)
     return candidates[ahead if allowed is None else ahead & allowed]
 
 
-def off_plane(center, position) -> np.ndarray:
-    """How far in front of a light, in m, points (3, Q) are that surely see it; its center is (3,) or (3, Q)."""
-    coordinates = np.abs(center).sum(axis=0) + np.abs(position).sum(axis=0)
-    return ROUNDING * np.minimum(coordinates, FARTHEST_ROUNDED)
+def off_plane(center, extent) -> np.ndarray:
+    """How far in front of a light, in m, points are that surely see it; its center is (3,) or (3, Q), and `extent` (Q,)
+    the sum of their coordinates, without signs."""
+    return ROUNDING * np.minimum(np.abs(center).sum(axis=0) + extent, FARTHEST_ROUNDED)
 
 
 def may_reach(light, position) -> np.ndarray:

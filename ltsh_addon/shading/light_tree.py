@@ -2,7 +2,7 @@
 
 The lights of a group are the leaves of a tree. A tile of neighboring samples takes, of every branch, the coarsest node
 that is small, or whose error is at most ERROR of what the tile gets of the group: far fewer than there are lights. A
-node is then one point or four, which have the mean and the variances of its brightness; how its lights face is taken as
+node is then one point, two or four, which have the mean and the variances of its brightness; how its lights face is taken as
 uniform around their mean. The error is estimated as the light of the node times the fourth power of its size by the
 length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for the
 whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail of
@@ -23,8 +23,8 @@ from .tails import NEAR_RADII
 # Fewer lights of a group are shaded one by one.
 FEWEST = 64
 # Size of a node by the length over which the integrand changes: up to SMALL whatever its light is; up to LARGEST where
-# its error is at most ERROR of the light of a group that a tile gets.
-SMALL, LARGEST, ERROR = 0.25, 3.0, 6e-4
+# its error is at most ERROR of the light of a group that a tile gets, of diffuse and of specular lobes.
+SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 6e-4)
 # Size of the nodes that tell how much light that is.
 COARSE = 0.6
 # Smaller ones are one point, others four.
@@ -36,13 +36,16 @@ SHARP_TAIL = 0.05
 # Leaves whose error is larger are shaded as polygons.
 LEAF_ERROR = 1e-3
 # Samples of a tile, and pairs of a sample and a node that are shaded at a time.
-TILE, PAIRS = 192, 12288
+TILE, PAIRS = 96, 12288
 # Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
 # the swing of its lights where some may face away.
 CROSSED, SWUNG = 0.1, 0.02
 
-# Where the points of a node are along its axes: they have its variances. Those of a square are Gauss's.
-CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+# Where the points of a node are along its axes, (W, P, 3), and in how many ways: they have its variances. Those of a
+# square are Gauss's.
+CORNERS = np.array([[[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]])
+# For specular lobes two of eight corners of a box are enough, others for the next node.
+PAIRS_OF_CORNERS = np.stack([CORNERS[0], -CORNERS[0]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -65,10 +68,8 @@ class LightTree:
     @classmethod
     def of(cls, lights) -> LightTree:
         """The tree of AreaLights whose radiance is positive."""
-        seen = [small_lights.SmallLight.of(light) for light in lights]
-        center, area = (np.array([getattr(one, name) for one in seen]) for name in ("center", "area_vector"))
+        center, area, covariance, diagonal = small_lights.all_of(lights)
         radiance = np.array([light.radiance for light in lights])
-        covariance, diagonal = (np.array([getattr(one, name) for one in seen]) for name in ("covariance", "diagonal"))
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
         order, start, end, children = ranges(center, normal)
@@ -299,7 +300,8 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int,
     roots = np.arange(count), np.zeros(count, int)
     tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.size < COARSE)
     light = np.bincount(tile, _Pairs(tree, tiles, tile, node).light, count)
-    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.are_fine(ERROR * light[tile]))
+    most = ERROR[lobes.sharpest is not None] * light
+    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.are_fine(most[tile]))
     pairs = _Pairs(tree, tiles, tile, node)
     near = (tree.number[node] >= 0) & ~pairs.are_fine(LEAF_ERROR * light[tile])
     left: dict[int, list] = {}
@@ -325,31 +327,28 @@ def _add_points(tree, lobes, position, pairs, total):
     clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
     horizons = [lobes.rows[row][:, columns] for row in clipped]
     sums = np.zeros((total.shape[0], 3, len(columns)), np.float32)
+    corners = CORNERS if lobes.sharpest is None else PAIRS_OF_CORNERS
     for is_tail in (True, False):
-        chosen = tail == is_tail
-        number, weight, center = _points(tree, nodes[chosen], single[chosen])
-        center = (center - middle[:, None]).astype(np.float32)
-        step = max(PAIRS // len(columns), 1)
-        for first in range(0, len(number), step):
-            part, point = number[first : first + step], center[:, first : first + step, None]
-            rays = _rays(tree, part, point - place[:, None, :], horizons)
-            exact = is_tail and lobes.limits is not None
-            values = lobes.limits.at_centers(columns, rays, len(sums)) if exact else lobes.at_point(columns, rays)
-            colors = (weight[first : first + step] * tree.color[:, part]).astype(np.float32)
-            for channel, color in enumerate(colors):
-                for own, value in zip(sums[:, channel], values, strict=True):
-                    own += (value * color[:, None]).sum(axis=0)
+        exact = is_tail and lobes.limits is not None
+        for is_single in (True, False):
+            chosen = nodes[(tail == is_tail) & (single == is_single)]
+            points = 1 if is_single else corners.shape[1]
+            step = max(PAIRS // (len(columns) * points), 1)
+            for first in range(0, len(chosen), step):
+                part = chosen[first : first + step]
+                center = tree.center[part].T[:, None]
+                if not is_single:
+                    # Each of the ways that there are for some of the nodes, so that what one does wrong others mend.
+                    ways = corners[part % len(corners)]
+                    center = center + np.einsum("npk,kcn->cpn", ways, tree.axes[:, :, part])
+                center = (center.reshape(3, -1) - middle[:, None]).astype(np.float32)
+                rays = _rays(tree, np.tile(part, points), center[..., None] - place[:, None, :], horizons)
+                values = lobes.limits.at_centers(columns, rays, len(sums)) if exact else lobes.at_point(columns, rays)
+                colors = (tree.color[:, part] / points).astype(np.float32)
+                for own, value in zip(sums, values, strict=True):
+                    value = value.reshape(points, len(part), -1)
+                    own += np.einsum("ck,kq->cq", colors, value[0] if points == 1 else value.sum(axis=0))
     total[:, :, columns] += sums
-
-
-def _points(tree, nodes, single):
-    """Numbers (K,) of nodes, shares (K,) in their light and places (3, K) of their points: one of those of the `nodes`
-    (M,) that are `single` (M,), four of others."""
-    alone, others = nodes[single], nodes[~single]
-    corners = tree.center[others].T[:, None] + np.einsum("pk,kcn->cpn", CORNERS, tree.axes[:, :, others])
-    number = np.concatenate([alone, np.tile(others, len(CORNERS))])
-    weight = np.repeat([1.0, 1.0 / len(CORNERS)], [len(alone), len(corners[0]) * len(others)])
-    return number, weight, np.concatenate([tree.center[alone].T, corners.reshape(3, -1)], axis=1)
 
 
 def _rays(tree, part, offset, horizons) -> small_lights.Rays:

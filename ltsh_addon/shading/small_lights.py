@@ -46,15 +46,39 @@ class SmallLight:
             return cls(light.center, float(np.sqrt(max(u @ u, v @ v))), area, diagonal, covariance)
         if light.corners is None:
             return cls(light.center, float(np.sqrt(diagonal)), area, diagonal, covariance)
-        # A fan of triangles: the mean of products over one is a twelfth of those of its corners and of their sum.
-        first = light.corners - light.corners[0]
-        second = np.roll(first, -1, axis=0)
-        shares = np.cross(first, second) @ (0.5 * light.area_vector) / (light.area_vector @ light.area_vector)
-        center = shares @ (first + second) / 3.0
-        products = sum((shares[:, None] * part).T @ part for part in (first, second, first + second)) / 12.0
-        covariance = products - np.outer(center, center)
-        center = light.corners[0] + center
+        (center,), (covariance,) = _moments(light.corners[None], light.area_vector[None])
         return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal, covariance)
+
+
+def all_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) and diagonals (L,) as of `SmallLight`."""
+    center, u, v, direction = (
+        np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
+    )
+    area, is_round = np.array([light.area_vector for light in lights]), np.array([light.is_round for light in lights])
+    diagonal = np.maximum(np.square(u + v).sum(axis=1), np.square(u - v).sum(axis=1))
+    covariance = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
+    covariance /= np.where(is_round, 4.0, 3.0)[:, None, None]
+    counts = np.array([0 if light.corners is None else len(light.corners) for light in lights])
+    for count in np.unique(counts[counts > 0]):
+        own = np.flatnonzero(counts == count)
+        corners = np.array([lights[number].corners for number in own])
+        center[own], covariance[own] = _moments(corners, area[own])
+    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal
+
+
+def _moments(corners, area):
+    """Centroids (L, 3) and covariances (L, 3, 3) of polygons with corners (L, V, 3) and area vectors (L, 3)."""
+    # A fan of triangles: the mean of products over one is a twelfth of those of its corners and of their sum.
+    first = corners - corners[:, :1]
+    second = np.roll(first, -1, axis=1)
+    x, y, z = np.moveaxis(first, -1, 0)
+    a, b, c = np.moveaxis(second, -1, 0)
+    crossed = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
+    shares = (crossed * (0.5 * area)[:, None]).sum(axis=-1) / (area * area).sum(axis=1)[:, None]
+    center = (shares[..., None] * (first + second)).sum(axis=1) / 3.0
+    products = sum(np.einsum("lv,lvi,lvj->lij", shares, part, part) for part in (first, second, first + second)) / 12.0
+    return corners[:, 0] + center, products - center[:, :, None] * center[:, None]
 
 
 @dataclass(frozen=True)

@@ -301,7 +301,9 @@ class Pairs:
         offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
         if not light.is_facing and not isinstance(emitter, Cluster):
-            ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(light.center, origins)
+            ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(
+                light.center, np.abs(origins).sum(axis=0)
+            )
         if light.is_focused or light.is_facing:
             ahead &= may_reach(light, surface.position)
         if light.receivers is not None:
@@ -566,7 +568,7 @@ class View:
             corners = emitter.corners_from(self.offset, self.height)
         else:
             place = np.take(surface.position, index, axis=1)
-            self.least_height = off_plane(light.center + light.radius, place).astype(np.float32)
+            self.least_height = off_plane(light.center + light.radius, np.abs(place).sum(axis=0)).astype(np.float32)
         if is_quad:
             self.quads = SphericalQuads(corners)
             self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle

@@ -143,6 +143,10 @@ def test_nodes_have_the_power_and_the_moments_of_their_lights():
     moments = ((power[:, None] * shift).T @ shift + own) / power.sum()
     axes = tree.axes[:, :, 0]
     assert np.allclose(axes.T @ axes, moments)
-    points = light_tree.CORNERS @ axes
-    assert np.allclose(points.T @ points / len(points), moments) and np.allclose(points.sum(axis=0), 0.0)
+    for corners in (light_tree.CORNERS, light_tree.PAIRS_OF_CORNERS):
+        points = corners @ axes
+        assert np.allclose(points.sum(axis=1), 0.0)
+        # Of pairs, all ways together.
+        points = points.reshape(-1, 3)
+        assert np.allclose(points.T @ points / len(points), moments)
     assert len(lights) < float32.FEWEST  # so that few lights are shaded one by one

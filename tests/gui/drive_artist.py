@@ -11,8 +11,8 @@ import numpy as np
 
 SECONDS = 2400
 SIZE = "1600x900"
-# From the right and upper end of the sidebar, see `hands`: the first light of the list, its star and its eye.
-ROW, STAR, EYE, TECHNIQUES = 181, 78, 57, 88
+# From the right and upper end of the sidebar, see `hands`: name, star and eye of the first light of the list.
+NAME, STAR, EYE, ROW = 235, 81, 60, 181
 SOLID_SECONDS = 3.0
 
 
@@ -53,7 +53,7 @@ def new_scene(rig):
     yield from typed(rig, "Delete")
 
 
-def click_light(rig, row, right=160):
+def click_light(rig, row, right=NAME):
     """Click in a row of the list of lights."""
     yield from hands.click(rig, *hands.to_window(rig, "VIEW_3D", "UI", right, ROW + 21 * row))
 

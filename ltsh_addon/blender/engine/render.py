@@ -238,8 +238,8 @@ class FinalJob:
         """What the render goes through."""
         pixels, techniques = 1e-6 * math.prod(self.resolution), dict.fromkeys(self.shaded_as().values())
         # What is not direct light has shadows in any case.
-        shadows = self.shadows == "on" or self.cycles_samples > 0
-        sampling, shading = shading_steps(pixels * self.sub_samples, self.sub_samples, shadows, techniques)
+        rays = self.shadow_rays if self.shadows == "on" or self.cycles_samples else 0
+        sampling, shading = shading_steps(pixels * self.sub_samples, self.sub_samples, rays, techniques)
         rest = finished_steps(pixels, self.cycles_samples) if self.cycles_samples else []
         rest += [Step("lights", shading[-1].cost)] if self.keeps_lights else []
         return [Step(STARTING, START_SECONDS), *sampling, *shading, *rest]

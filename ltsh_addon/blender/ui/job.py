@@ -51,9 +51,10 @@ LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
 MOST = 0.99
 # Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
-SAMPLE_SECONDS, FILE_SECONDS = 12.0, 3.0
-SHADING_SECONDS = {"ltc": 4.0, "ltsh2": 5.0, "ltsh4": 6.0, "ltsh4c": 7.5, REFERENCE: 100.0}
-SHADOW_SECONDS, DENOISE_SECONDS = 8.0, 4.0
+SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
+SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
+SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # of shadows with `USUAL_RAYS`
+USUAL_RAYS = 256
 PATHS = 2.0  # a sample of all light costs so many of direct light
 REFERENCE_POINTS = 0.15
 
@@ -163,7 +164,7 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     pixels = 1e-6 * math.prod(options.resolution)
     points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
     half = rendered + SAMPLE_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
-    sampling, shading = shading_steps(points, options.sub_samples, options.shadows == "on", options.techniques)
+    sampling, shading = shading_steps(points, options.sub_samples, _rays(options), options.techniques)
     return [
         *sampling,
         *(Step(f"Cycles {name}", half) for name in ("A", "B") if with_cycles),
@@ -174,14 +175,16 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     ]
 
 
-def shading_steps(points: float, sub_samples: int, shadows: bool, techniques) -> tuple[list[Step], list[Step]]:
-    """How so many million points are sampled, and how they are shaded."""
+def shading_steps(points: float, sub_samples: int, shadow_rays: int, techniques) -> tuple[list[Step], list[Step]]:
+    """How so many million points are sampled, and how they are shaded; without shadows there are 0 rays."""
     sampling = [
         Step("open scene", OPEN_SECONDS),
         Step("samples", RENDER_SECONDS * sub_samples + SAMPLE_SECONDS * points),
     ]
     shading = [Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques]
-    return sampling, [*([Step("shadows", SHADOW_SECONDS * points)] if shadows else []), *shading]
+    # Rays go where a light is neither seen whole nor not at all, and elsewhere a few ask for that.
+    shadows = SHADOW_SECONDS * points * math.sqrt(shadow_rays / USUAL_RAYS)
+    return sampling, [*([Step("shadows", shadows)] if shadow_rays else []), *shading]
 
 
 def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
@@ -191,6 +194,10 @@ def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
         Step("Cycles", RENDER_SECONDS + PATHS * SAMPLE_SECONDS * pixels * cycles_samples),
         Step("denoise", DENOISE_SECONDS * pixels),
     ]
+
+
+def _rays(options) -> int:
+    return options.shadow_rays if options.shadows == "on" else 0
 
 
 def _bake(options: BakeOptions) -> list[Step]:

@@ -9,6 +9,7 @@ shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there tw
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,8 +95,10 @@ def finish(
     *,
     scene_name: str | None = None,
     view_layer: str | None = None,
+    shaded: Callable[[picture.Comparison], None] = lambda comparison: None,
 ) -> Finished:
-    """The finished picture of a scene and view layer, by default those of the file. Raises as `render_scene` does."""
+    """The finished picture of a scene and view layer, by default those of the file; `shaded` gets the direct light
+    before Cycles begins. Raises as `render_scene` does."""
     from ..blender.process import client
     from ..blender.process.blender_process import kept_blender
 
@@ -103,6 +106,7 @@ def finish(
     where = {"scene_name": scene_name, "view_layer": view_layer}
     with temporary_folder() as folder, kept_blender(folder):
         comparison = _ours(options, where, clock, progress)
+        shaded(comparison)
         spent = clock.seconds()
         film = comparison.film
         reserve = LAST_SECONDS * film.width * film.height / 1e6

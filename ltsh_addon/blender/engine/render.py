@@ -274,7 +274,7 @@ def final_picture(
     there. Raises SceneError, TableError, Cancelled, OSError.
     """
     if job.cycles_samples:
-        return _complete_picture(job, scene_file, progress)
+        return _complete_picture(job, scene_file, progress, show)
     options = client.ExtractOptions(
         scene=scene_file,
         sub_samples=job.sub_samples,
@@ -336,7 +336,19 @@ def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarra
     return {name: inside_border(image, extraction.border) for name, image in found.items()}
 
 
-def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> FinalPicture:
+def _direct_light(job: FinalJob, comparison) -> FinalPicture:
+    """What of a complete picture is there before Cycles begins."""
+    extraction = comparison.extraction
+    images = {f"LTSH {PASS_LABELS[part]}": image for (_, part), image in comparison.images.items()}
+    coverage = extraction.film.coverage()
+    combined = _over_background(
+        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job, extraction.exposure
+    )
+    passes = {name: inside_border(image, extraction.border) for name, image in images.items()}
+    return FinalPicture(inside_border(combined, extraction.border), passes, ())
+
+
+def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show) -> FinalPicture:
     """The same with everything that Cycles renders, and its passes."""
     options = RenderOptions(
         scene_file,
@@ -347,7 +359,8 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress) -> Fi
         cycles_samples=job.cycles_samples,
         shadow_rays=job.shadow_rays,
     )
-    made = finish(options, progress, scene_name=job.scene, view_layer=job.view_layer)
+    where = {"scene_name": job.scene, "view_layer": job.view_layer}
+    made = finish(options, progress, **where, shaded=lambda comparison: show(_direct_light(job, comparison)))
     border = made.comparison.extraction.border
     zero = np.zeros_like(made.combined[..., :3])
     passes = {f"LTSH {label}": made.ours.get(f"{job.technique}.{part}", zero) for part, label in PASS_LABELS.items()}

@@ -303,6 +303,26 @@ def test_the_picture_is_shown_as_its_passes_come(scene, tmp_path):
     np.testing.assert_array_equal(shown[-1].combined, whole.combined)
 
 
+def test_a_complete_picture_shows_its_direct_light_before_cycles_begins(scene, tmp_path):
+    path, stages, shown = parts.save(tmp_path / "scene.blend"), [], []
+    job = final_job(scene, cycles_samples=2, shadow_rays=8)
+
+    def show(picture):
+        assert "Cycles" not in stages
+        shown.append(picture)
+
+    whole = render_module.final_picture(job, path, lambda stage, fraction: stages.append(stage), show)
+    assert "Cycles" in stages
+    (early,) = shown
+    for name in ("LTSH Specular", "LTSH Diffuse"):
+        # Cycles keeps the direct light of some pixels.
+        ours = whole.passes[name] > 0.0
+        assert ours.any()
+        np.testing.assert_allclose(early.passes[name][ours], whole.passes[name][ours], **SAME)
+    both = early.passes["LTSH Specular"] + early.passes["LTSH Diffuse"]
+    np.testing.assert_allclose(early.combined[..., :3], both, **SAME)
+
+
 def test_a_render_tells_a_line_a_second_and_shows_every_picture(scene, monkeypatch):
     told, pictures, now = [], [], [100.0]
     engine = SimpleNamespace(update_progress=told.append, update_stats=lambda first, text: told.append(text),

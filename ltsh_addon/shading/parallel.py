@@ -34,7 +34,6 @@ SECONDS_WORTH_A_CHILD = 0.5
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
 CORES_VARIABLE = "LTSH_CORES"
-_PACKAGE = __package__.rpartition(".")[0]
 _logger = logging.getLogger(__name__)
 # Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
 _ONLY_DIFFUSE = {
@@ -398,14 +397,14 @@ class Child:
 
     def begin(self, task: bytes, *arguments) -> None:
         """Send the task, `worker.packed`; `arguments` are what the class at `side` takes beside it."""
-        first = {"path": sys.path, "package": _PACKAGE, "side": self.side, "arguments": arguments}
+        first = {"path": sys.path, "package": worker.PACKAGE, "side": self.side, "arguments": arguments}
         worker.send(self._process.stdin, first)
         self.ask(task)
 
     def ask(self, message):
         """The child's answer to a message."""
         worker.send(self._process.stdin, message)
-        answer = worker.receive(self._process.stdout)
+        answer = worker.receive(self._process.stdout, worker.PACKAGE_FOLDER.name)
         if isinstance(answer, str):
             raise _ChildError(answer.strip().splitlines()[-1])
         return answer

@@ -17,6 +17,8 @@ import traceback
 from pathlib import Path
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
+# How the package is called here: as its folder, but in the parent, where Blender may have loaded it under another name.
+PACKAGE = (__package__ or "").rpartition(".")[0] or PACKAGE_FOLDER.name
 _LENGTH = struct.Struct("<Q")
 
 
@@ -34,7 +36,7 @@ def send(stream, message) -> None:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds the parent's modules under the name that the package has here: Blender loads it under another one."""
+    """Finds the modules of the other process, where the package is called `package`, under the name it has here."""
 
     def __init__(self, stream, package):
         super().__init__(stream)
@@ -42,12 +44,12 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module, name):
         if self.package and (module + ".").startswith(self.package + "."):
-            module = PACKAGE_FOLDER.name + module[len(self.package) :]
+            module = PACKAGE + module[len(self.package) :]
         return super().find_class(module, name)
 
 
 def receive(stream, package: str = ""):
-    """Read one message from a parent that knows the package as `package`. EOFError: the other side is gone."""
+    """Read one message from a process that knows the package as `package`. EOFError: the other side is gone."""
     header = stream.read(_LENGTH.size)
     if len(header) < _LENGTH.size:
         raise EOFError("the other process has ended")
@@ -67,7 +69,7 @@ def _serve(commands, answers) -> None:
     side = side_class(receive(commands, first["package"]), *first["arguments"])
     send(answers, None)
     while True:
-        message = receive(commands)
+        message = receive(commands, first["package"])
         try:
             answer = side.shade(message)
         except Exception:

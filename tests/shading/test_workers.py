@@ -262,7 +262,27 @@ def leave_some(fraction):
 one = shading.shade(samples, [light], "ltsh4", workers=1).combined
 by_children.clear()
 two = shading.shade(samples, [light], "ltsh4", workers=2, progress=leave_some).combined
-print(np.array_equal(one, two), any(by_children), "ltsh_addon" in sys.modules)
+visibility, ratio, crew, processes = (importlib.import_module(package + name) for name in (
+    "visibility", "visibility.ratio", "visibility.crew", "blender.process.blender_process"))
+mesh = visibility.OccluderMesh(np.array([(0, -9, 1), (9, -9, 1), (9, 9, 1)]), np.array([(0, 1, 2)]))
+occluders = visibility.Occluders((mesh,), np.zeros(1, int), np.eye(4)[None, :3])
+ratio.SECONDS_WORTH_A_CHILD, ratio.BLOCK_SAMPLES, traced = -1.0, 8, []
+queued = crew._Queue.done
+def counted(self, *arguments):
+    import threading
+    traced.append(threading.current_thread() is not threading.main_thread())
+    queued(self, *arguments)
+crew._Queue.done = counted
+limit = time.monotonic() + 60.0
+def leave_some(stage, fraction):
+    while not any(traced) and time.monotonic() < limit:
+        time.sleep(0.01)
+with visibility.open_tracer(occluders, processes.embree_libraries()) as tracer:
+    single = ratio.visible_shares(samples, [light], tracer, workers=1).diffuse
+    traced.clear()
+    double = ratio.visible_shares(samples, [light], tracer, workers=2, progress=leave_some).diffuse
+same = np.array_equal(one, two) and np.array_equal(single, double)
+print(same, any(by_children) and any(traced), "ltsh_addon" in sys.modules)
 """
 
 

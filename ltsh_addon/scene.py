@@ -400,23 +400,33 @@ class SurfaceSamples:
 class Film:
     """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
     `sub_samples` samples, of which those that hit nothing are absent. Where a surface has several lobes, `first` (P,)
-    is true for one sample of each hit; left out: for all."""
+    is true for one sample of each hit; left out: for all. Where samples stand for several, `count` (P,) says for how
+    many; left out: one each."""
 
     width: int
     height: int
     pixel: np.ndarray  # (P,) integers
     sub_samples: int = 1
     first: np.ndarray | None = None  # (P,) bool
+    count: np.ndarray | None = None  # (P,) integers
 
     def take(self, index) -> Film:
         """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        first = None if self.first is None else self.first[index]
-        return replace(self, pixel=self.pixel[index], first=first)
+        first, count = (None if values is None else values[index] for values in (self.first, self.count))
+        return replace(self, pixel=self.pixel[index], first=first, count=count)
+
+    @property
+    def points(self) -> int:
+        """How many samples a pixel has, about."""
+        if self.count is None or not len(self.count):
+            return self.sub_samples
+        return max(1, round(self.sub_samples * len(self.count) / self.count.sum()))
 
     def image(self, values: np.ndarray) -> np.ndarray:
         """Image (H, W) or (H, W, C), row 0 on top, of per-sample `values` (P,) or (P, C)."""
         values = np.asarray(values, dtype=np.float64)
         columns = values.reshape(values.shape[0], int(np.prod(values.shape[1:])))
+        columns = columns if self.count is None else columns * self.count[:, None]
         count = self.width * self.height
         image = np.stack([np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1)
         return (image / self.sub_samples).reshape(self.height, self.width, *values.shape[1:])

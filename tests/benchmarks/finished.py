@@ -1,0 +1,89 @@
+"""Finished pictures beside Cycles with Open Image Denoise at equal processor time, each against converged Cycles."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT)]
+
+from ltsh_addon import imaging  # noqa: E402
+from ltsh_addon.blender.process import client  # noqa: E402
+from ltsh_addon.blender.process.blender_process import denoiser_libraries, kept_blender  # noqa: E402
+from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
+from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
+from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
+from ltsh_addon.shading.parallel import cores  # noqa: E402
+
+SCENES = ("demo", "artist", "studio", "lamp", "closed")
+SIZE, BUDGETS, TRUE_SAMPLES = (240, 135), (2.0, 8.0, 30.0), 4096
+OTHER_SEED = 7919  # of the truth, so that no noise is shared
+
+
+def build(name: str, path: Path) -> None:
+    """The .blend of a scene."""
+    if name == "demo":
+        client.build_demo(path)
+        return
+    script = Path(__file__).with_name("finished_scenes.py")
+    subprocess.run([sys.executable, str(script), name, str(path)], check=True, stdout=subprocess.DEVNULL)
+
+
+def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=True) -> tuple[np.ndarray, float, int]:
+    """What Cycles alone makes (H, W, 3), processor seconds with the start of Blender, samples."""
+    own = Path(tempfile.mkdtemp(dir=folder))
+    start = time.process_time()
+    with kept_blender(own):
+        # As much as starting Blender, opening the file and denoising take.
+        left = None if seconds is None else max(seconds - START, 0.1)
+        job = client.FinishedJob(path, None, None, None, None, *SIZE, samples, left)
+        made = client.render_finished(job, own)
+    image = read_layer(made.channels, "Combined", "RGB")
+    if denoise:
+        albedo, normal = (read_layer(made.guides, *guide) for guide in (render.ALBEDO, render.NORMAL))
+        with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+            image = denoiser.denoised(image, albedo, normal)
+    return image, made.processor_seconds + time.process_time() - start, made.samples
+
+
+START = 1.0
+
+
+def ours(path: Path, folder: Path, **options) -> tuple[np.ndarray, dict, dict]:
+    """What `ltsh render` makes, its seconds and its report."""
+    with kept_blender(folder):
+        made = render.finish(RenderOptions(path, output=folder, resolution=SIZE, **options))
+    return made.combined[..., :3], made.seconds["processor"], made.report
+
+
+def errors(image: np.ndarray, true: np.ndarray) -> str:
+    relative = np.linalg.norm(image - true) / np.linalg.norm(true)
+    return f"{100.0 * relative:7.2f} %{imaging.mean_flip(true, image):9.4f}"
+
+
+def main(names=SCENES, true_samples=TRUE_SAMPLES, budgets=BUDGETS) -> None:
+    print(f"finished pictures of {SIZE[0]} x {SIZE[1]}, load {os.getloadavg()[0]:.1f}")
+    print(f"  {'scene':<10}{'budget':>8}  {'':<18}{'processor':>10}{'rel. L2':>10}{'FLIP':>9}")
+    with tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            path = Path(folder) / f"{name}.blend"
+            build(name, path)
+            true, seconds, _ = by_cycles(path, Path(folder), samples=true_samples, denoise=False)
+            print(f"  {name:<10}{'':>8}  Cycles, {true_samples} samples, {seconds:.0f} s: the truth", flush=True)
+            for budget in budgets:
+                image, seconds, samples = by_cycles(path, Path(folder), seconds=budget)
+                label = f"Cycles {samples}"
+                print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{seconds:>8.1f} s{errors(image, true)}", flush=True)
+                image, seconds, report = ours(path, Path(folder), budget=budget)
+                label = f"LTSH {report['sub_samples']} + {report['cycles_samples']}"
+                took = seconds["total"]
+                print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{took:>8.1f} s{errors(image, true)}", flush=True)
+
+
+if __name__ == "__main__":
+    main(*([sys.argv[1:]] if sys.argv[1:] else []))

@@ -1,0 +1,71 @@
+"""One sample stands for the hits of a pixel on one surface, and the picture stays what it was."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from surface_scenes import single_sample
+
+from ltsh_addon.cycles import gbuffer
+from ltsh_addon.scene import AreaLight, Film
+from ltsh_addon.shading import shade
+
+POINTS, SIDE = 8, 4
+
+
+def hits(seed, bend=0.0, step=0.0):
+    """Samples of a textured floor that is bent, and has a step in the middle of each pixel; each pixel has POINTS."""
+    random = np.random.default_rng(seed)
+    pixel = np.tile(np.arange(SIDE * SIDE), POINTS)
+    inside = random.random((len(pixel), 2))
+    inside[: SIDE * SIDE] = 0.4  # the pixels' centers come first, left of the step
+    place = np.stack([pixel % SIDE, pixel // SIDE], axis=1) + inside
+    normal = np.stack([bend * place[:, 0], np.zeros(len(pixel)), np.ones(len(pixel))], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    one = single_sample(roughness=0.4).take(np.zeros(len(pixel), int))
+    position = np.concatenate([0.1 * place, np.where(inside[:, :1] > 0.5, step, 0.0)], axis=1)
+    fields = {name: normal for name in ("normal", "diffuse_normal", "geometric_normal", "smooth_normal")}
+    albedo = random.random((len(pixel), 3))
+    return replace(one, position=position, diffuse_albedo=albedo, **fields), Film(SIDE, SIDE, pixel, POINTS)
+
+
+@pytest.mark.parametrize(("bend", "step", "left"), [(0.0, 0.0, 1), (0.0, 0.5, 2), (3.0, 0.0, None)])
+def test_flat_surfaces_keep_one_sample_each_and_bent_ones_more(bend, step, left):
+    samples, film = hits(0, bend, step)
+    found, small = gbuffer.merged(samples, film)
+    if left is not None:
+        assert len(found) == left * SIDE * SIDE
+    else:
+        assert len(found) > 2 * SIDE * SIDE
+    assert small.count.sum() == len(samples)
+    np.testing.assert_allclose(small.coverage(), film.coverage())
+
+
+@given(st.integers(0, 1000), st.sampled_from((0.0, 0.3)), st.sampled_from((0.0, 0.5)))
+def test_colors_keep_their_mean(seed, bend, step):
+    samples, film = hits(seed, bend, step)
+    found, small = gbuffer.merged(samples, film)
+    np.testing.assert_allclose(small.image(found.diffuse_albedo), film.image(samples.diffuse_albedo), atol=1e-12)
+
+
+def test_the_picture_stays_what_it_was_where_light_is_smooth():
+    samples, film = hits(3, step=0.5)
+    samples = replace(samples, diffuse_albedo=np.full((len(samples), 3), 0.5))
+    x, y, z = np.eye(3)
+    light = AreaLight("Key", "RECTANGLE", np.array([0.2, 0.2, 3.0]), x, y, -z, np.ones(3))
+    found, small = gbuffer.merged(samples, film)
+    whole, less = (shade(part, [light], "ltc").combined for part in (samples, found))
+    # The floor's light changes by a few percent over a pixel.
+    np.testing.assert_allclose(small.image(less), film.image(whole), rtol=0.05)
+
+
+def test_lobes_of_one_hit_stay_together():
+    samples, film = hits(5)
+    twice = np.repeat(np.arange(len(samples)), 2)
+    samples, film = samples.take(twice), replace(film.take(twice), first=np.arange(2 * len(samples)) % 2 == 0)
+    samples = replace(samples, roughness=np.where(film.first, 0.3, 0.7))
+    found, small = gbuffer.merged(samples, film)
+    np.testing.assert_array_equal(found.roughness, np.tile([0.3, 0.7], SIDE * SIDE))
+    np.testing.assert_allclose(small.coverage(), film.coverage())

@@ -2,12 +2,12 @@
 
 The lights of a group are the leaves of a tree. A tile of neighboring samples takes, of every branch, the coarsest node
 that is small, or whose error is at most ERROR of what the tile gets of the group: far fewer than there are lights. A
-node is then one point, two or four, which have the mean and the variances of its brightness; how its lights face is taken as
-uniform around their mean. The error is estimated as the light of the node times the fourth power of its size by the
-length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for the
-whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail of
-an "ltsh" lobe get its true value there, as `tails` has it. Lights that are leaves and yet too large go the way of all
-lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
+node is then one point, two or four, which have the mean and the variances of its brightness; how its lights face is
+taken as uniform around their mean. The error is estimated as the light of the node times the fourth power of its size
+by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for
+the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail
+of an "ltsh" lobe get its true value there, as `tails` has it. Lights that are leaves and yet too large go the way of
+all lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations

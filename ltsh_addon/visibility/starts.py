@@ -50,6 +50,10 @@ class StartFinder:
             index, shape = start + found.ray, _Shape.of(self._occluders, found, self._is_applied)
             clearance[index] = CLEARANCE * (reach[index] + shape.size)
             is_thick = self._thickness[found.instance] > 0.0
+            # Graphics cards interpolate positions less exactly than Cycles: those would meet their own surface.
+            moved = shape.point - position[index]
+            off = (_dot(moved, moved) > (0.5 * clearance[index]) ** 2) & ~is_thick
+            position[index[off]] = shape.point[off]
             for number in np.unique(found.instance[is_thick]):
                 here = found.instance == number
                 clearance[index[here]] += self._thickness_of(number, found.triangle[here])
@@ -208,6 +212,7 @@ class _Shape:
     is_smooth: np.ndarray
     shares: np.ndarray
     to_world: np.ndarray  # (Q, 3, 3)
+    point: np.ndarray  # (Q, 3) in world space
     size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
 
     @classmethod
@@ -236,6 +241,7 @@ class _Shape:
             is_smooth,
             shares,
             np.where(applied, np.eye(3), matrix[:, :, :3]),
+            np.einsum("qc,qck->qk", shares, in_world) + matrix[:, :, 3],
             size,
         )
 

@@ -272,6 +272,23 @@ def test_a_convex_surface_does_not_hide_itself(libraries, place, instances):
         assert found.all(), f"{(found == 0).sum()} of {found.size} rays are blocked"
 
 
+def test_samples_that_are_rounded_to_below_their_triangle_are_not_hidden_by_it(libraries):
+    """As graphics cards round them: by several times what a ray keeps off."""
+    rng = np.random.default_rng(8)
+    vertices, triangles = sphere(16)
+    mesh, matrix = OccluderMesh(vertices, triangles, normals=vertices), np.eye(3, 4)
+    matrix[:, 3] = 3.0, -3.0, 1.0
+    with open_tracer(Occluders((mesh,), [0], [matrix]), libraries) as tracer:
+        samples = samples_on(mesh, matrix, rng, 2000)
+        index, directions = directions_around(samples.geometric_normal, rng, 8)
+        facing = np.einsum("rk,rk->r", directions, np.minimum(samples.geometric_normal, samples.smooth_normal)[index])
+        index, directions = index[facing > 0.2], directions[facing > 0.2]
+        below = replace(samples, position=samples.position - 1e-5 * samples.geometric_normal)
+        starts, found = seen(tracer, below, index, directions, 20.0)
+    assert found.all(), f"{(found == 0).sum()} of {found.size} rays are blocked"
+    np.testing.assert_allclose(starts.position, samples.position, atol=2e-6)
+
+
 def test_a_large_plane_of_many_triangles_does_not_hide_itself(libraries):
     rng = np.random.default_rng(2)
     # Triangles of all sizes side by side, in a plane that no axis is parallel to.

@@ -142,8 +142,7 @@ def moved(rig):
 def rendered(rig):
     """F12, and its lights changed in the window of the render."""
     bpy.context.scene.render.engine = "LTSH"
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "F12")
+    hands.operate(rig, bpy.ops.render.render, "INVOKE_DEFAULT")
     results = hands.module("ui.results")
     yield from hands.until(lambda: results._rendered, 400)
     rig.check(bool(results._rendered), "the mixer has the lights of the final render")

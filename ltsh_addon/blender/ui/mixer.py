@@ -15,6 +15,7 @@ from ..lights.linking import Receivers
 from . import comparison, results
 from .panels import draw_text, gray, in_both_places, split_names
 
+UPDATE = "Update Moved Lights"
 # By what share of its distance and size a light may be elsewhere that has not moved.
 UNMOVED = 1e-5
 
@@ -75,6 +76,17 @@ def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]
     return found
 
 
+def _stands_elsewhere(ob, kept: dict) -> bool:
+    """True where a light object has moved or turned since its light was kept: what is known at once."""
+    if ob.type != "LIGHT":
+        return False
+    matrix = np.array(ob.matrix_world)
+    near = kept["is_distant"] or np.allclose(matrix[:3, 3], kept["center"], rtol=1e-4, atol=1e-4)
+    axis = -matrix[:3, 2] / max(np.linalg.norm(matrix[:3, 2]), 1e-30)
+    is_turned = ob.data.type != "POINT" and not np.allclose(axis, kept["direction"], atol=1e-4)
+    return not near or is_turned
+
+
 def state_of(row: Row, item) -> tuple[str, str]:
     """An icon, and a sentence where the light in the scene is not that of the picture."""
     if not row.lights:
@@ -82,6 +94,8 @@ def state_of(row: Row, item) -> tuple[str, str]:
     lost = [name for name in row.lights if name not in bpy.data.objects]
     if lost and row.settings:
         return "ERROR", f"{listed(lost, 3)}: not in the scene any more"
+    if row.light is not None and _stands_elsewhere(bpy.data.objects[row.name], row.light):
+        return "ERROR", f"{row.name}: moved since this picture; {UPDATE} shades it where it is"
     for name, (power, exposure, color) in targets(row, item).items():
         ob = bpy.data.objects[name]
         now = (ob.data.energy, ob.data.exposure, *ob.data.color) if ob.type == "LIGHT" else ()
@@ -243,7 +257,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
     """Shade lights that have been moved or resized since the picture where they are now; the others stay"""
 
     bl_idname = "ltsh.update_moved_lights"
-    bl_label = "Update Moved Lights"
+    bl_label = UPDATE
 
     def execute(self, context):
         moved = moved_rows(context, results.mixer_of(context.scene).rows)

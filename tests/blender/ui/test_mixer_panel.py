@@ -196,7 +196,10 @@ def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
     assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
     fill.location.x, fill.rotation_euler.y, fill.data.size = -0.2, 0.6, 0.8
     bpy.context.view_layer.update()
+    row, item = next(pair for pair in results.mixer_pairs(scene) if pair[0].name == "Fill")
+    assert mixer.state_of(row, item)[1].startswith("Fill: moved since this picture")
     assert bpy.ops.ltsh.update_moved_lights() == {"FINISHED"}
+    assert [mixer.state_of(*pair)[1] for pair in results.mixer_pairs(scene)] == ["", "", ""]
     found = shown()
     assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
     # The file has it too.

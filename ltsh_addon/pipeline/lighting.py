@@ -296,8 +296,15 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
     arrays |= {f"rest.{name}": np.asarray(values, np.float32) for name, values in (rest or {}).items()}
     arrays |= {f"taken.{name}": np.asarray(values, np.float32) for name, values in (taken or {}).items()}
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, document=json.dumps(document), **arrays)
+    arrays["document"] = np.array(json.dumps(document))
+    # As np.savez_compressed, but half as slow for files that are 5 % larger.
+    with (
+        replacing(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+    ):
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
     if extraction.occluders is None:
         return [path]
     occluders = path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX)

@@ -6,7 +6,7 @@ import hands
 SIZE = "1280x900"
 SECONDS = 1800
 # Places that shift with what the panel shows.
-ADD_CAMERA, BAKE_HEADER, BAKE = (151, 324), (226, 405), (142, 692)
+ADD_CAMERA, GRAY_COMPARE, BAKE_HEADER, BAKE = (151, 372), (155, 425), (232, 438), (155, 497)
 SHADED = "LTSH ltsh4.combined"
 
 
@@ -26,7 +26,7 @@ def mended(rig):
     hands.operate(rig, bpy.ops.ed.undo_push, message="Without camera")
     yield 3
     rig.shot("1_no_camera.png")
-    yield from hands.click_button(rig, hands.SHADE)
+    yield from hands.click_button(rig, GRAY_COMPARE)
     rig.check(hands.job() is None, "without a camera nothing starts")
     yield from hands.click_button(rig, ADD_CAMERA)
     yield 1
@@ -65,8 +65,7 @@ def previewed(rig):
     yield 4
     rig.check(bpy.context.scene.render.engine == "LTSH", "the preview is on")
     rig.shot("3_preview.png")
-    # The panel that ends it stands above by then, with settings of its own.
-    hands.operate(rig, bpy.ops.ltsh.preview)
+    yield from hands.click_button(rig, hands.PREVIEW)
     yield 2
     rig.check(bpy.context.scene.render.engine == engine, "and ending it brings the artist's engine back")
 

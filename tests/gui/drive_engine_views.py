@@ -8,7 +8,7 @@ import time
 import bpy
 import eyes
 import numpy as np
-from hands import Pulse, click, module, operate, select, settings, until, view_middle, wait_for_job
+from hands import Pulse, click, editor_for_results, module, operate, select, settings, until, view_middle, wait_for_job
 
 SECONDS = 1800
 EXPOSURE = -1.5
@@ -151,8 +151,9 @@ def beside_cycles(rig):
     yield 1
     pixels = yield from eyes.settled(rig, "views_8_no_cycles.png")
     rig.check(is_picture(pixels), "without a Cycles picture the technique is seen")
-    settings().techniques, settings().cycles_samples = {"ltsh4"}, 64
+    settings().techniques, settings().cycles_samples, settings().anti_aliasing = {"ltsh4"}, 64, 1
     settings().shadows = False  # as in the view
+    editor_for_results(rig)
     operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
     yield from wait_for_job(rig, 900)
     pixels = yield from eyes.settled(rig, "views_8_difference.png")

@@ -8,7 +8,7 @@ import bpy
 ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
 CLICK_SECONDS = 0.6
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
-MANUAL, PREVIEW, COMPARE, SHADE, CANCEL = (60, 15), (155, 54), (155, 353), (155, 382), (155, 171)
+MANUAL, PREVIEW, COMPARE, SHADE, CANCEL = (60, 15), (155, 54), (155, 353), (155, 382), (155, 167)
 
 
 def module(name):
@@ -46,8 +46,17 @@ def click_button(rig, place):
     yield from click(rig, *to_window(rig, "VIEW_3D", "UI", *place))
 
 
+def editor_for_results(rig):
+    """Make the timeline an Image Editor, in which results open: a window of their own would lie over this one."""
+    for area in rig.window.screen.areas:
+        if area.type == "DOPESHEET_EDITOR":
+            area.ui_type = "IMAGE_EDITOR"
+
+
 def open_panel(rig):
-    """Look through the camera, with our tab in the sidebar."""
+    """Look through the camera, with our tab in the sidebar; results open in the timeline's area."""
+    editor_for_results(rig)
+    settings().anti_aliasing = 1
     rig.camera_view()
     rig.panel()
     yield 1
@@ -79,9 +88,21 @@ def close_window(window):
 
 
 def results_opened(rig):
-    """Show the results in the Image Editor, and wait for our tab beside them."""
+    """Show the results in an Image Editor in half of the 3D view, with our tab beside them."""
+    screen = rig.window.screen
+    for area in screen.areas:
+        if area.type == "IMAGE_EDITOR":
+            area.ui_type = "TIMELINE"
+    known = set(screen.areas)
+    operate(rig, bpy.ops.screen.area_split, direction="VERTICAL", factor=0.5)
+    area = next(area for area in screen.areas if area not in known)
+    area.ui_type = "IMAGE_EDITOR"
+    area.spaces.active.show_region_ui = True
     operate(rig, bpy.ops.ltsh.open_results)
-    yield from until(lambda: rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", 30)
+    yield 2
+    rig.region("IMAGE_EDITOR", "UI").active_panel_category = "LTSH"
+    operate(rig, bpy.ops.image.view_all, fit_view=True, kind="IMAGE_EDITOR")
+    yield 1
 
 
 def view_middle(rig):

@@ -24,8 +24,8 @@ import numpy as np
 from .lookup_table import MIN_ALPHA
 from .polygon import dot, project_to_sphere
 
-# Halvings of each edge of a light before it is integrated along; round lights have short edges.
-HALVINGS, MANY_EDGES = 2, 16
+# Lights of fewer corners have their edges cut in two, and both parts again where they bend most.
+MANY_EDGES, NEWTON_STEPS = 16, 2
 
 
 def ggx_brdf_cosine(cos_theta_o, alpha, directions):
@@ -156,6 +156,11 @@ class HalfVectors:
         """Stretched half vectors (3, ..., P), of any length, for vectors (3, ..., P) in local frames."""
         return self._stretched(vectors, np.sqrt(dot(vectors, vectors)))
 
+    def along_edge(self, vectors, step):
+        """As `to_original_domain` for vectors (3, ..., P), and how fast that changes with `step` (3, ..., P)."""
+        length = np.sqrt(dot(vectors, vectors))
+        return self._stretched(vectors, length), self._stretched(step, dot(vectors, step) / np.maximum(length, 1e-300))
+
     def _stretched(self, vectors, length):
         x, y, z = vectors
         x = x + length * self.sine
@@ -190,13 +195,26 @@ class HalfBoundary:
     @classmethod
     def of(cls, halves: HalfVectors, polygon: np.ndarray) -> HalfBoundary:
         """Of polygons (3, V, P) above the horizon of local frames."""
-        for _ in range(HALVINGS if polygon.shape[1] < MANY_EDGES else 0):
-            following = np.roll(polygon, -1, axis=1)
-            near, far = (np.sqrt(dot(*[halves.to_original_domain(ends)] * 2)) for ends in (polygon, following))
-            # In the middle of the arc that an edge is, where the length of vectors changes evenly.
-            middle = polygon + near / np.maximum(near + far, 1e-300) * (following - polygon)
-            polygon = np.stack([polygon, middle], axis=2).reshape(3, -1, polygon.shape[2])
+        if polygon.shape[1] < MANY_EDGES:
+            polygon = _with_middles(polygon, 0.5 * (polygon + np.roll(polygon, -1, axis=1)))
+            polygon = _with_middles(polygon, cls._bends(halves, polygon))
         return cls(halves, polygon, np.roll(polygon, -1, axis=1) - polygon)
+
+    @staticmethod
+    def _bends(halves, polygon) -> np.ndarray:
+        """Points (3, V, P) of the edges that are, in h', as far from both ends: exact of edges that are straight there,
+        then steps of Newton's."""
+        step = np.roll(polygon, -1, axis=1) - polygon
+        near = halves.to_original_domain(polygon)
+        length = np.sqrt(dot(near, near))
+        near = near / np.maximum(length, 1e-300)
+        across, total = np.roll(near, -1, axis=1) - near, length + np.roll(length, -1, axis=1)
+        share = length / np.maximum(total, 1e-300)
+        for _ in range(NEWTON_STEPS):
+            stretched, moved = halves.along_edge(polygon + share * step, step)
+            slope = dot(moved, across)
+            share = np.clip(share - dot(stretched, across) / np.where(slope > 0.0, slope, np.inf), 0.0, 1.0)
+        return polygon + share * step
 
     pieces = property(lambda self: self.start.shape[1])
 
@@ -223,15 +241,17 @@ class HalfBoundary:
         )
         total = first + last
         speed = 1.0 / (_sinc(angle) * near * far * total * total)
-        place = self.start[:, :, None] + (last / total) * self.step[:, :, None]
-        length = np.sqrt(dot(place, place))
-        stretched = self.halves._stretched(place, length)
         step = self.step[:, :, None]
-        moved = self.halves._stretched(np.broadcast_to(step, place.shape), dot(place, step) / length)
+        stretched, moved = self.halves.along_edge(self.start[:, :, None] + (last / total) * step, step)
         squared = dot(stretched, stretched)
         measure = np.cross(stretched, moved, axis=0) * (speed * weights / squared)
-        count = place.shape[-1]
+        count = squared.shape[-1]
         return (stretched / np.sqrt(squared)).reshape(3, -1, count), measure.reshape(3, -1, count)
+
+
+def _with_middles(polygon, middles):
+    """Polygons (3, 2 V, P) of the corners (3, V, P) and the points `middles` (3, V, P) between each and the next."""
+    return np.stack([polygon, middles], axis=2).reshape(3, -1, polygon.shape[2])
 
 
 def _sinc(angle):

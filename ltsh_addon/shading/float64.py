@@ -20,7 +20,7 @@ from .lobes import FLOAT64_CHUNK, LEAST_SHARE, form_factor, integrals_on_sphere,
 from .lookup_table import MIN_ALPHA, Lobe, LookupTable
 from .patch_tree import PatchTree
 from .polygon import dot
-from .reference import reference_integrals
+from .reference import anisotropic_integrals, reference_integrals
 from .spherical_harmonics import coefficient_index
 from .tails import SeenLight, TailLimits
 
@@ -241,8 +241,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 parts = _joined(parts, len(samples))
             parts = _finished(parts, table, samples, light)
             if len(anisotropic):
-                estimates = np.zeros(len(samples))
-                others = reference_integrals(samples, cosine, frame, light, corners, anisotropic, estimates)
+                others = anisotropic_integrals(samples, cosine, frame, light, corners, anisotropic)
                 parts = chain(parts, others)
         for index, integrals in parts:
             plain, schlick, dip, dielectric = integrals[:4, :, None]

@@ -26,14 +26,27 @@ from .light_polygons import in_front, light_view, to_local, visible_parts
 from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
 from .polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
 
-# Gauss-Legendre orders along each piece of the boundary, and along a radius; tried in turn.
-_ORDERS = ((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72))
 _ELLIPSE_PIECES = 8
 # Evaluations per batch: the arrays of one batch stay in the cache.
-_BATCH = 60_000
-_ROUND_CORNERS = 128
+_BATCH = 30_000
 # Per arc of a cone's edge, where the factor of the spread is 0.
 _CONE_CHORDS = 4
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is done for an integral."""
+
+    orders: tuple[tuple[int, int], ...]  # Gauss-Legendre, along each piece of the boundary and a radius; in turn
+    tolerance: float
+    round_corners: int  # of the polygon that a round light is, where it is no exact ellipse
+
+
+EXACT = Effort(((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72)), 1e-4, 128)
+# For anisotropic lobes in techniques with a table: of up to VERY_STRETCHED times as large an alpha along one axis as
+# along the other to 2e-3 of the light at most; to that more orders are needed beyond.
+QUICK, QUICK_STRETCHED = Effort(((4, 4),), 1.0, 32), Effort(((5, 6), (8, 10), (14, 16), (24, 26)), 2e-3, 32)
+VERY_STRETCHED = 10.5
 
 
 @dataclass(frozen=True)
@@ -196,7 +209,7 @@ def lobe_integrals(
     alpha,
     ior,
     *,
-    tolerance=1e-4,
+    effort: Effort = EXACT,
     cone: Cone | FacingEmission | None = None,
     metal=None,
     halves: HalfVectors | None = None,
@@ -205,10 +218,10 @@ def lobe_integrals(
 
     `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
     cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
-    `ior` (P,). The order grows until two successive orders differ by less than `tolerance` of the first row plus 1e-6;
-    the estimate is the last difference. Lights must be convex. With a `cone` the integrand has its factor, too. With a
-    `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance falls below 0. Anisotropic lobes are
-    those of `halves`, whatever `alpha` is; they take no exact ellipses.
+    `ior` (P,). The order grows until two successive orders differ by less than the tolerance of the first row plus
+    1e-6; the estimate is the last difference, infinite after one order. Lights must be convex. With a `cone` the
+    integrand has its factor, too. With a `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance
+    falls below 0. Anisotropic lobes are those of `halves`, whatever `alpha` is; they take no exact ellipses.
     """
     warp = limit_warp(cos_theta_o, alpha) if halves is None else halves
     boundary = make_boundary(warp)
@@ -218,7 +231,7 @@ def lobe_integrals(
     count = len(cos_theta_o)
     result, error = np.zeros((4 if metal is None else 7, count)), np.full(count, np.inf)
     open_points = np.arange(count)
-    for level, order in enumerate(_ORDERS):
+    for level, order in enumerate(effort.orders):
         batch = max(_BATCH // (boundary.pieces * order[0] * order[1]), 1)
         for start in range(0, len(open_points), batch):
             index = open_points[start : start + batch]
@@ -229,7 +242,7 @@ def lobe_integrals(
             if level > 0:
                 error[index] = np.abs(value - result[:, index]).max(axis=0)
             result[:, index] = value
-        open_points = open_points[error[open_points] > tolerance * np.abs(result[0, open_points]) + 1e-6]
+        open_points = open_points[error[open_points] > effort.tolerance * np.abs(result[0, open_points]) + 1e-6]
         if len(open_points) == 0:
             break
     return np.maximum(result, 0.0), error
@@ -317,20 +330,31 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
     if is_anisotropic.any():
         plain = candidates[~is_anisotropic]
         if len(plain):
-            yield from _integrals(samples, (cosine, None), frame, light, corners, plain, error)
-        halves = HalfVectors.of(samples, frame, cosine)
-        yield from _integrals(samples, (cosine, halves), frame, light, corners, candidates[is_anisotropic], error)
+            yield from _integrals(samples, (cosine, None, EXACT), frame, light, corners, plain, error)
+        lobes = cosine, HalfVectors.of(samples, frame, cosine), EXACT
+        yield from _integrals(samples, lobes, frame, light, corners, candidates[is_anisotropic], error)
     else:
-        yield from _integrals(samples, (cosine, None), frame, light, corners, candidates, error)
+        yield from _integrals(samples, (cosine, None, EXACT), frame, light, corners, candidates, error)
+
+
+def anisotropic_integrals(samples, cosine, frame, light, corners, candidates):
+    """As `reference_integrals` of anisotropic lobes, with less effort and without estimates."""
+    halves, across = HalfVectors.of(samples, frame, cosine), np.square(1.0 - samples.anisotropy[candidates])
+    is_long = np.maximum(across, 1.0 / across) > VERY_STRETCHED
+    for effort, chosen in ((QUICK, candidates[~is_long]), (QUICK_STRETCHED, candidates[is_long])):
+        if len(chosen):
+            ignored = np.zeros(len(samples))
+            yield from _integrals(samples, (cosine, halves, effort), frame, light, corners, chosen, ignored)
 
 
 def _integrals(samples, lobes, frame, light, corners, candidates, error):
-    """As `reference_integrals` for `lobes`: cosines (P,) of theta_o, and the HalfVectors of anisotropic ones."""
-    cosine, halves = lobes
+    """As `reference_integrals` for `lobes`: cosines (P,) of theta_o, the HalfVectors of anisotropic ones, and the
+    Effort."""
+    cosine, halves, effort = lobes
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
     clipped = brdf.clipped_metals(samples)
     if light.is_round:
-        corners = light.polygon(_ROUND_CORNERS)
+        corners = light.polygon(effort.round_corners)
     if light.is_focused:
         batches = _cone_parts(samples, cosine, frame, light, corners, candidates)
     elif light.is_round and halves is None:
@@ -347,7 +371,7 @@ def _integrals(samples, lobes, frame, light, corners, candidates, error):
         alpha = samples.roughness[index] ** 2
         setting, own = (cosine[index], alpha, samples.ior[index]), None if halves is None else halves.take(index)
         metal = [term[index] * clipped[index, None] for term in terms] if clipped[index].any() else None
-        integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal, halves=own)
+        integrals, estimate = lobe_integrals(make_boundary, *setting, effort=effort, cone=cone, metal=metal, halves=own)
         if light.is_facing:
             integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
         error[index] += estimate

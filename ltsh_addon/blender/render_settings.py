@@ -407,10 +407,10 @@ def render_exr(scene, path: Path) -> None:
 
 def pass_names() -> dict[str, str]:
     """Names of the passes in the EXR, which changed with 5.0."""
-    names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission")
+    names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission", "Environment")
     if bpy.app.version < (5, 0, 0):
-        names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit")
-    keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission")
+        names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit", "Env")
+    keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission", "background")
     return dict(zip(keys, names, strict=True))
 
 

@@ -204,6 +204,7 @@ def _job_of(engine, depsgraph) -> FinalJob:
         shadows="on" if scene.ltsh.shadows else "off",
         shadow_rays=scene.ltsh.shadow_rays,
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
+        has_sky=not (scene.render.film_transparent or world_radiance(scene.world)[1]),
         cycles_samples=settings.cycles_samples if settings.complete else 0,
         cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
         keeps_lights=scene.ltsh.keep_lights and not engine.is_animation,
@@ -227,6 +228,7 @@ class FinalJob:
     shadows: str = "off"
     shadow_rays: int = 256  # see `PictureOptions`
     background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
+    has_sky: bool = False  # the background varies: Cycles renders it
     cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
     cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
     keeps_lights: bool = False  # for the light mixer
@@ -282,11 +284,15 @@ def final_picture(
         scene_name=job.scene,
         view_layer=job.view_layer,
         emission=True,
+        background=job.has_sky,
         shadows=job.shadows,
     )
     extraction = client.extract(options, progress=progress)
     emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
     coverage = inside_border(extraction.film.coverage(), extraction.border)
+    behind = (
+        job.background if extraction.background is None else inside_border(extraction.background, extraction.border)
+    )
     passes, warnings = {EMISSION: emission}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
@@ -296,7 +302,7 @@ def final_picture(
         shown = PASSES if job.shown == "combined" else (job.shown,)
         color = emission if job.shown == "combined" else np.zeros_like(emission)
         color = sum((passes[name] for part in shown if (name := f"LTSH {PASS_LABELS[part]}") in passes), color)
-        combined = _over_background(color, coverage, job, extraction.exposure)
+        combined = _over_background(color, coverage, behind, extraction.exposure)
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
 
     show(picture())
@@ -314,7 +320,8 @@ def final_picture(
         return picture()
     shown = PASSES if job.shown == "combined" else (job.shown,)
     glow = extraction.exposure * extraction.emission * (job.shown == "combined")
-    rest = _over_background(glow, extraction.film.coverage(), job, extraction.exposure)
+    behind = job.background if extraction.background is None else extraction.background
+    rest = _over_background(glow, extraction.film.coverage(), behind, extraction.exposure)
     kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
     return replace(picture(), lights=light_pictures(kept, progress))
 
@@ -342,7 +349,7 @@ def _direct_light(job: FinalJob, comparison) -> FinalPicture:
     images = {f"LTSH {PASS_LABELS[part]}": image for (_, part), image in comparison.images.items()}
     coverage = extraction.film.coverage()
     combined = _over_background(
-        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job, extraction.exposure
+        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.exposure
     )
     passes = {name: inside_border(image, extraction.border) for name, image in images.items()}
     return FinalPicture(inside_border(combined, extraction.border), passes, ())
@@ -398,12 +405,13 @@ def _image(extraction, technique: str, part: str, shadows, progress: Progress) -
     return inside_border(extraction.film.image(extraction.exposure * lit.combined), extraction.border)
 
 
-def _over_background(color: np.ndarray, coverage: np.ndarray, job: FinalJob, exposure: float) -> np.ndarray:
-    """RGBA (H, W, 4) of `color`."""
-    if job.background is None:
+def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:
+    """RGBA (H, W, 4) of `color` over what is behind the surfaces: radiance (3,), what of it is seen (H, W, 3), or None:
+    nothing."""
+    if background is None:
         return np.concatenate([color, coverage[..., None]], axis=-1)
-    behind = exposure * job.background * (1.0 - coverage)[..., None]
-    return np.concatenate([color + behind, np.ones((*coverage.shape, 1))], axis=-1)
+    seen = background if background.ndim == 3 else background * (1.0 - coverage)[..., None]
+    return np.concatenate([color + exposure * seen, np.ones((*coverage.shape, 1))], axis=-1)
 
 
 def inside_border(image: np.ndarray, border) -> np.ndarray:

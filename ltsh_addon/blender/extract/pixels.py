@@ -13,7 +13,7 @@ from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
-from ..lights.world import blocks_nothing, take_world, world_lights
+from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials.aovs import (
     declare_aovs,
     give_default_material,
@@ -59,6 +59,8 @@ def render_pixel_samples(
     return files
 
 
+# What may be asked for -> the pass of Cycles that has it.
+EXTRA_PASSES = {"emission": "emit", "background": "environment"}
 # File with what stands in the way of light.
 OCCLUDERS = "occluders.npz"
 SEEDS = {"A": 1, "B": 7919}
@@ -195,6 +197,7 @@ def prepare_scene(
     kept = inventory.kept if for_finished else None
     of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, kept)
     inventory.receivers.mark()
+    inventory.behind = world
     add_world(inventory, scene, world)
     warnings.extend(inventory.warnings)
     if not inventory.lights and not for_finished:
@@ -243,8 +246,9 @@ def extract(job: dict, folder: Path, progress) -> dict:
         inventory.occluders.save(folder / OCCLUDERS)
 
     started = time.monotonic()
-    extra_passes = ("emit",) if job.get("emission") else ()
-    samples = render_pixel_samples(scene, view_layer, folder, job["sub_samples"], progress, extra_passes)
+    extra_passes = tuple(one for key, one in EXTRA_PASSES.items() if job.get(key))
+    with world_behind(scene, inventory.behind if job.get("background") else None):
+        samples = render_pixel_samples(scene, view_layer, folder, job["sub_samples"], progress, extra_passes)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None

@@ -52,6 +52,7 @@ class LightInventory:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m in the file, of all positions here
     unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
     world: Any = None  # that lights the scene
+    behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, where shadows are wanted
     made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`

@@ -21,7 +21,8 @@ SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
 # What patches differ by, on average, that is worth a warning.
 COARSE = 0.05
 MOST_RADIANCE = 1e15  # W m^-2 sr^-1
-NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1  # "NONE" and "AUTOMATIC" of a world's sampling method
+SAMPLING_METHODS = ("NONE", "AUTOMATIC", "MANUAL")  # of a world, by their numbers
+NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1
 # What Light Path nodes say of the light that surfaces see, as where Cycles samples the world.
 LIGHT_PATH = "ShaderNodeLightPath"
 SEEN_BY_SURFACES = {"Is Camera Ray": 0.0, "Ray Depth": 1.0}
@@ -44,6 +45,22 @@ def take_world(scene, view_layer, warnings: list[str]):
     if world.cycles.sampling_method == "NONE":
         _store(world.cycles, "sampling_method", SAMPLED_BY_ITSELF)
     return world
+
+
+@contextmanager
+def world_behind(scene, world):
+    """Meanwhile `scene` has the `world`, which Cycles prepares for no light."""
+    if world is None:
+        yield
+        return
+    method = SAMPLING_METHODS.index(world.cycles.sampling_method)
+    try:
+        _store(world.cycles, "sampling_method", NOT_SAMPLED)
+        scene.world = world
+        yield
+    finally:
+        scene.world = None
+        _store(world.cycles, "sampling_method", method)
 
 
 def _store(settings, name: str, value) -> None:

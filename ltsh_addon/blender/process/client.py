@@ -38,6 +38,7 @@ class ExtractOptions:
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
+    background: bool = False  # and what of the world is seen behind them
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
 
@@ -70,10 +71,10 @@ class Extraction:
     W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
-    the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, without the
-    exposure; None where it was not asked for. `problems` say why most of the picture is not shaded. `occluders` are
-    what stands in the way of light, around `origin` (3,) in m; None without shadows. `light_settings` are power,
-    exposure, red, green and blue of light objects as Blender has them.
+    the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, and `background` what of the
+    world is seen behind them, without the exposure; None where it was not asked for. `problems` say why most of the
+    picture is not shaded. `occluders` are what stands in the way of light, around `origin` (3,) in m; None without
+    shadows. `light_settings` are power, exposure, red, green and blue of light objects as Blender has them.
     """
 
     lights: tuple[AreaLight, ...]
@@ -91,6 +92,7 @@ class Extraction:
     pixel_filter: str = "BOX"
     color_space: ColorSpace = REC709
     emission: np.ndarray | None = None
+    background: np.ndarray | None = None
     problems: tuple[str, ...] = ()
     occluders: Occluders | None = None
     kept: KeptByCycles | None = None
@@ -133,7 +135,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             reference=read_reference(manifest, folder),
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
-            emission=_read_emission(manifest, folder) if options.emission else None,
+            emission=_read_pass("emission", manifest, folder) if options.emission else None,
+            background=_read_pass("background", manifest, folder) if options.background else None,
             kept=kept,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
@@ -220,9 +223,9 @@ def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 
 
-def _read_emission(manifest: dict, folder: Path) -> np.ndarray:
-    """What surfaces emit, the mean of all sample renders."""
-    name = manifest["passes"]["emission"]
+def _read_pass(key: str, manifest: dict, folder: Path) -> np.ndarray:
+    """A pass of the sample renders (H, W, 3), the mean of all."""
+    name = manifest["passes"][key]
     images = [lobes.read_layer(_rendered(folder / file), name, "RGB") for file in manifest["samples"]]
     return np.mean(images, axis=0, dtype=np.float64)
 

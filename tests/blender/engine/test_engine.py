@@ -303,6 +303,28 @@ def test_the_picture_is_shown_as_its_passes_come(scene, tmp_path):
     np.testing.assert_array_equal(shown[-1].combined, whole.combined)
 
 
+def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
+    """What cameras see of it, where surfaces see something else."""
+    world, background = parts.add_world(Color=(0.9, 0.3, 0.1, 1.0))
+    tree, seen = world.node_tree, np.array([0.2, 0.5, 0.4])
+    plain = parts.add_node(tree, "ShaderNodeBackground", Color=(*seen, 1.0))
+    mix, path = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeLightPath")
+    output = background.outputs[0].links[0].to_node
+    for start, end in ((path.outputs["Is Camera Ray"], mix.inputs[0]), (background.outputs[0], mix.inputs[1]),
+                       (plain.outputs[0], mix.inputs[2]), (mix.outputs[0], output.inputs["Surface"])):  # fmt: skip
+        tree.links.new(start, end)
+    path = parts.save(tmp_path / "scene.blend")
+    picture = render_module.final_picture(
+        final_job(scene, background=np.zeros(3), has_sky=True), path, lambda *now: True
+    )
+    lit = picture.passes["LTSH Specular"] + picture.passes["LTSH Diffuse"] + picture.passes[render_module.EMISSION]
+    behind = picture.combined[..., :3] - lit
+    share = behind[..., 1] / seen[1]
+    assert share.min() > -1e-4 and share.max() == pytest.approx(1.0, abs=1e-3) and share.mean() < 0.9
+    np.testing.assert_allclose(behind, share[..., None] * seen, atol=2e-3)
+    np.testing.assert_array_equal(picture.combined[..., 3], 1.0)
+
+
 def test_a_complete_picture_shows_its_direct_light_before_cycles_begins(scene, tmp_path):
     path, stages, shown = parts.save(tmp_path / "scene.blend"), [], []
     job = final_job(scene, cycles_samples=2, shadow_rays=8)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ...pipeline.relight import Row, tint
+from ...pipeline.relight import Row
 from ...scene import AreaLight, SceneError, error_line, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
@@ -67,7 +67,8 @@ def moved_rows(context, rows) -> dict[int, AreaLight]:
 
 def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
     """Power, exposure and color of each light object of a row that give what the mixer shows."""
-    found, factor = {}, tint(np.array(row.color), item.color)
+    # A channel that the light has not got in the picture is left as it is.
+    found, factor = {}, np.where(np.array(row.color) != 0.0, results.tint_of(row, item), 1.0)
     for name, (power, exposure, *color) in row.settings.items():
         mixed = factor * color
         # Colors stay within what Blender's color fields show.
@@ -78,7 +79,7 @@ def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]
 
 def _stands_elsewhere(ob, kept: dict) -> bool:
     """True where a light object has moved or turned since its light was kept: what is known at once."""
-    if ob.type != "LIGHT":
+    if ob is None or ob.type != "LIGHT":
         return False
     matrix = np.array(ob.matrix_world)
     near = kept["is_distant"] or np.allclose(matrix[:3, 3], kept["center"], rtol=1e-4, atol=1e-4)
@@ -94,7 +95,7 @@ def state_of(row: Row, item) -> tuple[str, str]:
     lost = [name for name in row.lights if name not in bpy.data.objects]
     if lost and row.settings:
         return "ERROR", f"{listed(lost, 3)}: not in the scene any more"
-    if row.light is not None and _stands_elsewhere(bpy.data.objects[row.name], row.light):
+    if row.light is not None and _stands_elsewhere(bpy.data.objects.get(row.name), row.light):
         return "ERROR", f"{row.name}: moved since this picture; {UPDATE} shades it where it is"
     for name, (power, exposure, color) in targets(row, item).items():
         ob = bpy.data.objects[name]

@@ -280,10 +280,11 @@ def _factor(scene, row: Row, item) -> np.ndarray:
         return np.ones(3)
     if not is_on(scene, item):
         return np.zeros(3)
-    return item.power * 2.0**item.exposure * _tint(row, item)
+    return item.power * 2.0**item.exposure * tint_of(row, item)
 
 
-def _tint(row: Row, item) -> np.ndarray:
+def tint_of(row: Row, item) -> np.ndarray:
+    """By what the mixer multiplies red, green and blue of a row to get its color."""
     # Blender holds colors in single precision.
     same = np.allclose(item.color, row.color, rtol=1e-6, atol=1e-6)
     return np.ones(3) if same else tint(np.array(row.color), item.color)
@@ -296,7 +297,7 @@ def is_on(scene, item) -> bool:
 
 def is_neutral(row: Row, item) -> bool:
     """True where power, exposure and color are as rendered."""
-    return item.power == 1.0 and item.exposure == 0.0 and bool((_tint(row, item) == 1.0).all())
+    return item.power == 1.0 and item.exposure == 0.0 and bool((tint_of(row, item) == 1.0).all())
 
 
 def reset_mixer(scene) -> None:

@@ -1,5 +1,7 @@
 """The light mixer in Blender: what it shows, what it writes to the lights of the scene, lights that have moved."""
 
+from dataclasses import replace
+
 import bpy
 import numpy as np
 import pytest
@@ -113,6 +115,18 @@ def test_colors_beyond_white_go_into_the_power(scene):
     mixer.applied(scene)
     assert max(key.data.color) <= 1.0 + 1e-6
     np.testing.assert_allclose(key.data.energy * np.array(key.data.color), (200.0, 50.0, 50.0), rtol=1e-6)
+
+
+def test_channels_that_a_light_has_not_got_are_left_alone(scene, pictures):
+    """By its nodes the light is red, whatever its color."""
+    key = bpy.data.objects["Key"]
+    rows = [replace(results.mixer_pairs(scene)[0][0], color=(1.0, 0.0, 0.0)), Row("Panel", ("Panel",), light={})]
+    show(scene, rows, pictures[:2])
+    results.reset_mixer(scene)
+    items(scene)["Key"].power, items(scene)["Key"].color = 2.0, (0.5, 1.0, 1.0)
+    assert mixer.applied(scene) == []
+    np.testing.assert_allclose(key.data.energy * np.array(key.data.color), (50.0, 50.0, 25.0), rtol=1e-6)
+    assert [mixer.state_of(*pair)[1] for pair in results.mixer_pairs(scene)] == ["", ""]
 
 
 def test_what_cannot_be_written_is_named(scene):

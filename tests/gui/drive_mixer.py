@@ -10,14 +10,14 @@ SIZE = "1600x900"
 SECONDS = 1200
 # Where things of our panel are, in pixels from the right and the upper end of the sidebar: of the first light the eye,
 # its power below the list, and Apply to Scene.
-EYE, POWER, APPLY = (256, 234), (107, 339), (88, 411)
+EYE, POWER, APPLY = (256, 209), (107, 314), (88, 386)
 
 
 def main(rig):
     yield from hands.open_panel(rig)
     yield 1
     settings = hands.settings()
-    settings.anti_aliasing = 1
+    settings.anti_aliasing, settings.resolution_percentage = 1, 60
     yield from beside_the_view(rig)
     hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
     yield from hands.job_started(rig, "shading starts")

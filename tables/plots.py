@@ -39,7 +39,7 @@ def draw_all(folder: Path, report) -> list[Path]:
 
 def draw_error_maps():
     """Relative L2 error over roughness and angle, one panel per shipped table."""
-    figure, axes = plt.subplots(1, len(SHIPPED_TABLES), figsize=(10.5, 3.1), sharey=True, constrained_layout=True)
+    figure, axes = plt.subplots(1, len(SHIPPED_TABLES), figsize=(13.0, 3.1), sharey=True, constrained_layout=True)
     for axis, name in zip(axes, SHIPPED_TABLES, strict=True):
         errors = validate.error_map(load_table(name))
         image = axis.imshow(
@@ -70,7 +70,7 @@ def draw_lobes():
         axis.axhline(0.0, color="0.5", lw=0.6)
         axis.set_aspect("equal")
         axis.axis("off")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure
 
 

@@ -5,6 +5,8 @@ World space is Blender's: metres, right-handed, z up. Radiance is scene-referred
 
 from __future__ import annotations
 
+import base64
+import itertools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -207,11 +209,17 @@ class AreaLight:
 
     def moved(self, offset: np.ndarray) -> AreaLight:
         """The same light elsewhere by `offset` (3,) in m."""
-        if self.is_distant:
+        if self.is_distant or not np.any(offset):
             return self
         corners = None if self.corners is None else self.corners + offset
         detail = tuple(part.moved(offset) for part in self.detail)
-        return replace(self, center=self.center + offset, corners=corners, detail=detail)
+        return self.altered(center=self.center + offset, corners=corners, detail=detail)
+
+    def altered(self, **changes) -> AreaLight:
+        """A copy with other values, which are not checked: `dataclasses.replace` takes too long for 100,000 lights."""
+        light = object.__new__(AreaLight)
+        light.__dict__.update({name: self.__dict__[name] for name in _LIGHT_FIELDS}, **changes)
+        return light
 
     def origins(self, position: np.ndarray) -> np.ndarray:
         """From where the light is seen at `position` (...): there, or where directions start."""
@@ -298,6 +306,51 @@ class AreaLight:
         if self.is_round:
             return round_outline(round_vertices)
         return np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
+
+
+_LIGHT_FIELDS = tuple(item.name for item in fields(AreaLight))
+_VECTORS = ("center", "half_u", "half_v", "direction", "radiance")
+# In a row: more lights that differ in their vectors and corners alone have one record.
+_FEW_ALIKE = 16
+
+
+def light_records(lights: Iterable[AreaLight]) -> list[dict]:
+    """What JSON has of `lights`, for `lights_of`."""
+    found = []
+    for own in (list(alike) for _, alike in itertools.groupby(lights, _kind)):
+        if len(own) <= _FEW_ALIKE or own[0].detail or own[0].cone is not None or own[0].pattern is not None:
+            found += [light.record() for light in own]
+            continue
+        vectors = [np.array([getattr(light, name) for light in own]) for name in _VECTORS]
+        if own[0].corners is not None:
+            vectors.append(np.array([light.corners for light in own]).reshape(len(own), -1))
+        values = np.concatenate(vectors, axis=1).astype("<f8")
+        found.append({"like": own[0].record(), "vectors": base64.b64encode(values.tobytes()).decode()})
+    return found
+
+
+def _kind(light) -> tuple:
+    rest = (light.__dict__[name] for name in _LIGHT_FIELDS if name not in (*_VECTORS, "corners", "detail"))
+    return *rest, len(light.detail), 0 if light.corners is None else len(light.corners)
+
+
+def lights_of(records: Iterable[dict]) -> tuple[AreaLight, ...]:
+    """The lights of `light_records`. Raises ValueError and TypeError where they are not whole."""
+    found = []
+    for record in records:
+        if "like" not in record:
+            found.append(AreaLight(**record))
+            continue
+        like = AreaLight(**record["like"])
+        corners = () if like.corners is None else like.corners.shape
+        values = np.frombuffer(base64.b64decode(record["vectors"], validate=True), "<f8")
+        values = values.reshape(-1, 3 * (len(_VECTORS) + (corners[0] if corners else 0)))
+        if not np.isfinite(values).all():
+            raise ValueError(f"light {like.name!r}: vectors that are not finite, expected finite numbers")
+        for row in values:
+            own = {name: row[3 * place : 3 * place + 3] for place, name in enumerate(_VECTORS)}
+            found.append(like.altered(**own, corners=row[3 * len(_VECTORS) :].reshape(corners) if corners else None))
+    return tuple(found)
 
 
 def round_outline(count: int) -> np.ndarray:

@@ -45,17 +45,48 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     groups = _connected(len(triangles), neighbors)
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
-    polygons = []
-    for members in np.split(order, starts[1:]):
-        if len(members) == 0:
+    ends = np.append(starts[1:], len(order))[: len(starts)]
+    polygons: dict[int, FlatPolygon] = {}  # by their place in the order
+    labels, triangle_corners = labels.tolist(), vertices[triangles]
+    pairs = starts[ends - starts == 2]
+    corners, pair_normals, are_quads = _quads(vertices, triangles[order[pairs]], triangles[order[pairs + 1]])
+    for start, own, normal in zip(pairs[are_quads].tolist(), corners[are_quads], pair_normals[are_quads], strict=True):
+        polygons[start] = FlatPolygon(own, normal, labels[order[start]])
+    for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
+        if start in polygons:
             continue
+        members = order[start:end]
         outline = _outline(vertices, triangles[members]) if len(members) > 1 else None
         if outline is not None:
-            polygons.append(FlatPolygon(outline, _normal(outline), int(labels[members[0]])))
+            polygons[start] = FlatPolygon(outline, _normal(outline), labels[members[0]])
             continue
-        for index in members:
-            polygons.append(FlatPolygon(vertices[triangles[index]], normals[index], int(labels[index])))
-    return polygons
+        for place, index in enumerate(members.tolist(), start):
+            polygons[place] = FlatPolygon(triangle_corners[index], normals[index], labels[index])
+    return [polygons[place] for place in sorted(polygons)]
+
+
+def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners (G, 4, 3), unit normals (G, 3) and a mask (G,): of pairs of coplanar triangles (G, 3) those that plainly
+    are a flat polygon of four corners. `_outline` looks at the others, one by one."""
+    matches = (first[:, :, None] == np.roll(second, -1, axis=1)[:, None]) & (
+        np.roll(first, -1, axis=1)[:, :, None] == second[:, None]
+    )
+    rows, place = np.arange(len(first)), matches.reshape(-1, 9).argmax(axis=1)
+    edge, other = place // 3, place % 3
+    index = [first[rows, (edge + step) % 3] for step in (1, 2, 0)] + [second[rows, (other + 2) % 3]]
+    corners = vertices[np.stack(index, axis=1)]
+    offset = corners - corners.mean(axis=1, keepdims=True)
+    before, after = corners - np.roll(corners, 1, axis=1), np.roll(corners, -1, axis=1) - corners
+    area = np.linalg.norm(np.cross(before, after), axis=-1)
+    limit = STRAIGHT * np.maximum(np.abs(corners).max(axis=(1, 2)), np.ptp(corners, axis=1).max(axis=1))
+    good = (matches.sum(axis=(1, 2)) == 1) & (area > limit[:, None] * np.linalg.norm(before + after, axis=-1)).all(
+        axis=1
+    )
+    normals = np.cross(offset, np.roll(offset, -1, axis=1)).sum(axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    height = np.abs((offset * normals[:, None]).sum(axis=-1)).max(axis=1)
+    good &= height <= FLATNESS * np.linalg.norm(offset, axis=-1).max(axis=1)
+    return corners, normals, good
 
 
 def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:

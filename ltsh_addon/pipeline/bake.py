@@ -18,7 +18,7 @@ import numpy as np
 from .. import imaging
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
-from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, Film, Progress, SurfaceSamples, listed
+from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..shading.parallel import cores
 from ..visibility import Occluders
 from . import lighting, picture
@@ -97,12 +97,7 @@ def _shadow_tracer(options, manifest, folder):
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest), np.array(manifest["origin"]), is_baked=True)
-
-
-def lights_of(manifest) -> tuple[AreaLight, ...]:
-    """The lights of a bake."""
-    return tuple(AreaLight(**light) for light in manifest["lights"])
+    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]), np.array(manifest["origin"]), is_baked=True)
 
 
 def _check(options: BakeOptions) -> None:
@@ -157,7 +152,7 @@ class ObjectBaker:
         from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
 
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
-        self.lights, self.tracer = lights_of(manifest), tracer
+        self.lights, self.tracer = lights_of(manifest["lights"]), tracer
         self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]

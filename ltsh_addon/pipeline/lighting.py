@@ -21,7 +21,7 @@ import numpy as np
 
 from .. import shading, visibility
 from ..files import replacing, temporary_folder
-from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line
+from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line, light_records, lights_of
 from ..shading.light_tree import FEWEST
 
 # Of the files of `keep_picture`: all that shading needs, and what shadow rays meet.
@@ -165,7 +165,7 @@ def shade_lights(
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = [replace(lights[light], group=str(number)) for number, one in enumerate(part) for light in one]
+        own = [lights[light].altered(group=str(number)) for number, one in enumerate(part) for light in one]
         found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
         if found.quadrature_error is not None:
             error = found.quadrature_error if error is None else error + found.quadrature_error
@@ -233,7 +233,7 @@ class KeptPicture:
         border, space = found["border"], found["color_space"]
         extraction = Extraction(
             **{name: found[name] for name in UNCHANGED},
-            lights=tuple(AreaLight(**light) for light in found["lights"]),
+            lights=lights_of(found["lights"]),
             samples=SurfaceSamples(**{item.name: arrays[f"samples.{item.name}"] for item in fields(SurfaceSamples)}),
             film=Film(
                 pixel=arrays["film.pixel"],
@@ -275,7 +275,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
     document = {
         "extraction": {
             **{name: getattr(extraction, name) for name in UNCHANGED},
-            "lights": [light.record() for light in extraction.lights],
+            "lights": light_records(extraction.lights),
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,

@@ -224,9 +224,11 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
         lobes, pairs = has_lobe(part), 0
         ends = np.stack([part.position.min(axis=0, initial=np.inf), part.position.max(axis=0, initial=-np.inf)])
         for light in lights:
+            if light.name in reached:
+                continue
             # How far the box around the samples reaches in front of the light.
             ahead = ((light.origins(ends) - light.center) * light.direction).max(axis=0).sum()
-            if light.name not in reached and (light.is_facing or ahead > 0.0):
+            if light.is_facing or ahead > 0.0:
                 pairs += len(part)
                 if pairs > MOST_PAIRS or _reaches(light, part, lobes):
                     reached.add(light.name)

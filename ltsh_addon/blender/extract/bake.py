@@ -14,7 +14,7 @@ import numpy as np
 from ...cycles.texels import BakeView, TexelMesh
 from ...cycles.uv import tiles_of
 from ...files import save_array
-from ...scene import FARTHEST, SceneError, error_line, listed
+from ...scene import FARTHEST, SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
@@ -484,7 +484,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
     return {
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
-        "lights": [light.record() for light in opened.lights],
+        "lights": light_records(opened.lights),
         "origin": opened.origin.tolist(),
         "occluders": OCCLUDERS if job["shadows"] == "on" else None,
         "color_space": working_space(),

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...scene import SceneError, error_line, listed
+from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, seen_lights
@@ -265,7 +265,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "frame": scene.frame_current,
         "camera": camera.name,
         **picture,
-        "lights": [light.record() for light in inventory.lights],
+        "lights": light_records(inventory.lights),
         "light_settings": inventory.settings,
         "origin": inventory.origin.tolist(),
         "occluders": OCCLUDERS if has_shadows else None,

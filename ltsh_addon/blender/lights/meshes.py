@@ -157,6 +157,8 @@ MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
 # Polygons of one object with a texture that are looked at one by one; beyond, the largest stand for all.
 MOST_LOOKS = 256
 STAND_INS = 32
+# Fields of lights that differ from polygon to polygon.
+_PLACE = ("center", "half_u", "half_v", "direction", "corners")
 FEW_POLYGONS = 16
 
 
@@ -285,38 +287,44 @@ def _sides(side: int) -> tuple[int, ...]:
 
 
 def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[AreaLight]:
-    lights = []
-    for _, polygons in parts:
-        for polygon in polygons:
-            for way in _sides(side):
-                value = radiance[polygon.label][0 if way > 0 else 1]
-                if np.any(value):
-                    lights.append(polygon_light(mesh_light.light_of(polygon.label), polygon, way, value))
-    return lights
+    polygons = [polygon for _, own in parts for polygon in own]
+    lights: dict[tuple, AreaLight] = {}
+    kinds: dict[tuple, list[int]] = {}
+    for number, polygon in enumerate(polygons):
+        kinds.setdefault((polygon.label, len(polygon.corners)), []).append(number)
+    for (label, _), numbers in kinds.items():
+        for order, way in enumerate(_sides(side)):
+            value = radiance[label][0 if way > 0 else 1]
+            if np.any(value):
+                own = polygon_lights(mesh_light.light_of(label), [polygons[number] for number in numbers], way, value)
+                lights.update(zip(((number, order) for number in numbers), own, strict=True))
+    return [lights[key] for key in sorted(lights)]
 
 
 def polygon_light(stand_in: AreaLight, polygon: FlatPolygon, way: int, radiance: np.ndarray) -> AreaLight:
     """`stand_in` as the side `way` (1 or -1 times the normal) of `polygon`, half_u along its longest edge."""
-    corners = polygon.corners if way > 0 else polygon.corners[::-1]
-    direction = way * polygon.normal
-    edges = np.roll(corners, -1, axis=0) - corners
-    longest = edges[np.argmax(np.linalg.norm(edges, axis=-1))]
-    u = longest - np.dot(longest, direction) * direction
-    u /= np.linalg.norm(u)
+    return polygon_lights(stand_in, [polygon], way, radiance)[0]
+
+
+def polygon_lights(stand_in: AreaLight, polygons: list[FlatPolygon], way: int, radiance) -> list[AreaLight]:
+    """As `polygon_light`, of `polygons` with equally many corners."""
+    corners = np.array([polygon.corners for polygon in polygons])[:, :: 1 if way > 0 else -1]
+    direction = way * np.array([polygon.normal for polygon in polygons])
+    edges = np.roll(corners, -1, axis=1) - corners
+    u = edges[np.arange(len(edges)), np.linalg.norm(edges, axis=-1).argmax(axis=1)]
+    u = u - (u * direction).sum(axis=1, keepdims=True) * direction
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
     v = np.cross(direction, u)
-    place = (corners - corners[0]) @ np.stack([u, v], axis=-1)
-    low, high = place.min(axis=0), place.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low)
-    return replace(
-        stand_in,
-        shape="POLYGON",
-        center=corners[0] + middle[0] * u + middle[1] * v,
-        half_u=half[0] * u,
-        half_v=half[1] * v,
-        direction=direction,
-        radiance=radiance,
-        corners=corners,
-    )
+    place = np.einsum("nvi,nai->nva", corners - corners[:, :1], np.stack([u, v], axis=1))
+    low, high = place.min(axis=1), place.max(axis=1)
+    (middle_u, middle_v), (half_u, half_v) = (0.5 * (low + high)).T[..., None], (0.5 * (high - low)).T[..., None]
+    center = corners[:, 0] + middle_u * u + middle_v * v
+    first = replace(
+        stand_in, shape="POLYGON", center=center[0], half_u=u[0], half_v=v[0], direction=direction[0],
+        radiance=radiance, corners=corners[0],
+    )  # fmt: skip
+    rows = zip(center, half_u * u, half_v * v, direction, corners, strict=True)
+    return [first.altered(**dict(zip(_PLACE, row, strict=True))) for row in rows]
 
 
 def _material_radiance(studio: Studio, material, known: dict) -> np.ndarray:

@@ -17,7 +17,18 @@ from ...files import replacing_by_copy, temporary_folder
 from ...imaging.color import identified
 from ...imaging.exr import read_channels
 from ...reading import check_name
-from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SceneError, SurfaceSamples, listed
+from ...scene import (
+    REC709,
+    AreaLight,
+    Border,
+    ColorSpace,
+    Film,
+    Progress,
+    SceneError,
+    SurfaceSamples,
+    lights_of,
+    listed,
+)
 from ...shading.light_polygons import has_lobe, lights_that_reach_nothing
 from ...visibility import Occluders
 from .blender_process import run_child
@@ -116,7 +127,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     with temporary_folder() as folder:
         manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
         samples, film, warnings, problems = _read_samples(manifest, folder)
-        lights = tuple(AreaLight(**record) for record in manifest["lights"])
+        lights = lights_of(manifest["lights"])
         warnings += gbuffer.rounded_positions(samples.position, lights)
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])

@@ -1,5 +1,6 @@
 """The shared vocabulary: area lights as polygons, surface samples on disk, film."""
 
+import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from surface_scenes import area_light, random_samples
 
 from ltsh_addon.files import load_samples, save_samples
-from ltsh_addon.scene import AREA_LIGHT_SHAPES, Film, SurfaceSamples
+from ltsh_addon.scene import AREA_LIGHT_SHAPES, AreaLight, Film, SurfaceSamples, light_records, lights_of
 
 shapes = pytest.mark.parametrize("shape", AREA_LIGHT_SHAPES)
 
@@ -47,6 +48,35 @@ def test_lights_refuse_what_makes_no_sense():
     for field, value in wrong.items():
         with pytest.raises(ValueError, match=f"light 'Lamp': {field} is .*, expected three finite numbers"):
             replace(area_light("Lamp"), **{field: value})
+
+
+def test_lights_survive_their_records_many_alike_in_one():
+    """In their order, bit for bit; those that differ in more than their vectors are kept apart."""
+    generator = np.random.default_rng(1)
+    fans = [
+        AreaLight(
+            "Lamp", "POLYGON", *generator.normal(size=(5, 3)), group="A", corners=generator.normal(size=(count, 3))
+        )
+        for count in np.repeat([4, 3, 4], 40)
+    ]
+    lights = [*fans, *(area_light(center=place) for place in generator.normal(size=(30, 3))), area_light(spread=1.0)]
+    lights.append(replace(area_light(), detail=(area_light(),)))
+    records = json.loads(json.dumps(light_records(lights)))
+    assert len(records) == 6
+    for light, other in zip(lights, lights_of(records), strict=True):
+        assert light.record() == other.record()
+        assert np.array_equal(light.area_vector, other.area_vector)
+    records[0]["vectors"] = records[0]["vectors"][:-8]
+    with pytest.raises(ValueError, match="size"):
+        lights_of(records)
+
+
+def test_altered_lights_forget_what_they_have_computed():
+    light = area_light()
+    assert light.area_vector.any()
+    wider = light.altered(half_u=2.0 * light.half_u)
+    assert np.allclose(wider.area_vector, 2.0 * light.area_vector)
+    assert light.moved(np.zeros(3)) is light and np.allclose(light.moved(np.ones(3)).center, light.center + 1.0)
 
 
 @pytest.mark.parametrize("field", [field.name for field in fields(SurfaceSamples)])

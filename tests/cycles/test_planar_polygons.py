@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ltsh_addon.cycles import planar_polygons
 from ltsh_addon.cycles.planar_polygons import flat_polygons, hides_itself, is_closed, is_inside, signed_volume
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
@@ -62,6 +63,29 @@ def test_single_precision_in_any_pose_does_not_break_the_plane():
         moved = 0.1 * vertices @ rotation(generator).T + generator.normal(size=3)
         polygons = flat_polygons(moved.astype(np.float32).astype(float), triangles, labels(triangles))
         assert len(polygons) == 1 and len(polygons[0].corners) == 4
+
+
+def test_bent_and_cut_quads_are_what_they_are_one_by_one(monkeypatch):
+    """Pairs of triangles at once, and one by one: flat quads, a triangle with a straight corner, bent ones, kites."""
+    generator = np.random.default_rng(4)
+    square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    shapes = [square + generator.normal(0.0, 0.2, (4, 3)) * [1, 1, 0] for _ in range(20)]
+    shapes += [square * [1, 1, 0] + [[0, 0, 0], [0, 0, 0], [0, 0, 0.3], [0, 0, 0]]]
+    shapes += [np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 1, 0]])]
+    vertices = np.concatenate([shape + [3.0 * number, 0, 0] for number, shape in enumerate(shapes)])
+    first = 4 * np.arange(len(shapes))[:, None]
+    triangles = np.stack([first + [0, 1, 2], first + [2, 3, 0]], axis=1).reshape(-1, 3)
+    found = flat_polygons(vertices, triangles, labels(triangles))
+    monkeypatch.setattr(planar_polygons, "_quads", none_at_once)
+    expected = flat_polygons(vertices, triangles, labels(triangles))
+    assert len(found) == len(expected) == len(shapes) + 1
+    for polygon, other in zip(found, expected, strict=True):
+        assert {tuple(corner) for corner in polygon.corners} == {tuple(corner) for corner in other.corners}
+        assert np.allclose(polygon.normal, other.normal) and np.isclose(area(polygon), area(other))
+
+
+def none_at_once(vertices, first, second):
+    return np.zeros((len(first), 4, 3)), np.zeros((len(first), 3)), np.zeros(len(first), bool)
 
 
 def test_labels_are_not_mixed():

@@ -103,6 +103,14 @@ def plane_axes(light) -> np.ndarray:
     return np.stack([first, np.cross(light.direction, first)])
 
 
+def upright(light):
+    """The same round light by its principal axes, which are at right angles: transforms may shear it."""
+    u, v = light.half_u, light.half_v
+    turn = 0.5 * np.arctan2(2.0 * (u @ v), u @ u - v @ v)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return light.altered(half_u=cosine * u + sine * v, half_v=cosine * v - sine * u)
+
+
 @dataclass(frozen=True)
 class Effort:
     """Layers per cone, and chords per arc of a layer, 2 or more."""

@@ -256,6 +256,22 @@ def test_a_horizon_beyond_the_cone_changes_nothing(dtype):
     assert checked > 15
 
 
+def test_a_sheared_ellipse_is_the_ellipse_that_it_is():
+    """By other axes of the same surface, which are not at right angles."""
+    u, v, turn = np.array([0.5, 0.1, 0.0]), np.array([0.05, -0.4, 0.0]), 0.6
+    sheared = replace(area_light(shape="ELLIPSE", half_u=u, half_v=v, center=(0, 0, 2.0)), spread=np.radians(70.0))
+    other = {"half_u": np.cos(turn) * u + np.sin(turn) * v, "half_v": np.cos(turn) * v - np.sin(turn) * u}
+    upright = light_cone.upright(sheared)
+    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_cone.ConeRegions.suit(upright)
+    assert np.allclose(upright.area_vector, sheared.area_vector)
+    samples = random_samples(60, seed=8)
+    one, two = (
+        shading.shade(samples, [light], "ltsh4", workers=1).combined for light in (sheared, replace(sheared, **other))
+    )
+    np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-6)
+    assert one.any()
+
+
 def test_bump_maps_shadow_every_part_of_a_light_with_a_spread():
     """Against dense points; double precision, which takes the mean direction, is 0.3 % off them."""
     samples, lights = all_kinds_of_samples(60, seed=5), focused_lights(100.0)

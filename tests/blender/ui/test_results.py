@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -192,6 +193,25 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
     squared = ((technique - halves[0]) * (technique - halves[1])).sum() / (halves[0] * halves[1]).sum()
     assert row["unbiased_squared_error"] == pytest.approx(squared, rel=1e-6)
     assert 0.0 < row["flip"] < 1.0
+
+
+def test_results_open_in_an_image_editor_that_is_free(scene):
+    """Not in a UV Editor, nor in one that shows a picture of the artist's."""
+    texture, render = bpy.data.images.new("Texture", 4, 4), SimpleNamespace(type="RENDER_RESULT")
+
+    def editor(ui_type, image):
+        return SimpleNamespace(ui_type=ui_type, spaces=SimpleNamespace(active=SimpleNamespace(image=image)))
+
+    taken = [editor("VIEW_3D", None), editor("UV", None), editor("IMAGE_EDITOR", texture)]
+    for free in (editor("IMAGE_EDITOR", None), editor("IMAGE_EDITOR", render),
+                 editor("IMAGE_EDITOR", comparison.viewer_image(scene))):  # fmt: skip
+        context = SimpleNamespace(window=SimpleNamespace(screen=SimpleNamespace(areas=[*taken, free])))
+        assert comparison.put_in_editor(context, scene)
+        assert free.spaces.active.image == comparison.viewer_image(scene)
+        assert [area.spaces.active.image for area in taken] == [None, None, texture]
+    context = SimpleNamespace(window=SimpleNamespace(screen=SimpleNamespace(areas=taken)))
+    assert not comparison.put_in_editor(context, scene)
+    assert not comparison.open_editor(SimpleNamespace(window=None), scene)
 
 
 def test_presets_of_ours_set_everything_they_name(scene):

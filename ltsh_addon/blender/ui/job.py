@@ -265,8 +265,13 @@ class Plan:
 
     def _expected(self, step: Step) -> float:
         """Seconds: as long as the same stage took before, or by its cost."""
-        pace = (self._done_seconds + PRIOR_SECONDS) / (self._done_cost + PRIOR_SECONDS)
-        return self._measured.get(step.stage, step.cost * pace)
+        return self._measured.get(step.stage, step.cost * self._pace())
+
+    def _pace(self) -> float:
+        """Seconds for a cost of 1; a step that takes longer than expected tells that all will."""
+        seconds, cost = self._done_seconds + PRIOR_SECONDS, self._done_cost + PRIOR_SECONDS
+        so_far = seconds + self._now() - self._stage_started
+        return max(seconds / cost, so_far / (cost + self._steps[self._at].cost))
 
     def _rest_of_step(self) -> float:
         """Seconds; between reports the rest melts away and never becomes nothing."""

@@ -68,6 +68,13 @@ def test_a_machine_that_is_slower_makes_the_rest_longer():
     assert plan.seconds_left() == pytest.approx(20.0 * pace)
 
 
+def test_a_stage_that_is_late_makes_the_rest_longer_before_it_ends():
+    plan, clock = plan_of(10.0, 10.0)
+    clock.now += 40.0
+    pace = (40.0 + PRIOR_SECONDS) / (10.0 + PRIOR_SECONDS)
+    assert plan.seconds_left() >= 10.0 * pace
+
+
 def test_a_stage_that_comes_again_is_expected_to_take_as_long_again():
     plan, clock = plan_of(1.0, 5.0, 1.0, 5.0, stages=("open", "samples", "open", "samples"))
     clock.now += 2.0

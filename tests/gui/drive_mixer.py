@@ -39,7 +39,9 @@ def beside_the_view(rig):
     area.ui_type = "IMAGE_EDITOR"
     area.spaces.active.show_region_ui = True
     yield 1
-    rig.region("IMAGE_EDITOR", "UI").active_panel_category = "LTSH"
+    region = rig.region("IMAGE_EDITOR", "UI")
+    yield from hands.until(lambda: region.active_panel_category not in ("", "UNSUPPORTED"), 60)
+    region.active_panel_category = "LTSH"
     yield 1
 
 

@@ -95,8 +95,9 @@ def _upload(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
 # there are `COARSE_POINTS`), and rays of a light and a point.
 LEVELS = ((None, 8), (1, 32))
 COARSE_POINTS = 8000
-# Then the further points of pixels get rays of their own, so many of them together: new rays from new places.
-GROUP, GROUP_RAYS = 4, 64
+# Edges become smooth at once by the first points of pixels. The others wait for rays of their own, so many points
+# together: new rays from new places.
+FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
 # Occluders that take longer to collect are collected when no object moves any more.
 QUICK_SECONDS = 0.03
 
@@ -243,7 +244,7 @@ class LiveShadows:
         if number > 0 and not self._is_off:
             if number // GROUP == self._own[0] and self._own[1] is not None:
                 return self._own[1]
-            if self._thread is None and level is None and number >= GROUP:
+            if self._thread is None and level is None and number >= FIRST_POINTS:
                 self._begin_own(number // GROUP, gbuffer, view)
             self.waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)

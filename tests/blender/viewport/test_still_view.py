@@ -259,7 +259,7 @@ def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
 def refined_pictures():
     """A view at rest with live shadows: its picture, how many points it has, how often it waited, its versions and
     points over time, and what many rays at every point give."""
-    scene, points = LiveView(), filter_points("BLACKMAN_HARRIS", 1.5, 12)
+    scene, points = LiveView(), filter_points("BLACKMAN_HARRIS", 1.5, 20)
     try:
         waited, versions = 0, []
         for _ in range(80):
@@ -282,9 +282,9 @@ def refined_pictures():
 @edits_with_graphics
 def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
     live, samples, waited, versions, exact = with_graphics(refined_pictures)
-    assert samples == 12
-    # The first four points have the shadows of the centers, the others those of their groups: each waits once.
-    assert waited == 2
+    assert samples == 20
+    # The first eight points have the shadows of the centers, the others those of their groups: each waits once.
+    assert waited == 3
     # But for the two levels at the start, no picture has fewer points than the one before.
     counts = [count for version, count in versions if version == 2]
     assert versions[-1][0] == 2 and counts == sorted(counts)

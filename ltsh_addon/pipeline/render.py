@@ -11,14 +11,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import imaging
-from ..cycles import gbuffer
 from ..cycles.lobes import read_layer
 from ..files import save_array, temporary_folder, write_bytes
 from ..imaging.denoise import NoDenoiser, open_denoiser
@@ -26,7 +25,7 @@ from ..imaging.exr import write_channels
 from ..scene import PASSES, Cancelled, Progress, listed
 from ..shading.parallel import cores
 from . import lighting, picture
-from .options import PictureOptions, RenderOptions, child_job
+from .options import SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 
 # Names of the passes of Cycles in `pass_names`: light and color of each pass of ours.
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
@@ -34,7 +33,11 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 COMBINED, REST = "combined", "rest"
 SHOWN = "shown.png"
 # Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
-SUB_SAMPLES, LAST_SECONDS = 16, 6.0
+SUB_SAMPLES, LAST_SECONDS = 17, 6.0
+# Of a budget: what the points of pixels, and the shadows, may take; and what a shadow ray takes, of which some soft
+# shadows take all.
+POINTS_SHARE, SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.2, 0.3, 1e-6, 0.6
+MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -124,6 +127,11 @@ def finish(
         clock.end("denoise")
         report = _report(comparison, cycles, ours, problems)
         report["finished"] |= {"denoiser": denoiser, "budget_s": options.budget}
+        if options.budget is not None and clock.seconds() > MOST_OVER * options.budget:
+            report["warnings"].append(
+                f"the picture took {clock.seconds():.1f} s of processor time, the budget is {options.budget:g} s; give "
+                "it more, or fewer pixels"
+            )
         seconds = {
             **comparison.extraction.seconds,
             "techniques": {name: result.seconds for name, result in comparison.results.items()},
@@ -172,20 +180,27 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
         *(PictureOptions, options), passes=PASSES, sub_samples=options.sub_samples or SUB_SAMPLES, shadows="on",
         cycles_samples=2,
     )  # fmt: skip
-    job = child_job(
-        client.ExtractOptions, own, **where, width=width, height=height, cycles_samples=0, for_finished=True
-    )
+    seconds = None if options.budget is None else POINTS_SHARE * options.budget
+    size = {"width": width, "height": height, "seconds": seconds}
+    job = child_job(client.ExtractOptions, own, **where, **size, cycles_samples=0, for_finished=True)
     extraction = client.extract(job, progress=progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
         return picture.Comparison(own, extraction, {}, None)
-    samples, film = gbuffer.merged(extraction.samples, extraction.film)
-    extraction = replace(extraction, samples=samples, film=film)
-    shadows = lighting.trace_shadows(extraction, PASSES, options.shadow_rays, progress)
+    shadows = lighting.trace_shadows(extraction, PASSES, _rays(options, extraction), progress)
     clock.end("shadows")
     results = picture.evaluated(tables, extraction, shadows, own, progress)
     clock.end("shading")
     return picture.Comparison(own, extraction, results, shadows)
+
+
+def _rays(options: RenderOptions, extraction) -> int:
+    """At most so many shadow rays for a light and a pixel, as the options and the budget allow."""
+    if options.budget is None:
+        return options.shadow_rays
+    pairs = len(extraction.samples) / extraction.film.points * len(extraction.lights)
+    affordable = SHADOWS_SHARE * options.budget / max(SOFT_SHARE * RAY_SECONDS * pairs, 1e-9)
+    return int(np.clip(affordable, SHADOW_RAYS[0], options.shadow_rays))
 
 
 @dataclass(frozen=True)

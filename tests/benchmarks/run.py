@@ -283,6 +283,17 @@ def cycles(options):
     bake_cost.equal_error(options.quick)
 
 
+def finished(options):
+    """Finished pictures beside Cycles with its denoiser, at equal processor time (see finished.py)."""
+    import finished as measured
+
+    heading("finished pictures: errors against converged Cycles; times are processor time of the whole process")
+    if options.quick:
+        measured.main(("studio",), 1024, (8.0,))
+    else:
+        measured.main()
+
+
 def shadows(options):
     """Shadows beside Cycles: errors, error at equal time, rays, memory (see shadows.py)."""
     import shadows as measured
@@ -329,6 +340,7 @@ SECTIONS = {
     "processes": processes,
     "cycles": cycles,
     "shadows": shadows,
+    "finished": finished,
     "animation": animation,
     "viewport": viewport,
 }
@@ -350,7 +362,7 @@ def main():
     print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
           f"load {os.getloadavg()[0]:.1f}, children run on {parallel.interpreter()}")  # fmt: skip
     for name in options.sections or SECTIONS:
-        if not (name in ("cycles", "shadows", "animation", "viewport") and options.no_cycles):
+        if not (name in ("cycles", "finished", "shadows", "animation", "viewport") and options.no_cycles):
             SECTIONS[name](options)
     print(f"\n{time.perf_counter() - start:.0f} s")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -39,17 +40,20 @@ from .origin import move_to_origin
 
 
 def render_pixel_samples(
-    scene, view_layer, folder: Path, sub_samples: int, progress, extra_passes: tuple[str, ...] = ()
+    scene, view_layer, folder: Path, offsets: np.ndarray, progress, extra_passes: tuple[str, ...] = (), end=math.inf
 ) -> list[str]:
-    """Names of the files in `folder`, one per sub-sample; the points are `sub_pixel_offsets`."""
+    """Names of the files in `folder`, one for each of the `offsets` (N, 2) from the pixels' centers. At the processor
+    time `end` those that are left are not rendered."""
     declare_aovs(view_layer)
     enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
-    files, offsets = [], sub_pixel_offsets(scene, sub_samples)
+    files, sub_samples = [], len(offsets)
     # Only the camera differs: the others need no second look at the scene, and show the same bits.
     scene.render.use_persistent_data = sub_samples > 1
     with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
+            if files and time.process_time() > end:
+                break
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             with shifted_pixels(scene, offset):
@@ -227,7 +231,7 @@ def no_light(scene, reasons: list[str]) -> SceneError:
 
 def extract(job: dict, folder: Path, progress) -> dict:
     """Do the `job` (see `client.extract`), write EXRs into `folder`; the manifest as a dictionary."""
-    started, warnings, seconds = time.monotonic(), [], {}
+    started, begun, warnings, seconds = time.monotonic(), time.process_time(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job.get("scripts", False))
     scene = scene_named(job.get("scene_name"))
@@ -247,8 +251,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started = time.monotonic()
     extra_passes = tuple(one for key, one in EXTRA_PASSES.items() if job.get(key))
+    end = math.inf if job.get("seconds") is None else begun + job["seconds"]
+    offsets = sub_pixel_offsets(scene, job["sub_samples"], for_finished)
     with world_behind(scene, inventory.behind if job.get("background") else None):
-        samples = render_pixel_samples(scene, view_layer, folder, job["sub_samples"], progress, extra_passes)
+        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, extra_passes, end)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None

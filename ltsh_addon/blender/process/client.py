@@ -52,6 +52,7 @@ class ExtractOptions:
     background: bool = False  # and what of the world is seen behind them
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
+    seconds: float | None = None  # of processor time, after which no further sub-sample is begun
 
 
 @dataclass(frozen=True)
@@ -133,6 +134,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
         kept = _read_kept(manifest, folder, film, shows_patches(samples, lights)) if options.for_finished else None
+        if options.for_finished:
+            samples, film = gbuffer.merged(samples, film)
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)

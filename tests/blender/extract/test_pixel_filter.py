@@ -93,3 +93,16 @@ def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path)
     figures = report["passes"]["diffuse"]["techniques"]["ltc"]["against_cycles"]
     assert figures["unbiased_relative_error"] < 0.005
     assert np.abs(layers["ltc.diffuse"] - layers["cycles.diffuse"]).max() < 0.02 * peak
+
+
+@pytest.mark.parametrize("kind", ["BOX", "GAUSSIAN", "BLACKMAN_HARRIS"])
+@pytest.mark.parametrize("count", [1, 5, 17, 65])
+def test_balanced_points_have_their_mean_in_the_center_and_the_spread_of_the_filter(kind, count):
+    points = render_settings.balanced_points(kind, 1.5, count)
+    assert points.shape == (count, 2)
+    np.testing.assert_array_equal(points[0], 0.0)
+    np.testing.assert_allclose(points.mean(axis=0), 0.0, atol=1e-12)
+    many = render_settings.filter_points(kind, 1.5, 4096).std(axis=0)
+    if count > 5:
+        # The center itself is one of so many points.
+        np.testing.assert_allclose(points.std(axis=0), many, rtol=2.0 / np.sqrt(count) ** 1.5 + 1.0 / count)

@@ -238,7 +238,8 @@ def silent(stage, fraction):
 def sample(folder: Path, prepared, sub_samples=1, extra_passes=()):
     """Samples (one array per render), their pixels and the raw channels of each sample render."""
     scene, layer = prepared[:2]
-    files = pixels.render_pixel_samples(scene, layer, folder, sub_samples, silent, extra_passes)
+    offsets = render_settings.sub_pixel_offsets(scene, sub_samples)
+    files = pixels.render_pixel_samples(scene, layer, folder, offsets, silent, extra_passes)
     channels = [read_channels(folder / name) for name in files]
     for image in channels:
         gbuffer.clear_holdouts(image)

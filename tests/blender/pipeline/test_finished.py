@@ -21,7 +21,7 @@ SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
 # Relative error of the closed form in a block. Of the largest radiance: the points place an edge to 3 / POINTS of a
 # pixel, and it crosses some 12 of the 64 pixels of a block.
-POINTS = 32
+POINTS = 33
 OWN_ERROR, EDGE_ERROR = 0.015, 3.0 / POINTS * 12.0 / BLOCK**2
 
 
@@ -191,3 +191,17 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
 def test_a_budget_excludes_samples(tmp_path, capsys):
     assert main(["render", "room.blend", "-o", str(tmp_path), "--budget", "3", "--cycles-samples", "4"]) == 2
     assert "not both" in capsys.readouterr().err
+
+
+def test_a_budget_chooses_points_rays_and_samples(tmp_path):
+    floor_and_ball(gray(), 1)
+    path = parts.save(tmp_path / "room.blend")
+    found = {
+        budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)).report for budget in (0.01, 2.5)
+    }
+    small, large = found.values()
+    # However small it is, every part has something.
+    assert small["cycles_samples"] >= 2 and small["sub_samples"] >= 1
+    assert small["cycles_samples"] < large["cycles_samples"]
+    assert small["sub_samples"] <= large["sub_samples"] <= 17
+    assert any("the budget is 0.01 s" in line for line in small["warnings"])

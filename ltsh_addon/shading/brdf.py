@@ -123,6 +123,17 @@ def dielectric_reflectance(cosine, ior):
     return 0.5 * perpendicular * perpendicular * (1.0 + (plus / minus) ** 2)
 
 
+def stretch(x, y, anisotropy):
+    """u and v of the module's docstring for tangents with coordinates x and y along the local frame, of any length."""
+    squared = x * x + y * y
+    # Without a tangent there is no direction to be stretched in.
+    flat = squared <= 1e-12
+    squared, share = np.where(flat, 1.0, squared), np.square(1.0 / (1.0 - anisotropy))
+    across = np.where(flat, 1.0, (share * x * x + y * y / share) / squared)
+    along = np.where(flat, 0.0, (1.0 / share - share) * x * y / squared)
+    return across.astype(x.dtype), along.astype(x.dtype)
+
+
 @dataclass(frozen=True)
 class HalfVectors:
     """How directions in the local frames of P samples become stretched half vectors."""
@@ -137,12 +148,7 @@ class HalfVectors:
     def of(cls, samples, frame, cosine) -> HalfVectors:
         """Those of SurfaceSamples (P) in local frames (3, 3, P): rows tangent, bitangent, normal."""
         x, y = (sum(row[axis] * samples.tangent[:, axis] for axis in range(3)) for row in frame[:2])
-        squared = x * x + y * y
-        # Without a tangent there is no direction to be stretched in.
-        flat = squared <= 1e-12
-        squared, share = np.where(flat, 1.0, squared), np.square(1.0 / (1.0 - samples.anisotropy))
-        across = np.where(flat, 1.0, (share * x * x + y * y / share) / squared)
-        along = np.where(flat, 0.0, (1.0 / share - share) * x * y / squared)
+        across, along = stretch(x, y, samples.anisotropy)
         alpha = np.maximum(samples.roughness**2 * np.sqrt(across), MIN_ALPHA)
         cosine = np.clip(cosine, 0.0, 1.0)
         return cls(np.sqrt(1.0 - cosine * cosine), cosine, alpha, across, along)

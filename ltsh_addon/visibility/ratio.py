@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
-from ..shading.brdf import dielectric_reflectance, schlick_curve
+from ..shading.brdf import dielectric_reflectance, schlick_curve, stretch
 from ..shading.diffuse import diffuse_factor
 from ..shading.facing import FacingDisk, emission, ray_length
 from ..shading.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
@@ -248,6 +248,9 @@ class Surface:
             rebound = samples.diffuse_rebound.mean(axis=1, dtype=np.float32)
             self.shapes = np.stack([*(getattr(samples, name).astype(np.float32) for name in names), rebound])
         self.alpha = np.maximum(np.square(samples.roughness.astype(np.float32)), _MIN_ALPHA)
+        self.tangent, self.anisotropy = None, samples.anisotropy.astype(np.float32)
+        if samples.anisotropy.any():
+            self.tangent = self._rows(samples.tangent)
         names = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo")
         terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
         self.f0, f90, self.dip, self.dielectric, self.albedo = terms
@@ -589,7 +592,11 @@ class View:
             self.has_own_horizon = surface.geometric_normal is not surface.normal
             self.cosine, self.sine, rows = frames(normal, view)
             self.view = view
-            self.alpha = surface.alpha[index]
+            self.alpha, self.stretch = surface.alpha[index], None
+            if surface.tangent is not None:
+                along = [dot(row, np.take(surface.tangent, index, axis=1)) for row in rows[:2]]
+                self.stretch = stretch(*along, surface.anisotropy[index])
+                self.alpha = self.alpha * np.sqrt(self.stretch[0])
             self.warps = Warps(rows, self.cosine, self.sine, self.alpha)
             if is_quad:
                 self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
@@ -788,22 +795,34 @@ class View:
         """GGX BRDF with its Fresnel factor times cosine times 2 pi (S, Q); see `shading.brdf.ggx_brdf_cosine`."""
         half_x, half_z = local[0] + self.sine, local[2] + self.cosine
         alpha2 = self.alpha * self.alpha
+        across = None
+        if self.stretch is not None:
+            across = self.stretch[1] * half_x + self.stretch[0] * local[1]
         half_x *= half_x
+        if across is not None:
+            across *= across
+            across += half_x
         half_x += local[1] * local[1]
         half_z *= half_z
         squared = half_x + half_z
+        if across is not None:
+            half_x = across
         half_z *= alpha2
         half_x += half_z
         ratio = np.divide(squared, half_x, out=half_x)
         mu = np.maximum(local[2], _ZERO, out=half_z)
         slope = mu * mu
-        slope *= _ONE - alpha2
-        slope += alpha2
+        if self.stretch is None:
+            slope *= _ONE - alpha2
+            slope += alpha2
+        else:
+            beside = local[1] / self.stretch[0]
+            slope += alpha2 * (np.square(local[0] - self.stretch[1] * beside) + np.square(beside))
         np.sqrt(slope, out=slope)
         slope *= self.cosine
         slope += mu * np.sqrt(self.cosine * self.cosine * (_ONE - alpha2) + alpha2)
         ratio *= ratio
-        ratio *= alpha2
+        ratio *= alpha2 if self.stretch is None else alpha2 * self.stretch[0]
         ratio *= mu
         ratio /= slope
         ratio *= self._reflectance(squared)

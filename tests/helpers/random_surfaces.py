@@ -69,6 +69,8 @@ def samples(kind: str, count: int, random: np.random.Generator) -> SurfaceSample
 def _shape(kind, count, random):
     if kind == "rough":
         return {"diffuse_roughness": random.uniform(0.05, 1.0, count), "diffuse_rebound": 0.1 * _colors(random, count)}
+    if kind == "brushed":
+        return {"anisotropy": random.uniform(-0.6, 0.5, count), "tangent": random.normal(size=(count, 3))}
     if kind == "sheen":
         return {"sheen_a": random.uniform(0.2, 1.4, count), "sheen_b": random.uniform(-1.5, 0.3, count)}
     return {}

@@ -17,6 +17,7 @@ KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     for light in (*random_surfaces.LIGHTS[1:], *random_surfaces.PROFILED_LIGHTS, *random_surfaces.FACING_LIGHTS)
 ]
 KINDS += [(surface, light) for surface in random_surfaces.SHAPED for light in ("plain", "horizon", "polygon", "spread")]
+KINDS += [("brushed", light) for light in ("plain", "horizon", "ball")]
 
 
 class Tracer:

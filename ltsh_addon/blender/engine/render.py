@@ -176,10 +176,10 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
 
 def _passes_of_cycles(scene, layer) -> list[tuple[str, str, str]]:
     """The passes that `layer` has with Cycles; none where its add-on is off."""
-    try:
-        from cycles.engine import list_render_passes
-    except ImportError:
+    if not hasattr(layer, "cycles"):
         return []
+    from cycles.engine import list_render_passes
+
     unwritten = ("Noisy ", "Guiding ", "Render Time")
     return [one for one in list_render_passes(scene, layer) if not one[0].startswith(unwritten)]
 

@@ -473,6 +473,7 @@ def test_views_at_rest_are_drawn_again_and_what_moves_is_left_alone():
         view._redraw_later(time.monotonic() - took, samples)
         return view._redraw()
 
+    view.register()
     try:
         # A quick picture is refined once nothing has changed for a while; every change begins that anew.
         assert view.REST_SECONDS - 0.1 < left(0.01, 1) <= view.REST_SECONDS

@@ -33,7 +33,7 @@ MOST_PATCHES = 6144
 LEVELS = 2
 # What is so many times as bright as the mean, has this share of the light and fits into this angle, in rad, is a spot.
 SPOT_BRIGHTNESS, SPOT_SHARE, SPOT_RADIUS = 100.0, 0.01, 0.06
-MOST_SPOTS, SPOT_PATCHES = 8, 64
+MOST_SPOTS, SPOT_PATCHES = 8, 40
 # What a disk of constant radiance may miss of a spot.
 DISK_ERROR = 0.25
 

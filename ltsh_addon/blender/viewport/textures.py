@@ -110,7 +110,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
     dip = samples.specular_dip
     bumped = (samples.smooth_normal != samples.diffuse_normal).any()
     turned = bumped or (samples.diffuse_normal != samples.normal).any()
-    fuzzy = samples.sheen_a != 0.0
+    fuzzy = samples.sheen_a > 0.0
     return GBufferTextures(
         has_sheen=bool(fuzzy.any()),
         position=texture(samples.position, 1.0 + samples.receiver),

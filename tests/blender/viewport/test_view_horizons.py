@@ -106,7 +106,7 @@ def low_poly_sphere():
 
 def samples_in(gbuffer, eye):
     """Samples and pixels of the surfaces in `gbuffer`."""
-    names = [field.name for field in fields(gbuffer) if field.name != "shares"]
+    names = [field.name for field in fields(gbuffer) if field.name not in ("shares", "has_sheen")]
     read_textures = {name: read(getattr(gbuffer, name)) for name in names}
     pixel = np.flatnonzero(read_textures["position"][:, 3] > 0.0)
     at = {name: values[pixel] for name, values in read_textures.items()}

@@ -34,7 +34,8 @@ def sheen_on_coat():
 
 
 def metal():
-    made, node = principled("Metal", Metallic=1.0, Roughness=0.4, Base_Color=RED, Specular_Tint=BLUE)
+    brushed = {"Anisotropic": 0.6, "Anisotropic_Rotation": 0.15}
+    made, node = principled("Metal", Metallic=1.0, Roughness=0.4, Base_Color=RED, Specular_Tint=BLUE, **brushed)
     node.distribution = "MULTI_GGX"
     return made
 

@@ -31,6 +31,8 @@ from .lobes import FLOAT64_CHUNK
 
 # A child takes some 0.2 s to start: shorter tasks are done in this process.
 SECONDS_WORTH_A_CHILD = 0.5
+# About as many isotropic samples take as long as an anisotropic one.
+ANISOTROPIC_EFFORT = 100
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
 CORES_VARIABLE = "LTSH_CORES"
@@ -234,7 +236,8 @@ def run(
     """
     queue = _Queue(blocks, result)
     with helpers(queue) as children:
-        wanted = _children_wanted(task, len(samples), blocks, workers)
+        effort = len(samples) + ANISOTROPIC_EFFORT * np.count_nonzero(samples.anisotropy)
+        wanted = _children_wanted(task, effort, blocks, workers)
         # By this thread: it will keep more in the task while it shades.
         packed = worker.packed(task) if wanted else b""
         for _ in range(wanted):

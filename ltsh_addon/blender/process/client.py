@@ -127,13 +127,14 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     check_readable(scene)
     with temporary_folder() as folder:
         manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
-        samples, film, warnings, problems = _read_samples(manifest, folder)
+        bits: list[np.ndarray] = []
+        samples, film, warnings, problems = _read_samples(manifest, folder, bits)
         lights = lights_of(manifest["lights"])
         warnings += gbuffer.rounded_positions(samples.position, lights)
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
-        kept = _read_kept(manifest, folder, film, shows_patches(samples, lights)) if options.for_finished else None
+        kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
         if options.for_finished:
             samples, film = gbuffer.merged(samples, film)
         # In the file, where double precision tells positions apart.
@@ -175,8 +176,11 @@ def _ended(samples, film, lights) -> tuple[SurfaceSamples, Film]:
     return samples, replace(film.take(index), first=None if first.all() else first)
 
 
-def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, list[str], list[str]]:
-    """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded."""
+def _read_samples(
+    manifest: dict, folder: Path, bits: list[np.ndarray]
+) -> tuple[SurfaceSamples, Film, list[str], list[str]]:
+    """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded;
+    `bits` get what `gbuffer.kept_by_cycles` finds in each of a finished picture."""
     width, height = manifest["width"], manifest["height"]
     materials = manifest.get("unshaded", [])
     renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
@@ -188,6 +192,8 @@ def _read_samples(manifest: dict, folder: Path) -> tuple[SurfaceSamples, Film, l
         unusable += bad
         unnamed += gbuffer.surfaces_without_sample(channels)
         unshaded += gbuffer.unshaded_hits(channels, len(materials))
+        if manifest.get("kept"):
+            bits.append(gbuffer.kept_by_cycles(channels))
     samples, film = gbuffer.join(renders, width, height)
     warnings = []
     if unusable:
@@ -244,10 +250,9 @@ def _read_pass(key: str, manifest: dict, folder: Path) -> np.ndarray:
     return np.mean(images, axis=0, dtype=np.float64)
 
 
-def _read_kept(manifest: dict, folder: Path, film: Film, is_faceted: np.ndarray) -> KeptByCycles:
+def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> KeptByCycles:
     """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
     found = manifest["kept"]
-    bits = [gbuffer.kept_by_cycles(_rendered(folder / file)) for file in manifest["samples"]]
     by_pass = {name: np.any([(number & bit) > 0 for number in bits], axis=0) for name, bit in lobes.KEPT_BITS.items()}
     by_pass["specular"] |= film.image(is_faceted) > 0.0
     materials = found["materials"] + ["sharp reflections of the world (specular)"] * bool(is_faceted.any())

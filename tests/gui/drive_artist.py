@@ -12,7 +12,7 @@ import numpy as np
 SECONDS = 2400
 SIZE = "1600x900"
 # From the right and upper end of the sidebar, see `hands`: name, star and eye of the first light of the list.
-NAME, STAR, EYE, ROW = 235, 81, 60, 181
+NAME, STAR, EYE, ROW = 225, 78, 58, 174
 SOLID_SECONDS = 3.0
 
 
@@ -55,7 +55,7 @@ def new_scene(rig):
 
 def click_light(rig, row, right=NAME):
     """Click in a row of the list of lights."""
-    yield from hands.click(rig, *hands.to_window(rig, "VIEW_3D", "UI", right, ROW + 21 * row))
+    yield from hands.click(rig, *hands.to_window(rig, "VIEW_3D", "UI", right, ROW + 20 * row))
 
 
 def added(rig, words):

@@ -6,7 +6,7 @@ import hands
 SIZE = "1280x900"
 SECONDS = 1800
 # Places that shift with what the panel shows.
-ADD_CAMERA, GRAY_COMPARE, BAKE_HEADER, BAKE = (151, 372), (155, 425), (232, 438), (155, 497)
+ADD_CAMERA, GRAY_COMPARE, BAKE_HEADER, BAKE = (149, 358), (149, 392), (223, 420), (149, 477)
 SHADED = "LTSH ltsh4.combined"
 
 

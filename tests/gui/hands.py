@@ -8,7 +8,7 @@ import bpy
 ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
 CLICK_SECONDS = 0.6
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
-MANUAL, PREVIEW, COMPARE, SHADE, CANCEL = (60, 15), (155, 54), (155, 353), (155, 382), (155, 167)
+MANUAL, PREVIEW, COMPARE, SHADE, CANCEL = (60, 15), (149, 52), (149, 339), (149, 367), (149, 160)
 
 
 def module(name):

@@ -133,7 +133,7 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
 
 # Hits of a pixel whose normals are closer than this share of the width of their lobes (alpha), and at most so many
 # radians apart, and whose points lie this close to the same plane, get one shading. Sharper lobes than so never do.
-LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.5, 0.1, 0.2, 0.01
+LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.2, 0.1, 0.2, 0.01
 MERGED_ROUNDS = 3  # surfaces of a pixel
 COLORS = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound")
 SAME = ("roughness", "ior", "diffuse_roughness", "sheen_a", "sheen_b", "receiver", "anisotropy")
@@ -144,7 +144,7 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
 
     Edges keep all of their samples. What varies within a pixel but colors, such as the edge of a shadow, is as at the
     first of the hits, which is the center of the pixel where that shows the surface. On the example scene with 8 points
-    43 % of the samples remain, and without shadows specular light is 2 % off, diffuse 0.6 %.
+    half of the samples remain, and without shadows specular light is 1 % off, diffuse 0.5 %.
     """
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))

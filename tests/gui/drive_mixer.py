@@ -18,10 +18,10 @@ def main(rig):
     yield 1
     settings = hands.settings()
     settings.anti_aliasing, settings.resolution_percentage = 1, 60
-    yield from beside_the_view(rig)
     hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
     yield from hands.job_started(rig, "shading starts")
     yield from hands.wait_for_job(rig, 600)
+    yield from hands.results_opened(rig)
     yield 2
     rig.shot("1_shaded.png")
     yield from clicked(rig)
@@ -29,20 +29,6 @@ def main(rig):
     yield from applied(rig)
     yield from moved(rig)
     yield from rendered(rig)
-
-
-def beside_the_view(rig):
-    """An Image Editor with our tab, in which results appear."""
-    hands.operate(rig, bpy.ops.screen.area_split, direction="VERTICAL", factor=0.55)
-    yield 1
-    area = next(area for area in rig.window.screen.areas if area.type == "VIEW_3D")
-    area.ui_type = "IMAGE_EDITOR"
-    area.spaces.active.show_region_ui = True
-    yield 1
-    region = rig.region("IMAGE_EDITOR", "UI")
-    yield from hands.until(lambda: region.active_panel_category not in ("", "UNSUPPORTED"), 60)
-    region.active_panel_category = "LTSH"
-    yield 1
 
 
 def items():

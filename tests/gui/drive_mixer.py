@@ -1,4 +1,4 @@
-"""The light mixer by the mouse: a light muted, dragged, undone; applied to the scene, undone; a light moved."""
+"""The light mixer: a light of a picture brighter, solo, in another color; applied; moved; the lights of an F12 picture."""
 
 import statistics
 import time
@@ -8,9 +8,6 @@ import hands
 
 SIZE = "1600x900"
 SECONDS = 1200
-# Where things of our panel are, in pixels from the right and the upper end of the sidebar: of the first light the eye,
-# its power below the list, and Apply to Scene.
-EYE, POWER, APPLY = (256, 209), (107, 314), (88, 386)
 
 
 def main(rig):
@@ -24,7 +21,6 @@ def main(rig):
     yield from hands.results_opened(rig)
     yield 2
     rig.shot("1_shaded.png")
-    yield from clicked(rig)
     yield from changed(rig)
     yield from applied(rig)
     yield from moved(rig)
@@ -33,50 +29,6 @@ def main(rig):
 
 def items():
     return {item.name: item for item in hands.settings().mixed}
-
-
-def place(rig, where):
-    return hands.to_window(rig, "IMAGE_EDITOR", "UI", *where)
-
-
-def undone(rig):
-    """Undo with the mouse over the picture."""
-    yield from hands.over(rig, "IMAGE_EDITOR", x=0.2, y=0.2)
-    yield from hands.keys(rig, "ctrl+z")
-    yield 1
-
-
-def clicked(rig):
-    hands.settings().mode = "MIX"
-    yield 1
-    before = hands.image_pixels("LTSH Comparison")
-    yield from hands.click(rig, *place(rig, EYE))
-    yield from hands.until(lambda: hands.settings().mixed[0].muted)
-    rig.check(hands.settings().mixed[0].muted, "a click on the eye mutes a light")
-    yield 0.5
-    rig.check(max(hands.image_pixels("LTSH Comparison")) < max(before), "and the picture gets darker")
-    yield from undone(rig)
-    rig.check(not hands.settings().mixed[0].muted, "Ctrl Z takes it back")
-    rig.check(hands.image_pixels("LTSH Comparison") == before, "with the picture")
-    x, y = place(rig, POWER)
-    yield from hands.drag(rig, (x - 20, y), (x + 50, y))
-    yield 1
-    rig.fact("power after a drag by 70 pixels", round(hands.settings().mixed[0].power, 3))
-    rig.check(hands.settings().mixed[0].power > 1.0, "dragging the power makes it brighter")
-    energy = bpy.data.objects[hands.settings().mixed[0].name].data.energy
-    yield from hands.click(rig, *place(rig, APPLY))
-    name, power = hands.settings().mixed[0].name, hands.settings().mixed[0].power
-    yield from hands.until(lambda: bpy.data.objects[name].data.energy != energy)
-    rig.check(
-        abs(bpy.data.objects[name].data.energy - power * energy) < 1e-3 * energy, "Apply to Scene writes the power"
-    )
-    rig.shot("1_dragged.png")
-    yield from undone(rig)
-    rig.check(bpy.data.objects[name].data.energy == energy, "Ctrl Z takes that back in one step")
-    rig.check(hands.settings().mixed[0].power == power, "and the mixer keeps its values")
-    yield from undone(rig)
-    rig.check(hands.settings().mixed[0].power == 1.0, "which the next one takes back")
-    rig.check(hands.image_pixels("LTSH Comparison") == before, "with the picture, again")
 
 
 def changed(rig):

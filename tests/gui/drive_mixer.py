@@ -1,4 +1,4 @@
-"""The light mixer: a light of a picture brighter, solo, in another color; applied; moved; the lights of an F12 picture."""
+"""The light mixer: a light brighter, solo, in another color; applied; moved; the lights of an F12 picture."""
 
 import statistics
 import time

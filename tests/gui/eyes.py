@@ -39,8 +39,10 @@ def pixel_centers():
 
 
 def bare_view(rig):
-    """Nothing but the picture in the 3D view."""
-    space = rig.space
+    """Nothing but the picture in the 3D view, without the line about what it leaves out too."""
+    space, view_module = rig.space, module("engine.view")
+    show, nothing = view_module.show, view_module.QuietLine()
+    view_module.show = lambda region, error, notes, captions, quiet: show(region, error, notes, captions, nothing)
     space.overlay.show_overlays = space.show_gizmo = False
     space.show_region_header = space.show_region_tool_header = False
     space.show_region_toolbar = space.show_region_ui = space.show_region_hud = False

@@ -45,6 +45,8 @@ _WIDE_OPEN = 1e15
 _TINY = 1e-30
 # In m.
 _TINY_WIDTH = 1e-9
+# Cosine between half axes from which on a light counts as sheared: above what rounding makes of right angles.
+SHEAR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -101,6 +103,12 @@ def plane_axes(light) -> np.ndarray:
     """Two orthonormal axes (2, 3) in the plane of the light, the first along half_u."""
     first = light.half_u / np.sqrt((light.half_u**2).sum())
     return np.stack([first, np.cross(light.direction, first)])
+
+
+def has_shear(light) -> bool:
+    """Whether the half axes are at no right angle, by more than rounding."""
+    u, v = light.half_u, light.half_v
+    return abs(u @ v) > SHEAR * np.linalg.norm(u) * np.linalg.norm(v)
 
 
 def upright(light):
@@ -391,7 +399,7 @@ class ConeRegions:
     def suit(light) -> bool:
         """Whether the light is a rectangle, or an ellipse that is not long, in a place."""
         u, v = light.half_u, light.half_v
-        is_sheared = abs(u @ v) > 1e-6 * np.linalg.norm(u) * np.linalg.norm(v)
+        is_sheared = has_shear(light)
         is_long = (np.linalg.norm(u) / np.linalg.norm(v) - LONG) * (np.linalg.norm(v) / np.linalg.norm(u) - LONG) < 0.0
         is_fit = not (is_sheared or light.is_distant or (is_long and light.is_round))
         return is_fit and light.shape in AREA_LIGHT_SHAPES

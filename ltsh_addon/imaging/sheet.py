@@ -135,8 +135,8 @@ class _Sheet:
     def __init__(self, title: str, width: int, height: int, *, count: int, lines: tuple[int, int]):
         legend_lines, caption_lines = lines
         self.width, self.height = width, height
-        self.columns = min(count, COLUMNS)
-        self.rows = -(-count // self.columns)
+        self.rows = -(-count // COLUMNS)
+        self.columns = -(-count // self.rows)
         self.line = text_size("Ag", _TEXT)[1] + 4
         self.label_height = text_size("Ag", _LABEL, bold=True)[1] + 8
         self.caption_height = caption_lines * self.line + 10

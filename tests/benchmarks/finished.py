@@ -61,9 +61,22 @@ def ours(path: Path, folder: Path, **options) -> tuple[np.ndarray, dict, dict]:
     return made.combined[..., :3], made.seconds["processor"], made.report
 
 
-def errors(image: np.ndarray, true: np.ndarray) -> str:
-    relative = np.linalg.norm(image - true) / np.linalg.norm(true)
-    return f"{100.0 * relative:7.2f} %{imaging.mean_flip(true, image):9.4f}"
+def seeded(path: Path, seed: int) -> Path:
+    """A copy of the .blend with other random numbers."""
+    copy = path.with_name(f"{path.stem}_{seed}.blend")
+    code = (
+        f"import bpy; bpy.ops.wm.open_mainfile(filepath={str(path)!r}); bpy.context.scene.cycles.seed = {seed}; "
+        f"bpy.ops.wm.save_as_mainfile(filepath={str(copy)!r}, copy=True)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+    return copy
+
+
+def errors(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> str:
+    """Relative L2 without the noise of the truth, known as two halves that share no noise, and FLIP with it."""
+    first, second = halves
+    squared = ((image - first) * (image - second)).sum() / (first * second).sum()
+    return f"{100.0 * np.sqrt(max(squared, 0.0)):7.2f} %{imaging.mean_flip(0.5 * (first + second), image):9.4f}"
 
 
 def main(names=SCENES, true_samples=TRUE_SAMPLES, budgets=BUDGETS) -> None:
@@ -73,7 +86,11 @@ def main(names=SCENES, true_samples=TRUE_SAMPLES, budgets=BUDGETS) -> None:
         for name in names:
             path = Path(folder) / f"{name}.blend"
             build(name, path)
-            true, seconds, _ = by_cycles(path, Path(folder), samples=true_samples, denoise=False)
+            halves = [
+                by_cycles(seeded(path, OTHER_SEED + half), Path(folder), samples=true_samples // 2, denoise=False)
+                for half in range(2)
+            ]
+            seconds, true = sum(half[1] for half in halves), tuple(half[0] for half in halves)
             print(f"  {name:<10}{'':>8}  Cycles, {true_samples} samples, {seconds:.0f} s: the truth", flush=True)
             for budget in budgets:
                 image, seconds, samples = by_cycles(path, Path(folder), seconds=budget)

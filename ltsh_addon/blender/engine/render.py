@@ -288,21 +288,20 @@ def final_picture(
         shadows=job.shadows,
     )
     extraction = client.extract(options, progress=progress)
-    emission = extraction.exposure * inside_border(extraction.emission, extraction.border)
-    coverage = inside_border(extraction.film.coverage(), extraction.border)
-    behind = (
-        job.background if extraction.background is None else inside_border(extraction.background, extraction.border)
-    )
-    passes, warnings = {EMISSION: emission}, extraction.warnings
+    emission = extraction.exposure * extraction.emission
+    shown = PASSES if job.shown == "combined" else (job.shown,)
+    glow = emission if job.shown == "combined" else np.zeros_like(emission)
+    behind = job.background if extraction.background is None else extraction.background
+    rest = _over_background(glow, extraction.film.coverage(), behind, extraction.exposure)
+    passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
 
     def picture() -> FinalPicture:
         """What there is so far."""
-        shown = PASSES if job.shown == "combined" else (job.shown,)
-        color = emission if job.shown == "combined" else np.zeros_like(emission)
-        color = sum((passes[name] for part in shown if (name := f"LTSH {PASS_LABELS[part]}") in passes), color)
-        combined = _over_background(color, coverage, behind, extraction.exposure)
+        combined = inside_border(rest, extraction.border).copy()
+        for part in shown:
+            combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[part]}", 0.0)
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
 
     show(picture())
@@ -318,10 +317,6 @@ def final_picture(
             show(picture())
     if not job.keeps_lights:
         return picture()
-    shown = PASSES if job.shown == "combined" else (job.shown,)
-    glow = extraction.exposure * extraction.emission * (job.shown == "combined")
-    behind = job.background if extraction.background is None else extraction.background
-    rest = _over_background(glow, extraction.film.coverage(), behind, extraction.exposure)
     kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
     return replace(picture(), lights=light_pictures(kept, progress))
 

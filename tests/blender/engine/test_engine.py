@@ -323,6 +323,15 @@ def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
     assert share.min() > -1e-4 and share.max() == pytest.approx(1.0, abs=1e-3) and share.mean() < 0.9
     np.testing.assert_allclose(behind, share[..., None] * seen, atol=2e-3)
     np.testing.assert_array_equal(picture.combined[..., 3], 1.0)
+    # In a render region that is not cropped, with the lights kept for the mixer.
+    scene.render.use_border, scene.render.use_crop_to_border = True, False
+    scene.render.border_min_x, scene.render.border_max_x = 0.0, 0.5
+    path = parts.save(tmp_path / "region.blend")
+    job = final_job(scene, background=np.zeros(3), has_sky=True, keeps_lights=True)
+    region = render_module.final_picture(job, path, lambda *now: True)
+    width = region.combined.shape[1]
+    assert 0 < width < picture.combined.shape[1]
+    np.testing.assert_allclose(region.combined, picture.combined[:, :width], atol=2e-3)
 
 
 def test_a_complete_picture_shows_its_direct_light_before_cycles_begins(scene, tmp_path):

@@ -251,8 +251,9 @@ def pinned_pixel_filter(scene):
 VIEW_LAYER = "ltsh"
 
 
-def choose_view_layer(scene, warnings: list[str], name: str | None = None):
-    """The only view layer that is rendered from now on: the one called `name`, or the first in use."""
+def only_view_layer(scene, warnings: list[str], name: str | None = None, done: str = "shaded"):
+    """The only view layer that is rendered from now on: the one called `name`, or the first in use. A warning says
+    what is not `done` with the others."""
     if name is not None and name not in scene.view_layers:
         layers = listed(repr(layer.name) for layer in scene.view_layers)
         raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
@@ -260,10 +261,15 @@ def choose_view_layer(scene, warnings: list[str], name: str | None = None):
     if name is not None:
         used = [scene.view_layers[name]]
     if len(used) > 1:
-        warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is shaded")
+        warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is {done}")
     for layer in scene.view_layers:
         layer.use = layer == used[0]
-    layer = used[0]
+    return used[0]
+
+
+def choose_view_layer(scene, warnings: list[str], name: str | None = None):
+    """As `only_view_layer`, with no passes of its own and the name VIEW_LAYER."""
+    layer = only_view_layer(scene, warnings, name)
     layer.name = VIEW_LAYER
     # Nobody reads these passes, and their names could be those of passes that are read.
     for extra in (layer.aovs, layer.lightgroups):

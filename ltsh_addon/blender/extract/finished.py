@@ -36,7 +36,7 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     scene = scene_named(job["scene_name"])
     render_settings.go_to_frame(scene, job["frame"])
     camera = render_settings.choose_camera(scene, job["camera"])
-    layer = _only_layer(scene, job["view_layer"], warnings)
+    layer = render_settings.only_view_layer(scene, warnings, job["view_layer"], "rendered")
     width, height = render_settings.set_resolution(scene, job["width"], job["height"])
     everything = _kept_by_cycles(scene, layer, camera)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
@@ -72,18 +72,6 @@ def show_finished(job: dict, folder: Path, progress) -> dict:
     render_settings.go_to_frame(scene, job["frame"])
     render_settings.save_png(scene, np.load(job["pixels"]), folder / job["name"])
     return {}
-
-
-def _only_layer(scene, name: str | None, warnings: list[str]):
-    """The only view layer that is rendered from now on, the one called `name` or the first in use; else untouched."""
-    used = [layer for layer in scene.view_layers if layer.use] or [scene.view_layers[0]]
-    if name is not None:
-        used = [scene.view_layers[name]]
-    if len(used) > 1:
-        warnings.append(f"scene {scene.name!r}: only view layer {used[0].name!r} of {len(used)} is rendered")
-    for layer in scene.view_layers:
-        layer.use = layer == used[0]
-    return used[0]
 
 
 def _kept_by_cycles(scene, layer, camera) -> list[str]:

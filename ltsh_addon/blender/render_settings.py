@@ -422,10 +422,12 @@ def render_exr(scene, path: Path) -> None:
 
 def pass_names() -> dict[str, str]:
     """Names of the passes in the EXR, which changed with 5.0."""
-    names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission", "Environment")
+    names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission", "Environment",
+             "Object Index", "Material Index")  # fmt: skip
     if bpy.app.version < (5, 0, 0):
-        names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit", "Env")
-    keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission", "background")
+        names = ("GlossDir", "GlossCol", "DiffDir", "DiffCol", "Emit", "Env", "IndexOB", "IndexMA")
+    keys = ("specular_light", "specular_color", "diffuse_light", "diffuse_color", "emission", "background",
+            "object_index", "material_index")  # fmt: skip
     return dict(zip(keys, names, strict=True))
 
 

@@ -24,6 +24,7 @@ from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, Sc
 from ...shading import TableError
 from ..materials.looks import world_radiance
 from ..process import client
+from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
 from ..saving import save_working_copy
 from ..ui import comparison
@@ -46,6 +47,8 @@ PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
 DEPTH, NORMAL, POSITION = "Depth", "Normal", "Position"
 DATA_PASSES = {DEPTH: ("Z", "VALUE"), NORMAL: ("XYZ", "VECTOR"), POSITION: ("XYZ", "VECTOR")}
 DATA_SETTINGS = {DEPTH: "use_pass_z", NORMAL: "use_pass_normal", POSITION: "use_pass_position"}
+# Passes that Cycles writes with the samples, by the names of `names_in_files`.
+INDICES = ("object_index", "material_index")
 BEHIND = 1e10  # depth of the background, as in Cycles
 EMISSION = "LTSH Emission"
 ASK_SECONDS = 0.05
@@ -169,9 +172,15 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
     settings = scene.ltsh_view
     if not settings.complete:
         own = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
-        return own + [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
+        own += [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
+        return own + [(names_in_files()[key], "X", "VALUE") for key in _indices_of(layer)]
     own = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
     return own + [one for one in _passes_of_cycles(scene, layer) if one[0] != "Combined"]
+
+
+def _indices_of(layer) -> tuple[str, ...]:
+    """Those of `INDICES` that `layer` has."""
+    return tuple(key for key in INDICES if getattr(layer, f"use_pass_{key}"))
 
 
 def _passes_of_cycles(scene, layer) -> list[tuple[str, str, str]]:
@@ -205,11 +214,12 @@ def _job_of(engine, depsgraph) -> FinalJob:
         shadow_rays=scene.ltsh.shadow_rays,
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
         has_sky=not (scene.render.film_transparent or world_radiance(scene.world)[1]),
-        cycles_samples=settings.cycles_samples if settings.complete else 0,
+        cycles_samples=scene.ltsh.cycles_samples if settings.complete else 0,
         cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
         keeps_lights=scene.ltsh.keep_lights and not engine.is_animation,
         resolution=picture_size(scene),
         data_passes=any(getattr(depsgraph.view_layer, name) for name in DATA_SETTINGS.values()),
+        indices=_indices_of(depsgraph.view_layer),
         to_camera=None if camera is None else np.array(camera),
     )
 
@@ -234,6 +244,7 @@ class FinalJob:
     keeps_lights: bool = False  # for the light mixer
     resolution: tuple[int, int] = (1920, 1080)  # about, for the time that it takes
     data_passes: bool = False  # also those of `DATA_PASSES`
+    indices: tuple[str, ...] = ()  # also those of `INDICES`
     to_camera: np.ndarray | None = None  # (4, 4) from the world; None: no depth
 
     def steps(self) -> list[Step]:
@@ -285,6 +296,7 @@ def final_picture(
         view_layer=job.view_layer,
         emission=True,
         background=job.has_sky,
+        indices=job.indices,
         shadows=job.shadows,
     )
     extraction = client.extract(options, progress=progress)
@@ -296,6 +308,8 @@ def final_picture(
     passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
+    indices = extraction.indices.items()
+    passes |= {name: inside_border(plane[..., None], extraction.border) for name, plane in indices}
 
     def picture() -> FinalPicture:
         """What there is so far."""

@@ -76,10 +76,6 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         "subsurface, and all its passes",
         default=False,
     )
-    cycles_samples: bpy.props.IntProperty(
-        name="Cycles Samples", description="Samples of what Cycles renders in complete pictures",
-        min=1, soft_max=4096, default=64,
-    )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
         name="Passes of All Techniques",
         description="Final renders also have a specular and a diffuse pass of every technique",

@@ -250,7 +250,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         inventory.occluders.save(folder / OCCLUDERS)
 
     started = time.monotonic()
-    extra_passes = tuple(one for key, one in EXTRA_PASSES.items() if job.get(key))
+    extra_passes = tuple(one for key, one in EXTRA_PASSES.items() if job.get(key)) + tuple(job.get("indices", ()))
     end = math.inf if job.get("seconds") is None else begun + job["seconds"]
     offsets = sub_pixel_offsets(scene, job["sub_samples"], for_finished)
     with world_behind(scene, inventory.behind if job.get("background") else None):

@@ -50,6 +50,7 @@ class ExtractOptions:
     scripts: bool = False  # run those of the file
     emission: bool = False  # also what the surfaces themselves emit
     background: bool = False  # and what of the world is seen behind them
+    indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
     seconds: float | None = None  # of processor time, after which no further sub-sample is begun
@@ -79,14 +80,15 @@ UNCHANGED = (
 class Extraction:
     """What the child found and rendered.
 
-    `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in
-    W m^-2 sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
+    `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in W m^-2
+    sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
-    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those of
-    the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, and `background` what of the
-    world is seen behind them, without the exposure; None where it was not asked for. `problems` say why most of the
-    picture is not shaded. `occluders` are what stands in the way of light, around `origin` (3,) in m; None without
-    shadows. `light_settings` are power, exposure, red, green and blue of light objects as Blender has them.
+    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those
+    of the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, and `background` what
+    of the world is seen behind them, without the exposure; None where it was not asked for. `indices` (H, W) are
+    passes of what the first sub-samples see, by Cycles' names. `problems` say why most of the picture is not
+    shaded. `occluders` are what stands in the way of light, around `origin` (3,) in m; None without shadows.
+    `light_settings` are power, exposure, red, green and blue of light objects as Blender has them.
     """
 
     lights: tuple[AreaLight, ...]
@@ -105,6 +107,7 @@ class Extraction:
     color_space: ColorSpace = REC709
     emission: np.ndarray | None = None
     background: np.ndarray | None = None
+    indices: dict[str, np.ndarray] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     occluders: Occluders | None = None
     kept: KeptByCycles | None = None
@@ -152,6 +155,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
             emission=_read_pass("emission", manifest, folder) if options.emission else None,
             background=_read_pass("background", manifest, folder) if options.background else None,
+            indices=_read_indices(options.indices, manifest, folder),
             kept=kept,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
@@ -248,6 +252,15 @@ def _read_pass(key: str, manifest: dict, folder: Path) -> np.ndarray:
     name = manifest["passes"][key]
     images = [lobes.read_layer(_rendered(folder / file), name, "RGB") for file in manifest["samples"]]
     return np.mean(images, axis=0, dtype=np.float64)
+
+
+def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[str, np.ndarray]:
+    """Passes (H, W) of the first sample render, which sees the centers of pixels, by their names."""
+    if not keys:
+        return {}
+    channels = _rendered(folder / manifest["samples"][0])
+    names = [manifest["passes"][key] for key in keys]
+    return {name: lobes.read_layer(channels, name, "X") for name in names}
 
 
 def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> KeptByCycles:

@@ -203,7 +203,7 @@ class _JobOperator:
 
 
 class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
-    """Shade what the active camera sees, with the chosen techniques"""
+    """Shade what the active camera sees, with the chosen technique"""
 
     bl_idname = "ltsh.shade"
     bl_label = "Shade Camera View"
@@ -212,7 +212,7 @@ class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
 
 class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
     """Shade what the active camera sees, render it with Cycles too, and measure the difference.
-    Direct light without shadows on both sides"""
+    Direct light on both sides, without bounces"""
 
     bl_idname = "ltsh.compare"
     bl_label = "Compare with Cycles"

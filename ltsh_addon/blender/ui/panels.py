@@ -232,6 +232,11 @@ class _Bake:
         column.prop(settings, "bake_error")
 
 
+# Settings of the view layer, and their short names.
+DATA_PASSES = (("z", "Depth"), ("normal", "Normal"), ("position", "Position"),
+               ("object_index", "Object"), ("material_index", "Material"))  # fmt: skip
+
+
 class _Final:
     """F12 with our engine."""
 
@@ -245,10 +250,14 @@ class _Final:
     def draw(self, context):
         layout, view, layer = self.layout, context.scene.ltsh_view, context.view_layer
         layout.prop(view, "complete")
-        layout.prop(view, "cycles_samples" if view.complete else "technique_passes")
-        row = layout.row(align=True)
-        for name, label in (("use_pass_z", "Depth"), ("use_pass_normal", "Normal"), ("use_pass_position", "Position")):
-            row.prop(layer, name, text=label, toggle=True)
+        if view.complete:
+            text = "{} Cycles Samples, see Quality and Output"
+            draw_text(gray(layout), context, translated(text).format(context.scene.ltsh.cycles_samples), "INFO")
+        else:
+            layout.prop(view, "technique_passes")
+        grid = toggles(layout, context, 3)
+        for name, label in DATA_PASSES:
+            grid.prop(layer, f"use_pass_{name}", text=label, toggle=True)
 
 
 class _Quality:

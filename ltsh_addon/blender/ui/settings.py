@@ -291,7 +291,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     )  # fmt: skip
     cycles_samples: IntProperty(
         name="Cycles Samples",
-        description="Samples per pixel of the Cycles reference; its noise falls with their square root",
+        description="Samples per pixel of Cycles: of its picture beside the techniques and of what it adds to complete "
+        "renders; noise falls with their square root",
         min=2, max=1 << 20, soft_max=8192, default=256,
     )  # fmt: skip
     shadows: BoolProperty(

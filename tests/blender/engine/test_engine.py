@@ -18,6 +18,7 @@ from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
+from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
 from ltsh_addon.blender.ui.job import STARTING, Plan
 from ltsh_addon.blender.viewport.mirror import view_lights
@@ -105,7 +106,7 @@ def test_settings_of_cycles_own_renders_stay_hidden(addon):
 
 def test_a_complete_render_is_the_picture_that_the_command_makes_with_the_passes_of_cycles(scene, tmp_path):
     settings, layer = scene.ltsh_view, scene.view_layers[0]
-    settings.complete, settings.cycles_samples = True, 8
+    settings.complete, scene.ltsh.cycles_samples = True, 8
     layer.use_pass_diffuse_indirect = layer.use_pass_diffuse_direct = layer.use_pass_z = layer.use_pass_uv = True
     layer.use_pass_glossy_direct = layer.use_pass_cryptomatte_object = True
     channels = render_passes(scene, tmp_path / "final.exr")
@@ -370,9 +371,12 @@ def test_a_render_tells_a_line_a_second_and_shows_every_picture(scene, monkeypat
     assert lines[-1].startswith("LTSH: Sample Surfaces  ") and "left" in lines[-1] and " %" in lines[-1]
 
 
-def test_depth_normal_and_position_are_those_of_cycles(scene, tmp_path):
+def test_depth_normal_position_and_indices_are_those_of_cycles(scene, tmp_path):
     layer = bpy.context.view_layer
     layer.use_pass_z = layer.use_pass_normal = layer.use_pass_position = True
+    layer.use_pass_object_index = layer.use_pass_material_index = True
+    for number, ob in enumerate(one for one in scene.objects if one.type == "MESH"):
+        ob.pass_index, ob.material_slots[0].material.pass_index = 3 + 4 * number, 20 - 7 * number
     found = render_passes(scene, tmp_path / "ours.exr")
     scene.render.engine = "CYCLES"
     # Pixel centers, as one point per pixel has them.
@@ -386,7 +390,10 @@ def test_depth_normal_and_position_are_those_of_cycles(scene, tmp_path):
 
     hit = layer_of(expected, "Depth")[..., 0] < 1e9
     assert 0.3 < hit.mean()
-    for name in ("Depth", "Normal", "Position"):
+    indices = [pass_names()[key] for key in ("object_index", "material_index")]
+    for name, seen in zip(indices, ({0, 3, 7}, {0, 20, 13}), strict=True):
+        assert set(np.unique(layer_of(found, name))) == seen
+    for name in ("Depth", "Normal", "Position", *indices):
         ours, theirs = layer_of(found, name), layer_of(expected, name)
         assert ours.shape == theirs.shape
         # Of pixels that an edge crosses, rounding decides.

@@ -120,26 +120,53 @@ def _below(panel) -> list[type]:
     return list(found)
 
 
-# Panels that show themselves under our engine, and the engines that they had of their own (None: inherited ones).
-_changed: dict[type, set | None] = {}
+class _AsCycles:
+    """A context in which the engine is Cycles."""
+
+    engine = "CYCLES"
+
+    def __init__(self, context):
+        self._context = context
+
+    def __getattr__(self, name):
+        return getattr(self._context, name)
+
+
+def _asked_as_cycles(poll):
+    """The class method `poll` of a panel, to which our engine is Cycles."""
+
+    def poll_of_both(cls, context):
+        return poll.__func__(cls, _AsCycles(context) if context.engine == ENGINE else context)
+
+    return classmethod(poll_of_both)
+
+
+# Panels that show themselves under our engine, and what they had of their own of these (None: inherited).
+_changed: dict[type, dict] = {}
 
 
 def _share_panels() -> None:
     """Show them."""
     for panel in shared_panels():
         # A set of its own: Cycles' panels share one, those for its render settings included.
-        _changed[panel] = vars(panel).get("COMPAT_ENGINES")
-        panel.COMPAT_ENGINES = {*panel.COMPAT_ENGINES, ENGINE}
+        shown = {"COMPAT_ENGINES": {*panel.COMPAT_ENGINES, ENGINE}}
+        if _is_cycles(panel):
+            # Most ask the class that they all share whether the engine is right.
+            shown["poll"] = _asked_as_cycles(panel.poll)
+        _changed[panel] = {name: vars(panel).get(name) for name in shown}
+        for name, value in shown.items():
+            setattr(panel, name, value)
 
 
 def _unshare_panels() -> None:
     """Hide them again."""
     while _changed:
-        panel, engines = _changed.popitem()
-        if engines is None:
-            del panel.COMPAT_ENGINES
-        else:
-            panel.COMPAT_ENGINES = engines
+        panel, former = _changed.popitem()
+        for name, value in former.items():
+            if value is None:
+                delattr(panel, name)
+            else:
+                setattr(panel, name, value)
 
 
 REACH = 8.0  # pixels of an unscaled interface

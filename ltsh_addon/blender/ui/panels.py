@@ -311,7 +311,7 @@ class _Entries:
 
 LIGHT_ICONS = {"AREA": "LIGHT_AREA", "POINT": "LIGHT_POINT", "SPOT": "LIGHT_SPOT", "SUN": "LIGHT_SUN"}
 # Widths in a row of the list, as Blender counts them.
-NAME_UNITS, POWER_UNITS, COLOR_UNITS = 4.8, 3.2, 1.2
+NAME_UNITS, POWER_UNITS, COLOR_UNITS = 4.2, 3.8, 1.2
 LIGHT_ROWS = 4
 
 

@@ -104,6 +104,29 @@ def test_settings_of_cycles_own_renders_stay_hidden(addon):
         assert "LTSH" not in getattr(bpy.types, name).COMPAT_ENGINES, name
 
 
+def test_panels_of_materials_lights_and_worlds_are_there_as_with_cycles(addon):
+    """Also those that ask a class of their own for the engine."""
+    world, material = bpy.data.worlds.new("World"), bpy.data.materials.new("Clay")
+    light, ob = bpy.data.lights.new("Key", "AREA"), bpy.data.objects.new("Ball", bpy.data.meshes.new("Ball"))
+    names = ("CYCLES_MATERIAL_PT_surface", "CYCLES_MATERIAL_PT_settings",
+             "CYCLES_PT_context_material", "CYCLES_LIGHT_PT_light", "CYCLES_LIGHT_PT_beam_shape",
+             "CYCLES_WORLD_PT_surface", "CYCLES_WORLD_PT_settings", "CYCLES_OBJECT_PT_visibility")  # fmt: skip
+    shown = {}
+    for engine in ("LTSH", "CYCLES", "BLENDER_EEVEE"):
+        context = SimpleNamespace(engine=engine, world=world, material=material, light=light, object=ob, mesh=ob.data,
+                                  active_object=ob, scene=addon, preferences=bpy.context.preferences)  # fmt: skip
+        panels = {name: getattr(bpy.types, name).poll(context) for name in (*names, "CYCLES_RENDER_PT_sampling")}
+        shown[engine] = {name for name, is_shown in panels.items() if is_shown}
+    assert shown["LTSH"] == set(names) == shown["CYCLES"] - {"CYCLES_RENDER_PT_sampling"}
+    assert not shown["BLENDER_EEVEE"]
+    ltsh_addon.unregister()
+    try:
+        context.engine = "LTSH"
+        assert not any(getattr(bpy.types, name).poll(context) for name in names)
+    finally:
+        ltsh_addon.register()
+
+
 def test_a_complete_render_is_the_picture_that_the_command_makes_with_the_passes_of_cycles(scene, tmp_path):
     settings, layer = scene.ltsh_view, scene.view_layers[0]
     settings.complete, scene.ltsh.cycles_samples = True, 8

@@ -234,7 +234,9 @@ class KeptPicture:
         extraction = Extraction(
             **{name: found[name] for name in UNCHANGED},
             lights=lights_of(found["lights"]),
-            samples=SurfaceSamples(**{item.name: arrays[f"samples.{item.name}"] for item in fields(SurfaceSamples)}),
+            samples=SurfaceSamples(
+                **{item.name: _compact(arrays[f"samples.{item.name}"]) for item in fields(SurfaceSamples)}
+            ),
             film=Film(
                 pixel=arrays["film.pixel"],
                 first=arrays.get("film.first"),
@@ -259,6 +261,11 @@ class KeptPicture:
         rest = {name: arrays[f"rest.{name}"] for name in document["rest"]}
         taken = {name: arrays[f"taken.{name}"] for name in document["taken"]}
         return cls(extraction, shadows, options, document["had_cycles"], rest, taken)
+
+
+def _compact(values: np.ndarray) -> np.ndarray:
+    """`values`, or one zero that stands for all of them."""
+    return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
 KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")

@@ -9,17 +9,18 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from .. import imaging
-from ..files import replacing
+from ..files import replacing, temporary_folder
 from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
-from ..visibility import Occluders
+from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
 from . import picture
-from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, ShadowTracer, rays_of_point, shade_lights
+from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_of_point, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -422,12 +423,12 @@ class Mixer:
 class MovedLights:
     """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
 
-    Where rays start is found once, for the first of them.
+    With the first of them processes start that keep the samples, so that others take half a second; `close` ends them.
     """
 
     def __init__(self, kept: KeptPicture, occluders: Occluders | None):
-        self._kept, self._occluders, self._starts = kept, occluders, None
-        (self._table,) = picture.load_tables((technique_of(kept),)).values()
+        self._kept, self._occluders = kept, occluders
+        self._company, self._ending = None, ExitStack()
 
     @classmethod
     def load(cls, path: Path) -> MovedLights:
@@ -439,13 +440,39 @@ class MovedLights:
 
     def picture(self, light: AreaLight) -> np.ndarray:
         """The picture (H, W, 3) of one light. Raises SceneError."""
-        extraction, options, shadows = self._kept.extraction, self._kept.options, None
-        if self._occluders is not None:
-            rays = rays_of_point(options["shadow_rays"], extraction.film.sub_samples)
-            with ShadowTracer(self._occluders, (light,), extraction.origin) as tracer:
-                if self._starts is None:
-                    self._starts = tracer.starts(extraction.samples)
-                known = {"film": extraction.film, "starts": self._starts}
-                shadows = tracer.trace(extraction.samples, options["passes"], rays, **known)
-        alone = replace(self._kept, extraction=replace(extraction, lights=(light,)), shadows=shadows)
-        return _layers(alone, self._table, [[0]], None)[0]
+        if self._company is None:
+            self._start()
+        kept, film, task = self._kept, self._kept.extraction.film, None
+        light = light.moved(-kept.extraction.origin)
+        if self._tracer is not None:
+            rays = rays_of_point(kept.options["shadow_rays"], film.sub_samples)
+            task = task_of_light(self._samples, light, self._tracer, kept.options["passes"], rays)
+        radiance = np.zeros((len(film.pixel), 3), np.float32)
+        for block, found in zip(self._blocks, self._company.lit(light, task), strict=True):
+            for name, values in found.items():
+                taken = kept.taken.get(name)
+                radiance[block] += values if taken is None else taken.ravel()[film.pixel[block], None] * values
+        return film.image(kept.extraction.exposure * radiance).astype(np.float32)
+
+    def close(self) -> None:
+        """End the processes; the next light starts others."""
+        self._company = None
+        self._ending.close()
+
+    def _start(self) -> None:
+        from ..blender.process.blender_rays import open_rays
+
+        kept, samples, film = self._kept, self._kept.extraction.samples, self._kept.extraction.film
+        self._samples = replace(samples, position=samples.position - kept.extraction.origin)
+        starts = range(0, max(len(samples), 1), BLOCK_SAMPLES)
+        self._blocks = [slice(start, start + BLOCK_SAMPLES) for start in starts]
+        blocks = tuple((self._samples.take(block), film.take(block)) for block in self._blocks)
+        (table,) = picture.load_tables((technique_of(kept),)).values()
+        with ExitStack() as stack:
+            self._tracer = None
+            if self._occluders is not None:
+                folder = stack.enter_context(temporary_folder())
+                self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
+            self._company = Company(Setting(blocks, table, tuple(kept.options["passes"])), self._tracer)
+            stack.callback(self._company.close)
+            self._ending = stack.pop_all()

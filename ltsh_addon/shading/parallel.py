@@ -19,9 +19,10 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import numpy as np
 
@@ -451,6 +452,46 @@ class _Shader(Child):
     def end(self):
         super().end()
         self._side.close()
+
+
+class Keeper(Child):
+    """A child that keeps its task, and answers one question after another until `end`."""
+
+    def __init__(self, side: str, task: bytes):
+        self.side, self._task = side, task
+        self._questions: SimpleQueue = SimpleQueue()
+        self._answers: SimpleQueue = SimpleQueue()
+        self._is_ended = False
+        super().__init__()
+
+    def put(self, question) -> None:
+        """Ask; the answer is what the next `get` returns."""
+        self._questions.put(question)
+
+    def get(self):
+        """An answer, None where the child is gone."""
+        while self._thread.is_alive() or not self._answers.empty():
+            with suppress(Empty):
+                return self._answers.get(timeout=PATIENCE_SECONDS)
+        return None
+
+    def _feed(self):
+        self.begin(self._task)
+        self._task = b""
+        while not self._is_ended:
+            self._answers.put(self.ask(self._questions.get()))
+
+    def _is_unwanted(self):
+        return self._is_ended
+
+    def _give_back(self):
+        pass  # `get` tells
+
+    def end(self):
+        self._is_ended = True
+        # Wakes the thread: what it sends then nobody reads.
+        self._questions.put(None)
+        super().end()
 
 
 class _ChildError(Exception):

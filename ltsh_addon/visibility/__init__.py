@@ -6,21 +6,26 @@ they go, `ratio` makes shares of what they meet (`visible_shares`), and `crew` d
 
 from __future__ import annotations
 
+from .crew import Company, Setting
 from .directions import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import Visibility, visible_shares
+from .ratio import BLOCK_SAMPLES, Visibility, task_of_light, visible_shares
 from .rays import Tracer, open_tracer
 from .starts import Starts
 
 __all__ = [
+    "BLOCK_SAMPLES",
+    "Company",
     "Hits",
     "OccluderMesh",
     "Occluders",
+    "Setting",
     "Starts",
     "Tracer",
     "Transparency",
     "Visibility",
     "open_tracer",
     "shared_numbers",
+    "task_of_light",
     "visible_shares",
 ]

@@ -2,6 +2,7 @@
 
 Embree is called with Python's lock held, so that threads would not help. Children are started as those of
 `shading.parallel`, and open a tracer of their own. What happens in a block does not depend on who takes it.
+Those of a `Company` stay: each has some of the blocks, which one light after another lights.
 """
 
 from __future__ import annotations
@@ -9,10 +10,12 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from ..scene import Cancelled, Progress
-from ..shading import parallel, worker
+import numpy as np
+
+from ..scene import AreaLight, Cancelled, Film, Progress, SurfaceSamples
+from ..shading import LookupTable, parallel, shade, worker
 from .occluders import Occluders
 from .rays import open_tracer
 
@@ -126,3 +129,87 @@ class _Tracing(parallel.Child):
     def _give_back(self):
         if self._number is not None:
             self._queue.give_back(self._number)
+
+
+# -- processes that stay ----------------------------------------------------------------------------------------------
+
+# With fewer samples a process takes longer to start than to help.
+SAMPLES_WORTH_A_CHILD = 1 << 16
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Blocks of samples that one light after another lights, and how."""
+
+    blocks: tuple[tuple[SurfaceSamples, Film], ...]  # around the origin of the occluders
+    table: LookupTable
+    passes: tuple[str, ...]
+
+
+class LitBlocks:
+    """Answers a light, and the task that finds its shares, with radiance (B, 3) by pass of each block.
+
+    `setting` comes with the occluders and the library that traces; None: everything is seen.
+    """
+
+    def __init__(self, setting: tuple[Setting, Occluders | None, str | None], tracer=None):
+        self._setting, occluders, library = setting
+        self._tracer = tracer
+        if tracer is None and occluders is not None:
+            self._tracer = open_tracer(occluders, [library])
+        self._starts: list = [None] * len(self._setting.blocks)
+
+    def shade(self, message) -> list[dict[str, np.ndarray]]:
+        """The answer."""
+        return [self._lit(number, *message) for number in range(len(self._setting.blocks))]
+
+    def _lit(self, number: int, light: AreaLight, task) -> dict[str, np.ndarray]:
+        own, (samples, film) = self._setting, self._setting.blocks[number]
+        radiance = {name: np.zeros((len(samples), 3), np.float32) for name in own.passes}
+        shares = dict.fromkeys(own.passes, np.float32(1.0))
+        if task is not None:
+            if self._starts[number] is None:
+                self._starts[number] = self._tracer.starts(samples)
+            found = task.shares(samples, film, self._starts[number], self._tracer)
+            shares = {name: getattr(found, name)[0][:, None] for name in own.passes}
+        if any(share.any() for share in shares.values()):
+            lit = shade(samples, [light], own.table, passes=own.passes, workers=1)
+            radiance = {name: shares[name] * getattr(lit, name)[0] for name in own.passes}
+        return radiance
+
+
+class Company:
+    """This process and others, as many as there are cores, which keep the blocks of a setting until `close`.
+
+    `tracer` knows what stands in the way; None: nothing does.
+    """
+
+    def __init__(self, setting: Setting, tracer):
+        self._setting, self._tracer = setting, tracer
+        occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
+        count = min(parallel.cores(), len(setting.blocks))
+        cannot_help = parallel.interpreter() is None or (tracer is not None and library is None)
+        if cannot_help or sum(len(samples) for samples, _ in setting.blocks) < SAMPLES_WORTH_A_CHILD:
+            count = 1
+        self._parts = [replace(setting, blocks=setting.blocks[first::count]) for first in range(count)]
+        self._own = LitBlocks((self._parts[0], occluders, library), tracer)
+        self._children = [
+            parallel.Keeper("visibility.crew.LitBlocks", worker.packed((part, occluders, library)))
+            for part in self._parts[1:]
+        ]
+
+    def lit(self, light: AreaLight, task) -> list[dict[str, np.ndarray]]:
+        """What the blocks reflect of a light, see `LitBlocks`."""
+        for child in self._children:
+            child.put((light, task))
+        found = [self._own.shade((light, task))]
+        for part, child in zip(self._parts[1:], self._children, strict=True):
+            answer = child.get()
+            # Where the child is gone this process does its part.
+            found.append(LitBlocks((part, None, None), self._tracer).shade((light, task)) if answer is None else answer)
+        return [found[number % len(found)][number // len(found)] for number in range(len(self._setting.blocks))]
+
+    def close(self) -> None:
+        """End the other processes."""
+        for child in self._children:
+            child.end()

@@ -11,6 +11,8 @@ from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.lighting import KeptPicture
 from ltsh_addon.pipeline.relight import LightPictures, Mixer, MovedLights, light_pictures
+from ltsh_addon.shading import parallel
+from ltsh_addon.visibility import crew
 
 # float32 sums of three lights in another order, and what EXR files hold of them.
 ROUNDING = 1e-5
@@ -188,6 +190,29 @@ def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
     assert np.abs(moved - expected.layers[0]).mean() < 0.02 * expected.layers[0].mean()
     mixer.replace(0, mixer.rows[0], moved)
     assert not np.allclose(mixed(mixer, np.ones((3, 3))), before, rtol=0.05)
+
+
+def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(capsys, monkeypatch, room, out):
+    shade(capsys, monkeypatch, room, out, wall=wall(0.7, left=0.0))
+    monkeypatch.setattr(relight, "BLOCK_SAMPLES", 7)
+    alone = MovedLights.load(out / "shade.samples.npz")
+    monkeypatch.setattr(crew, "SAMPLES_WORTH_A_CHILD", 0)
+    monkeypatch.setattr(parallel, "cores", lambda: 3)
+    light = kept_in(out).extraction.lights[0]
+    lights = [light.moved(np.array([0.1 * step, 0.0, 0.0])) for step in range(3)]
+    expected = [alone.picture(one) for one in lights]
+    together = MovedLights.load(out / "shade.samples.npz")
+    try:
+        np.testing.assert_array_equal(together.picture(lights[0]), expected[0])
+        children = together._company._children
+        assert len(children) == 2 and all(child._process.poll() is None for child in children)
+        children[1]._process.kill()
+        np.testing.assert_array_equal(together.picture(lights[1]), expected[1])
+    finally:
+        together.close()
+    assert all(child._process.poll() is not None for child in children)
+    np.testing.assert_array_equal(together.picture(lights[2]), expected[2])
+    together.close()
 
 
 def test_no_samples_give_a_black_picture(capsys, monkeypatch, room, out):

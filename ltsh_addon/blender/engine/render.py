@@ -135,7 +135,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self.report({"WARNING"}, warning)
         self._show(picture, job.view_layer)
         if picture.lights is not None:
-            comparison.mix_render(job.scene, picture.lights)
+            comparison.mix_render(job.scene, picture.lights, picture.kept)
 
     def _show(self, picture: FinalPicture, view_layer: str) -> None:
         """Let Blender have the picture: the last one stays."""
@@ -276,6 +276,7 @@ class FinalPicture:
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
     lights: LightPictures | None = None
+    kept: KeptPicture | None = None  # what the lights are shaded from
 
 
 def final_picture(
@@ -331,8 +332,12 @@ def final_picture(
             show(picture())
     if not job.keeps_lights:
         return picture()
-    kept = KeptPicture(extraction, shadows, {"techniques": (job.technique,), "passes": shown}, False, {"": rest})
-    return replace(picture(), lights=light_pictures(kept, progress))
+    kept = KeptPicture(extraction, shadows, _kept_options(job, shown), False, {"": rest})
+    return replace(picture(), lights=light_pictures(kept, progress), kept=kept)
+
+
+def _kept_options(job: FinalJob, passes) -> dict:
+    return {"techniques": (job.technique,), "passes": passes, "shadow_rays": job.shadow_rays}
 
 
 def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarray]:
@@ -387,13 +392,14 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
         if planes and set(letters) <= set(planes):
             passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
     passes = {name: inside_border(image, border) for name, image in passes.items()}
-    lights, ours = None, made.comparison
+    lights, kept, ours = None, None, made.comparison
     if job.keeps_lights:
-        rest, chosen = {"": made.rest}, {"techniques": options.techniques, "passes": PASSES}
-        kept = KeptPicture(ours.extraction, ours.shadows, chosen, False, rest, made.taken)
+        kept = KeptPicture(
+            ours.extraction, ours.shadows, _kept_options(job, PASSES), False, {"": made.rest}, made.taken
+        )
         lights = light_pictures(kept, progress)
     warnings = tuple(made.report["warnings"])
-    return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights)
+    return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights, kept=kept)
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
+from ...pipeline.lighting import KeptPicture
 from ...pipeline.relight import LightPictures
 from ...scene import error_line
 from . import drawing, results
@@ -42,13 +43,13 @@ def mixed(item, context) -> None:
     put_in_editor(context, item.id_data)
 
 
-def mix_render(name: str, pictures: LightPictures) -> None:
+def mix_render(name: str, pictures: LightPictures, kept: KeptPicture) -> None:
     """Let the mixer change the lights of a final render of the scene `name`; called while Blender renders."""
 
     def take() -> None:
         scene = bpy.data.scenes.get(name)
         if scene is not None:
-            results.mix_render(scene, pictures)
+            results.mix_render(scene, pictures, kept)
             redraw_image_editors()
             redraw_panels()
 
@@ -563,6 +564,7 @@ def unregister() -> None:
     _remove_classes()
     if bpy.app.timers.is_registered(settle):
         bpy.app.timers.unregister(settle)
+    results.forget_renders()
     for name, function in HANDLERS:
         handlers = getattr(bpy.app.handlers, name)
         if function in handlers:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import bpy
 import numpy as np
@@ -109,9 +110,11 @@ def state_of(row: Row, item) -> tuple[str, str]:
 class LTSH_UL_mixer(bpy.types.UIList):
     """Lights of a finished picture"""
 
+    # By their names, of the panel that is drawn: to find them looks at files.
+    rows: ClassVar[dict[str, Row]] = {}
+
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
-        rows = {row.name: row for row, _ in results.mixer_pairs(context.scene)}
-        line, row = layout.row(align=True), rows.get(item.name)
+        line, row = layout.row(align=True), self.rows.get(item.name)
         line.enabled = row is not None
         line.prop(item, "muted", text="", icon="HIDE_ON" if item.muted else "HIDE_OFF", emboss=False)
         line.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)
@@ -131,7 +134,7 @@ class _Mixer:
 
     def draw(self, context):
         layout, settings = self.layout, context.scene.ltsh
-        rows = [row for row, _ in results.mixer_pairs(context.scene)]
+        rows = LTSH_UL_mixer.rows = {row.name: row for row, _ in results.mixer_pairs(context.scene)}
         split_names(layout, context)
         if not rows:
             layout.prop(settings, "keep_lights")
@@ -139,7 +142,7 @@ class _Mixer:
             return
         layout.template_list("LTSH_UL_mixer", "", settings, "mixed", settings, "mixed_active", rows=min(len(rows), 8))
         item = settings.mixed[settings.mixed_active] if settings.mixed_active < len(settings.mixed) else None
-        row = next((row for row in rows if item is not None and row.name == item.name), None)
+        row = None if item is None else rows.get(item.name)
         if row is not None:
             column = layout.column()
             for name in ("power", "exposure", "color"):

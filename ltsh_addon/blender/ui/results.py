@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import bpy
@@ -10,9 +10,9 @@ import numpy as np
 
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
-from ...pipeline.lighting import KEPT_SUFFIX
+from ...pipeline.lighting import KEPT_SUFFIX, KeptPicture
 from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, MovedLights, Row, tint
-from ...scene import AreaLight, SceneError
+from ...scene import AreaLight, SceneError, SurfaceSamples
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
 PREFIX = "LTSH "
@@ -81,7 +81,7 @@ def show(scene, folder: Path) -> None:
     """Make the pictures in `folder` the results of `scene`, with images for the chosen pass."""
     scene.ltsh.result_folder = _blender_path(folder)
     _pixels.clear()
-    _rendered.clear()
+    forget_renders()
     result = result_of(scene)
     if result is None:
         return
@@ -209,16 +209,18 @@ def _stored(settings, key: str, value: str):
 
 # -- the light mixer --------------------------------------------------------------------------------------------------
 
-# Of the picture that was asked for last, and what was kept of it to shade lights that have moved.
-_mixer: dict = {"stamp": None, "mixer": None, "kept": None, "is_silent": False}
+# Of the picture that was asked for last, and what shades lights that have moved.
+_mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}
 # Of final renders by the name of their scene, as long as nothing else is shown; they are in no file.
-_rendered: dict[str, Mixer] = {}
+_rendered: dict[str, tuple[Mixer, MovedLights | None]] = {}
+# Bytes of the samples of a final render that stay for lights that move, and seconds that their processes wait for one.
+MOST_BYTES, IDLE_SECONDS = 1 << 31, 60.0
 
 
 def mixer_of(scene) -> Mixer | None:
     """The light mixer of the results of `scene`; None where they have no pictures of the lights."""
     if scene.name in _rendered:
-        return _rendered[scene.name]
+        return _rendered[scene.name][0]
     result = result_of(scene)
     if result is None:
         return None
@@ -226,23 +228,37 @@ def mixer_of(scene) -> Mixer | None:
     try:
         stamp = str(path), path.stat().st_mtime_ns
         if _mixer["stamp"] != stamp:
-            _mixer.update(stamp=stamp, mixer=None, kept=None)
+            end_processes()
+            _mixer.update(stamp=stamp, mixer=None, moved=None)
             _mixer["mixer"] = Mixer(LightPictures.load(path))
     except (OSError, ValueError):
-        _mixer.update(stamp=None, mixer=None, kept=None)
+        end_processes()
+        _mixer.update(stamp=None, mixer=None, moved=None)
     return _mixer["mixer"]
 
 
-def mix_render(scene, pictures: LightPictures) -> None:
-    """Let the mixer of `scene` change the lights of a final render."""
-    _rendered.clear()
-    _rendered[scene.name] = Mixer(pictures)
+def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:
+    """Let the mixer of `scene` change the lights of a final render, and shade those that move."""
+    forget_renders()
+    size = sum(getattr(kept.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
+    moved = MovedLights(kept, kept.extraction.occluders) if size <= MOST_BYTES else None
+    _rendered[scene.name] = Mixer(pictures), moved
     _take_rows(scene)
 
 
 def forget_renders() -> None:
-    """Another file is opened: its scenes may have the same names."""
+    """Another picture is shown, or another file opened: its scenes may have the same names."""
+    end_processes()
     _rendered.clear()
+
+
+def end_processes() -> None:
+    """End those that wait for lights that move; they start again when one does."""
+    for moved in (_mixer["moved"], *(moved for _, moved in _rendered.values())):
+        if moved is not None:
+            moved.close()
+    if bpy.app.timers.is_registered(end_processes):
+        bpy.app.timers.unregister(end_processes)
 
 
 def update_moved(scene, moved: dict[int, AreaLight]) -> None:
@@ -250,17 +266,29 @@ def update_moved(scene, moved: dict[int, AreaLight]) -> None:
 
     Raises OSError, ValueError, SceneError.
     """
-    if scene.name in _rendered:
-        raise SceneError("lights of a final render: render again, or shade a picture, whose lights can be moved")
-    result, mixer = result_of(scene), mixer_of(scene)
-    if _mixer["kept"] is None:
-        _mixer["kept"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
+    mixer = mixer_of(scene)
     for number, light in moved.items():
-        row = replace(mixer.rows[number], light=light.record())
-        mixer.replace(number, row, _mixer["kept"].picture(light))
-    path = result.folder / MIXER_FILE
-    mixer.pictures.save(path)
-    _mixer["stamp"] = str(path), path.stat().st_mtime_ns
+        layer = _moved_lights(scene).picture(light)
+        mixer.replace(number, replace(mixer.rows[number], light=light.record()), layer)
+    if bpy.app.timers.is_registered(end_processes):
+        bpy.app.timers.unregister(end_processes)
+    bpy.app.timers.register(end_processes, first_interval=IDLE_SECONDS)
+    if scene.name not in _rendered:
+        path = result_of(scene).folder / MIXER_FILE
+        mixer.pictures.save(path)
+        _mixer["stamp"] = str(path), path.stat().st_mtime_ns
+
+
+def _moved_lights(scene) -> MovedLights:
+    if scene.name in _rendered:
+        found = _rendered[scene.name][1]
+        if found is None:
+            raise SceneError("this final render has too many samples to keep them all: render again with fewer points")
+        return found
+    if _mixer["moved"] is None:
+        result = result_of(scene)
+        _mixer["moved"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
+    return _mixer["moved"]
 
 
 def mixer_pairs(scene) -> list:

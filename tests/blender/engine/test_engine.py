@@ -454,6 +454,33 @@ def test_a_render_is_what_the_mixer_changes_until_results_are_shown(scene, monke
     assert results.mixer_of(scene) is None
 
 
+@pytest.mark.parametrize("complete", [False, True])
+def test_a_light_that_moved_since_a_render_is_shaded_where_it_is(scene, monkeypatch, complete):
+    """As a render of the moved light; the others, and what is bounced, stay."""
+    later = []
+    monkeypatch.setattr(bpy.app.timers, "register", lambda function, **_: later.append(function))
+    scene.ltsh_view.complete, scene.ltsh_view.cycles_samples, scene.ltsh.shadows = complete, 4, True
+    scene.cycles.max_bounces = 0
+
+    def rendered():
+        bpy.ops.render.render()
+        [one for one in later if one.__name__ == "take"][-1]()
+        return results.mixed_pixels(scene)[..., :3].copy()
+
+    before = rendered()
+    light = next(ob for ob in scene.objects if ob.type == "LIGHT")
+    light.location.x += 0.4
+    bpy.context.view_layer.update()
+    assert bpy.ops.ltsh.update_moved_lights() == {"FINISHED"}
+    found = results.mixed_pixels(scene)[..., :3].copy()
+    assert results.end_processes in later
+    expected = rendered()
+    size = np.linalg.norm(expected)
+    # Noise at the edges of shadows is of other rays.
+    assert np.linalg.norm(found - expected) < 0.02 * size < 0.2 * np.linalg.norm(before - expected)
+    results.forget_renders()
+
+
 def test_work_that_never_asks_is_left_at_once():
     begun, go_on, ended = threading.Event(), threading.Event(), threading.Event()
 

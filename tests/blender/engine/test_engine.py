@@ -459,7 +459,7 @@ def test_a_light_that_moved_since_a_render_is_shaded_where_it_is(scene, monkeypa
     """As a render of the moved light; the others, and what is bounced, stay."""
     later = []
     monkeypatch.setattr(bpy.app.timers, "register", lambda function, **_: later.append(function))
-    scene.ltsh_view.complete, scene.ltsh_view.cycles_samples, scene.ltsh.shadows = complete, 4, True
+    scene.ltsh_view.complete, scene.ltsh.cycles_samples, scene.ltsh.shadows = complete, 4, True
     scene.cycles.max_bounces = 0
 
     def rendered():

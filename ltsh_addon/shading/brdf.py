@@ -24,8 +24,8 @@ import numpy as np
 from .lookup_table import MIN_ALPHA
 from .polygon import dot, project_to_sphere
 
-# Lights of fewer corners have their edges cut in two, and both parts again where they bend most.
-MANY_EDGES, NEWTON_STEPS = 16, 2
+# Arcs of conics are cut in two until they turn by at most so many radians, or so often.
+LONGEST_ARC, MOST_HALVINGS = 0.8, 14
 
 
 def ggx_brdf_cosine(cos_theta_o, alpha, directions):
@@ -158,112 +158,122 @@ class HalfVectors:
         values = self.sine, self.cosine, self.alpha, self.across, self.along
         return HalfVectors(*(value[index] for value in values))
 
-    def to_original_domain(self, vectors: np.ndarray) -> np.ndarray:
-        """Stretched half vectors (3, ..., P), of any length, for vectors (3, ..., P) in local frames."""
-        return self._stretched(vectors, np.sqrt(dot(vectors, vectors)))
+    def astype(self, dtype) -> HalfVectors:
+        """The same in another precision."""
+        values = self.sine, self.cosine, self.alpha, self.across, self.along
+        return HalfVectors(*(value.astype(dtype) for value in values))
 
-    def along_edge(self, vectors, step):
-        """As `to_original_domain` for vectors (3, ..., P), and how fast that changes with `step` (3, ..., P)."""
-        length = np.sqrt(dot(vectors, vectors))
-        return self._stretched(vectors, length), self._stretched(step, dot(vectors, step) / np.maximum(length, 1e-300))
-
-    def _stretched(self, vectors, length):
+    def to_original_domain(self, vectors: np.ndarray, length=None) -> np.ndarray:
+        """Stretched half vectors (3, ..., P), of any length, for vectors (3, ..., P) in local frames; `length` is that
+        of the vectors, where it is known."""
         x, y, z = vectors
+        length = np.sqrt(dot(vectors, vectors)) if length is None else length
         x = x + length * self.sine
         return np.stack([x, self.along * x + self.across * y, self.alpha * (z + length * self.cosine)])
 
     def lobe(self, stretched):
         """P (...) at unit stretched half vectors [x, y, z] (..., P), the cosine (...) of the half angle, and the unit
-        directions (..., 3)."""
-        x, z = stretched[0], stretched[2] / self.alpha
-        y = (stretched[1] - self.along * x) / self.across
-        length = np.sqrt(x * x + y * y + z * z)
-        x, y, z = x / length, y / length, z / length
-        half = x * self.sine + z * self.cosine
-        direction = np.stack([2.0 * half * x - self.sine, 2.0 * half * y, 2.0 * half * z - self.cosine], axis=-1)
-        mu = np.maximum(direction[..., 2], 0.0)
-        slopes = direction[..., 0] - self.along / self.across * direction[..., 1], direction[..., 1] / self.across
-        masked = np.sqrt(mu * mu + self.alpha**2 * (slopes[0] ** 2 + slopes[1] ** 2))
-        view = np.hypot(self.alpha * self.sine, self.cosine)
-        visible = self.alpha * self.sine * stretched[0] + self.cosine * stretched[2]
-        values = 2.0 / np.pi * mu * visible / np.maximum(self.cosine * masked + mu * view, 1e-300)
-        return values, half, direction
+        directions [x, y, z]."""
+        x, y, z = stretched
+        up, turn, side = 1.0 / self.alpha, 1.0 / self.across, self.along / self.across
+        half_y, half_z = turn * y - side * x, up * z
+        inverse = 1.0 / np.sqrt(x * x + half_y * half_y + half_z * half_z)
+        half = (self.sine * x + self.cosine * half_z) * inverse
+        scale = 2.0 * half * inverse
+        i_x, i_y, i_z = scale * x - self.sine, scale * half_y, scale * half_z - self.cosine
+        mu = np.maximum(i_z, 0.0)
+        slope_x, slope_y = i_x - side * i_y, turn * i_y
+        masked = np.sqrt(mu * mu + self.alpha**2 * (slope_x * slope_x + slope_y * slope_y))
+        view, peak = np.hypot(self.alpha * self.sine, self.cosine), (2.0 / np.pi) * self.alpha * self.sine
+        visible = peak * x + (2.0 / np.pi) * self.cosine * z
+        return mu * visible / np.maximum(self.cosine * masked + mu * view, 1e-30), half, [i_x, i_y, i_z]
 
 
 @dataclass(frozen=True)
 class HalfBoundary:
-    """The boundaries of polygons as stretched half vectors see them: edges from `start` in local frames."""
+    """The boundaries of polygons as stretched half vectors see them: conics, cut into A short arcs
 
-    halves: HalfVectors
-    start: np.ndarray  # (3, E, P)
-    step: np.ndarray  # (3, E, P) to the next corner
+        (1 - s)^2 first + 2 s (1 - s) middle + s^2 last,  0 <= s <= 1,  up to the length of vectors.
+
+    A great circle is such a conic, and so are the half vectors of its directions and their linear image."""
+
+    halves: HalfVectors  # (P,)
+    first: np.ndarray  # (3, A) unit
+    middle: np.ndarray  # (3, A)
+    last: np.ndarray  # (3, A) unit
+    owner: np.ndarray  # (A,) the polygon of each
+    encloses: np.ndarray  # (P,) is e_z, the mirrored view, inside?
 
     @classmethod
     def of(cls, halves: HalfVectors, polygon: np.ndarray) -> HalfBoundary:
         """Of polygons (3, V, P) above the horizon of local frames."""
-        if polygon.shape[1] < MANY_EDGES:
-            polygon = _with_middles(polygon, 0.5 * (polygon + np.roll(polygon, -1, axis=1)))
-            polygon = _with_middles(polygon, cls._bends(halves, polygon))
-        return cls(halves, polygon, np.roll(polygon, -1, axis=1) - polygon)
+        corner = project_to_sphere(polygon)
+        following = np.roll(corner, -1, axis=1)
+        both = corner + following
+        length = np.sqrt(dot(both, both))
+        near = halves.to_original_domain(corner, 1.0)
+        size = np.sqrt(dot(near, near))
+        near = near / size
+        middle = halves.to_original_domain(both / np.maximum(length, 1e-300), 0.5 * length)
+        middle = middle / np.sqrt(size * np.roll(size, -1, axis=0))
+        arcs = [vectors.reshape(3, -1) for vectors in (near, middle, np.roll(near, -1, axis=1))]
+        side = triple(np.stack([-halves.sine, np.zeros_like(halves.sine), halves.cosine])[:, None], corner, following)
+        encloses = (side >= 0.0).all(axis=0) | (side <= 0.0).all(axis=0)
+        owner = np.tile(np.arange(polygon.shape[2]), polygon.shape[1])
+        return cls(halves, *_short_arcs(arcs, owner), encloses)
 
-    @staticmethod
-    def _bends(halves, polygon) -> np.ndarray:
-        """Points (3, V, P) of the edges that are, in h', as far from both ends: exact of edges that are straight there,
-        then steps of Newton's."""
-        step = np.roll(polygon, -1, axis=1) - polygon
-        near = halves.to_original_domain(polygon)
-        length = np.sqrt(dot(near, near))
-        near = near / np.maximum(length, 1e-300)
-        across, total = np.roll(near, -1, axis=1) - near, length + np.roll(length, -1, axis=1)
-        share = length / np.maximum(total, 1e-300)
-        for _ in range(NEWTON_STEPS):
-            stretched, moved = halves.along_edge(polygon + share * step, step)
-            slope = dot(moved, across)
-            share = np.clip(share - dot(stretched, across) / np.where(slope > 0.0, slope, np.inf), 0.0, 1.0)
-        return polygon + share * step
+    def apex(self) -> np.ndarray:
+        """Unit vectors (3, P) from which all of the boundary is well to be seen: e_z where it is inside, else a mean of
+        the boundary that is near to e_z."""
+        halfway = project_to_sphere(self.first + 2.0 * self.middle + self.last)
+        chord = self.last - self.first
+        weight = np.sqrt(dot(chord, chord)) * np.maximum(halfway[2], 0.0) + 1e-30
+        count = len(self.encloses)
+        mean = np.stack([np.bincount(self.owner, weight * values, count) for values in halfway])
+        return np.where(self.encloses, np.array([0.0, 0.0, 1.0])[:, None], project_to_sphere(mean))
 
-    pieces = property(lambda self: self.start.shape[1])
-
-    def take(self, index) -> HalfBoundary:
-        """Those of the points `index` (Q,)."""
-        return HalfBoundary(self.halves.take(index), self.start[:, :, index], self.step[:, :, index])
-
-    def corners(self) -> np.ndarray:
-        """Unit vectors (3, E, P)."""
-        return project_to_sphere(self.halves.to_original_domain(self.start))
-
-    def nodes(self, order: int):
-        """As `reference.PolygonBoundary.nodes`."""
+    def nodes(self, order: int, arcs, apex, dtype):
+        """Unit vectors w (3, order, A) on the chosen `arcs` (A,), and apex . (w x dw) times the quadrature weight
+        (order, A), for apices (3, A), all in `dtype`."""
         nodes, weights = np.polynomial.legendre.leggauss(order)
-        fractions, weights = 0.5 * (nodes + 1.0)[:, None], 0.5 * weights[:, None]
-        near = self.halves.to_original_domain(self.start)
-        far = np.roll(near, -1, axis=1)
-        normal = np.cross(near, far, axis=0)
-        angle = np.arctan2(np.sqrt(dot(normal, normal)), dot(near, far))[:, None]
-        near, far = (np.sqrt(dot(ends, ends))[:, None] for ends in (near, far))
-        # Where an arc between both ends has gone these shares of its angle, were the edge straight in h'.
-        first, last = (
-            _share(part * angle, angle, part) / end for part, end in ((1.0 - fractions, near), (fractions, far))
-        )
-        total = first + last
-        speed = 1.0 / (_sinc(angle) * near * far * total * total)
-        step = self.step[:, :, None]
-        stretched, moved = self.halves.along_edge(self.start[:, :, None] + (last / total) * step, step)
-        squared = dot(stretched, stretched)
-        measure = np.cross(stretched, moved, axis=0) * (speed * weights / squared)
-        count = squared.shape[-1]
-        return (stretched / np.sqrt(squared)).reshape(3, -1, count), measure.reshape(3, -1, count)
+        far, weights = (0.5 * values[:, None].astype(dtype) for values in (nodes + 1.0, weights))
+        near = 1.0 - far
+        first, middle, last = (vectors[:, arcs] for vectors in (self.first, self.middle, self.last))
+        # Differences of vectors that are close are exact.
+        start = 2.0 * triple(apex - first, first, middle - first)
+        across = 2.0 * triple(apex - first, first, last - first)
+        end = 2.0 * triple(apex - last, middle - last, last)
+        first, middle, last = (vectors.astype(dtype, copy=False) for vectors in (first, middle, last))
+        start, across, end = (values.astype(dtype, copy=False) for values in (start, across, end))
+        place = near * near * first[:, None] + 2.0 * near * far * middle[:, None] + far * far * last[:, None]
+        squared = dot(place, place)
+        wedge = weights * (near * near * start + near * far * across + far * far * end) / squared
+        return place / np.sqrt(squared), wedge
 
 
-def _with_middles(polygon, middles):
-    """Polygons (3, 2 V, P) of the corners (3, V, P) and the points `middles` (3, V, P) between each and the next."""
-    return np.stack([polygon, middles], axis=2).reshape(3, -1, polygon.shape[2])
+def _short_arcs(arcs, owner):
+    """The `arcs`, first, middle and last (3, A), cut in two until none turns by more than LONGEST_ARC, and their
+    owners."""
+    finished = []
+    for _ in range(MOST_HALVINGS):
+        first, middle, last = arcs
+        toward = dot(middle, first + last)
+        is_long = toward < 2.0 * np.cos(0.5 * LONGEST_ARC) * np.sqrt(dot(middle, middle))
+        finished.append([*(vectors[:, ~is_long] for vectors in arcs), owner[~is_long]])
+        first, middle, last, owner = *(vectors[:, is_long] for vectors in arcs), owner[is_long]
+        if len(owner) == 0:
+            break
+        halfway = 0.25 * (first + 2.0 * middle + last)
+        size = np.sqrt(dot(halfway, halfway))
+        halfway, scale = halfway / size, 0.5 / np.sqrt(size)
+        parts = (first, halfway), (scale * (first + middle), scale * (middle + last)), (halfway, last)
+        arcs, owner = [np.concatenate(part, axis=1) for part in parts], np.concatenate([owner, owner])
+    else:
+        finished.append([*arcs, owner])
+    return [np.concatenate(part, axis=-1) for part in zip(*finished, strict=True)]
 
 
-def _sinc(angle):
-    return np.sinc(angle / np.pi)
-
-
-def _share(part, angle, fraction):
-    """sin(part) / sin(angle), of which part = fraction angle."""
-    return fraction * _sinc(part) / _sinc(angle)
+def triple(a, b, c):
+    """a . (b x c) of vectors (3, ...); broadcasts."""
+    x, y, z = b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]
+    return a[0] * x + a[1] * y + a[2] * z

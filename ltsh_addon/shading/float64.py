@@ -12,7 +12,14 @@ import numpy as np
 
 from ..scene import REFERENCE
 from . import diffuse, facing, light_cone
-from .brdf import clipped_metals, dielectric_reflectance, f82_reflectance, ggx_brdf_cosine, half_angle_cosine
+from .brdf import (
+    HalfVectors,
+    clipped_metals,
+    dielectric_reflectance,
+    f82_reflectance,
+    ggx_brdf_cosine,
+    half_angle_cosine,
+)
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
 from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
@@ -208,6 +215,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
     lobe, bent = None, np.zeros(len(samples), bool)
     is_anisotropic = samples.anisotropy[lit] != 0.0
     anisotropic = lit[is_anisotropic]
+    halves = HalfVectors.of(samples, frame, cosine) if table != REFERENCE and len(anisotropic) else None
     if table != REFERENCE and len(lit):
         bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
@@ -241,7 +249,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 parts = _joined(parts, len(samples))
             parts = _finished(parts, table, samples, light)
             if len(anisotropic):
-                others = anisotropic_integrals(samples, cosine, frame, light, corners, anisotropic)
+                others = anisotropic_integrals(samples, halves, frame, light, corners, anisotropic)
                 parts = chain(parts, others)
         for index, integrals in parts:
             plain, schlick, dip, dielectric = integrals[:4, :, None]

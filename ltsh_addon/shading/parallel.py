@@ -33,7 +33,7 @@ from .lobes import FLOAT64_CHUNK
 # A child takes some 0.2 s to start: shorter tasks are done in this process.
 SECONDS_WORTH_A_CHILD = 0.5
 # About as many isotropic samples take as long as an anisotropic one.
-ANISOTROPIC_EFFORT = 100
+ANISOTROPIC_EFFORT = 6
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
 CORES_VARIABLE = "LTSH_CORES"

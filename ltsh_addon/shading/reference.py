@@ -43,10 +43,9 @@ class Effort:
 
 
 EXACT = Effort(((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72)), 1e-4, 128)
-# For anisotropic lobes in techniques with a table: of up to VERY_STRETCHED times as large an alpha along one axis as
-# along the other to 2e-3 of the light at most; to that more orders are needed beyond.
-QUICK, QUICK_STRETCHED = Effort(((4, 4),), 1.0, 32), Effort(((5, 6), (8, 10), (14, 16), (24, 26)), 2e-3, 32)
-VERY_STRETCHED = 10.5
+# For anisotropic lobes in techniques with a table: orders for an arc, and for one that is within NEAR of the apex.
+QUICK, QUICK_NEAR = (3, 4), (2, 3)
+QUICK_CORNERS, NEAR = 32, 0.35
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,7 @@ class PolygonBoundary:
 
     @classmethod
     def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
-        """Of polygons (3, V, P) in the local frame; those of HalfVectors are HalfBoundary."""
-        if isinstance(warp, HalfVectors):
-            return HalfBoundary.of(warp, polygon)
+        """Of polygons (3, V, P) in the local frame."""
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
@@ -212,7 +209,6 @@ def lobe_integrals(
     effort: Effort = EXACT,
     cone: Cone | FacingEmission | None = None,
     metal=None,
-    halves: HalfVectors | None = None,
 ):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
@@ -221,11 +217,11 @@ def lobe_integrals(
     `ior` (P,). The order grows until two successive orders differ by less than the tolerance of the first row plus
     1e-6; the estimate is the last difference, infinite after one order. Lights must be convex. With a `cone` the
     integrand has its factor, too. With a `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance
-    falls below 0. Anisotropic lobes are those of `halves`, whatever `alpha` is; they take no exact ellipses.
+    falls below 0.
     """
-    warp = limit_warp(cos_theta_o, alpha) if halves is None else halves
+    warp = limit_warp(cos_theta_o, alpha)
     boundary = make_boundary(warp)
-    apex = (boundary if halves is None else PolygonBoundary(boundary.corners())).apex()
+    apex = boundary.apex()
     if cone is not None:
         apex = np.where(cone.at_foot, project_to_sphere(warp.to_original_domain(cone.axis)), apex)
     count = len(cos_theta_o)
@@ -246,6 +242,76 @@ def lobe_integrals(
         if len(open_points) == 0:
             break
     return np.maximum(result, 0.0), error
+
+
+def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal=None, quick=False):
+    """As `lobe_integrals`, of the anisotropic lobes of `halves` (P,) over polygons (3, V, P) above the horizon.
+
+    In a `quick` way: in single precision, with few points and without estimates.
+    """
+    boundary = HalfBoundary.of(halves, polygon)
+    apex = boundary.apex()
+    if cone is not None:
+        apex = np.where(cone.at_foot, project_to_sphere(halves.to_original_domain(cone.axis)), apex)
+    toward, count, owner = apex[:, boundary.owner], len(ior), boundary.owner
+    setting = (halves, ior, cone, metal)
+
+    def sums(order, arcs, dtype):
+        total = np.zeros((4 if metal is None else 7, count))
+        batch = max(_BATCH // (order[0] * order[1]), 1)
+        for start in range(0, len(arcs), batch):
+            chosen = arcs[start : start + batch]
+            own = owner[chosen]
+            rows = _arc_sums(
+                order, (boundary, chosen, toward[:, chosen]), [_taken(part, own, dtype) for part in setting]
+            )
+            for row, values in zip(total, rows, strict=True):
+                row += np.bincount(own, values, count)
+        return total
+
+    if quick:
+        away = boundary.first - toward, boundary.last - toward
+        is_near = np.maximum(dot(away[0], away[0]), dot(away[1], away[1])) < NEAR**2
+        kinds = (QUICK, np.nonzero(~is_near)[0]), (QUICK_NEAR, np.nonzero(is_near)[0])
+        return np.abs(sum(sums(order, arcs, np.float32) for order, arcs in kinds)), np.zeros(count)
+    result, error, is_open = 0.0, np.full(count, np.inf), np.ones(count, bool)
+    for order in EXACT.orders:
+        value = np.where(is_open, np.abs(sums(order, np.nonzero(is_open[owner])[0], np.float64)), result)
+        error = np.where(is_open & (order is not EXACT.orders[0]), np.abs(value - result).max(axis=0), error)
+        result, is_open = value, error > EXACT.tolerance * value[0] + 1e-6
+        if not is_open.any():
+            break
+    return result, error
+
+
+def _taken(part, index, dtype):
+    """Those of the points `index` of what is None, numbers (P, ...) or has `take`, in `dtype` but for cones."""
+    if isinstance(part, HalfVectors):
+        return part.take(index).astype(dtype)
+    if isinstance(part, list):
+        return [term[index].astype(dtype) for term in part]
+    return part if part is None else part[index].astype(dtype) if isinstance(part, np.ndarray) else part.take(index)
+
+
+def _arc_sums(order, fan, setting):
+    """The rows of `lobe_integrals` (4, A), or (7, A), with a sign, of triangles of arcs of a boundary and apices;
+    `fan` is (boundary, arcs, apices (3, A))."""
+    boundary, arcs, apex = fan
+    halves, ior, cone, metal = setting
+    dtype = ior.dtype
+    points, wedge = boundary.nodes(order[0], arcs, apex, dtype)
+    apex = apex.astype(dtype)[:, None]
+    away = points - apex
+    rho = np.maximum(2.0 * np.arcsin(np.minimum(0.5 * np.sqrt(dot(away, away)), 1.0)), dtype.type(1e-7))
+    fractions, weights = (values[:, None, None].astype(dtype) for values in _unit_interval(order[1]))
+    sine = np.sin(rho)
+    near, far = np.sin(rho * (1.0 - fractions)) / sine, np.sin(rho * fractions) / sine  # (m, B, A)
+    stretched = [near * apex[axis] + far * points[axis] for axis in range(3)]
+    values, half, direction = halves.lobe(stretched)
+    values *= (wedge * rho / sine) * (weights * far)
+    if cone is not None:
+        values = values * cone.factor(np.stack(direction))
+    return _sums(values, half, ior, metal)
 
 
 def limit_warp(cosine, alpha) -> Lobe:
@@ -274,13 +340,15 @@ def _fixed_order(order, boundary, apex, setting, cone, metal):
     near, far = np.sin(rho * (1.0 - fractions)) / sine, inner_sine / sine  # (B, m, P)
     weight = wedge[:, None] * weights[:, None] * rho / sine * far
     warped = [near * apex[axis] + far * points[axis][:, None] for axis in range(3)]
-    if isinstance(warp, HalfVectors):
-        values, half, direction = warp.lobe(warped)
-    else:
-        values, half, direction = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
+    values, half, direction = _unwarped_lobe(warped, warp, cos_theta_o, alpha)
     values *= weight
     if cone is not None:
         values *= cone.factor(np.moveaxis(direction, -1, 0))
+    return _sums(values, half, ior, metal)
+
+
+def _sums(values, half, ior, metal):
+    """The rows of `lobe_integrals` of values (B, m, P) that are weighted."""
     schlick = values * brdf.schlick_curve(half)
     dip = (schlick * (half * (1.0 - half))).sum(axis=(0, 1))
     schlick = schlick.sum(axis=(0, 1))
@@ -327,34 +395,30 @@ def reference_integrals(samples, cosine, frame, light, corners, candidates, erro
     Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
     """
     is_anisotropic = samples.anisotropy[candidates] != 0.0
-    if is_anisotropic.any():
-        plain = candidates[~is_anisotropic]
-        if len(plain):
-            yield from _integrals(samples, (cosine, None, EXACT), frame, light, corners, plain, error)
-        lobes = cosine, HalfVectors.of(samples, frame, cosine), EXACT
-        yield from _integrals(samples, lobes, frame, light, corners, candidates[is_anisotropic], error)
-    else:
-        yield from _integrals(samples, (cosine, None, EXACT), frame, light, corners, candidates, error)
-
-
-def anisotropic_integrals(samples, cosine, frame, light, corners, candidates):
-    """As `reference_integrals` of anisotropic lobes, with less effort and without estimates."""
-    halves, across = HalfVectors.of(samples, frame, cosine), np.square(1.0 - samples.anisotropy[candidates])
-    is_long = np.maximum(across, 1.0 / across) > VERY_STRETCHED
-    for effort, chosen in ((QUICK, candidates[~is_long]), (QUICK_STRETCHED, candidates[is_long])):
+    for halves, chosen in ((False, candidates[~is_anisotropic]), (True, candidates[is_anisotropic])):
         if len(chosen):
-            ignored = np.zeros(len(samples))
-            yield from _integrals(samples, (cosine, halves, effort), frame, light, corners, chosen, ignored)
+            halves = HalfVectors.of(samples, frame, cosine) if halves else None
+            for index, integrals, estimate in _integrals(
+                samples, (cosine, halves, False), frame, light, corners, chosen
+            ):
+                error[index] += estimate
+                yield index, integrals
 
 
-def _integrals(samples, lobes, frame, light, corners, candidates, error):
-    """As `reference_integrals` for `lobes`: cosines (P,) of theta_o, the HalfVectors of anisotropic ones, and the
-    Effort."""
-    cosine, halves, effort = lobes
+def anisotropic_integrals(samples, halves, frame, light, corners, candidates):
+    """As `reference_integrals` of anisotropic lobes, the HalfVectors of all samples, in the quick way."""
+    for index, integrals, _ in _integrals(samples, (halves.cosine, halves, True), frame, light, corners, candidates):
+        yield index, integrals
+
+
+def _integrals(samples, lobes, frame, light, corners, candidates):
+    """Yield (index, integrals, error estimates (Q,)) for `lobes`: cosines (P,) of theta_o, the HalfVectors of
+    anisotropic ones, and whether they are done in the quick way."""
+    cosine, halves, quick = lobes
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
     clipped = brdf.clipped_metals(samples)
     if light.is_round:
-        corners = light.polygon(effort.round_corners)
+        corners = light.polygon(QUICK_CORNERS if quick else EXACT.round_corners)
     if light.is_focused:
         batches = _cone_parts(samples, cosine, frame, light, corners, candidates)
     elif light.is_round and halves is None:
@@ -363,19 +427,26 @@ def _integrals(samples, lobes, frame, light, corners, candidates, error):
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
         batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
     profile = light_cone.Profile.of(light) if light.has_falloff else None
-    for index, make_boundary, cone in batches:
+    for index, outline, cone in batches:
         if light.is_facing and not light.is_even:
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
         elif cone is None and light.has_falloff:
             cone = _whole_cone(samples, frame, light, index, profile)
-        alpha = samples.roughness[index] ** 2
-        setting, own = (cosine[index], alpha, samples.ior[index]), None if halves is None else halves.take(index)
-        metal = [term[index] * clipped[index, None] for term in terms] if clipped[index].any() else None
-        integrals, estimate = lobe_integrals(make_boundary, *setting, effort=effort, cone=cone, metal=metal, halves=own)
+        ior, metal = samples.ior[index], None
+        if clipped[index].any():
+            metal = [term[index] * clipped[index, None] for term in terms]
+        if halves is not None:
+            own = halves.take(index)
+            integrals, estimate = half_vector_integrals(own, outline, ior, cone=cone, metal=metal, quick=quick)
+        else:
+            make_boundary = (
+                partial(PolygonBoundary.warped, polygon=outline) if isinstance(outline, np.ndarray) else outline
+            )
+            setting = (cosine[index], samples.roughness[index] ** 2, ior)
+            integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal)
         if light.is_facing:
             integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
-        error[index] += estimate
-        yield index, integrals
+        yield index, integrals, estimate
 
 
 def _whole_cone(samples, frame, light, index, profile) -> Cone:
@@ -386,13 +457,14 @@ def _whole_cone(samples, frame, light, index, profile) -> Cone:
 
 
 def _polygons(samples, frame, light, corners, candidates):
-    """Yield (index, make_boundary, None) of polygons."""
+    """Yield (index, polygons (3, V, Q) in local frames, None)."""
     for index, polygon in visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
-        yield index, partial(PolygonBoundary.warped, polygon=polygon[:3]), None
+        yield index, polygon[:3], None
 
 
 def _ellipses(samples, frame, light, corners, candidates):
-    """As `_polygons`; exact ellipses where the geometric horizon does not cut them."""
+    """As `_polygons`; where the geometric horizon does not cut them exact ellipses, as functions of a warp that make
+    their boundaries."""
     cut, whole, local = _uncut_ellipses(samples, frame, light, candidates)
     if len(whole):
         yield whole, lambda warp: EllipseBoundary.warped(warp, *local), None
@@ -443,7 +515,7 @@ def _cone_parts(samples, cosine, frame, light, corners, candidates):
         axis = view.foot[3:] / view.distance
         for chosen, boundary, at_foot in _around_foot_and_peak(part, reach, flat, view):
             cone = Cone(axis[:, chosen], view.distance[chosen], profile, at_foot)
-            yield index[chosen], partial(PolygonBoundary.warped, polygon=boundary), cone
+            yield index[chosen], boundary, cone
 
 
 def _around_foot_and_peak(part, reach, flat, view):

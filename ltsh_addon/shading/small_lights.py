@@ -229,7 +229,7 @@ class LobeAtPoint:
         cosine = np.maximum(z, np.float32(0.0)) * angle
         cosine *= np.float32(1.0 / np.pi)
         if self.is_cosine:
-            return self.terms[:, 0, part] * cosine
+            return np.stack([terms[part] * cosine for terms in self.terms[:, 0]])
         x *= inverse
         leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
         values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in self.terms])

@@ -66,6 +66,15 @@ def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(lowest_
 
 
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_every_technique_takes_many_lights(name):
+    """With all Fresnel terms, of which each has its own integral."""
+    samples, lights = floor_samples(100, 0.3), many_lights(100)
+    found = shading.shade(samples, lights, name, passes=["specular"], workers=1).specular
+    expected = shading.shade(samples, lights, name, passes=["specular"], workers=1, dtype=np.float64).specular
+    assert relative_error(found, expected) < 0.02
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_a_ball_of_many_faces_shines_as_the_ball(name):
     """Unit radiance; half of the faces look away. Diffuse: cos r^2 / d^2 of the whole ball above the horizon."""
     ball, samples = _ball_of_faces(24), floor_samples(200, 0.3)

@@ -24,7 +24,7 @@ COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
 # Positions that are rounded to more than this share of the distance from the nearest light, if there are more than that
 # share of them, are worth a warning.
 ROUNDED, ROUNDED_SHARE = 2e-3, 0.02
-FEW_SAMPLES = 1000  # are asked
+FEW_SAMPLES, MOST_PAIRS = 1000, 2_000_000  # are asked, the latter of samples and lights
 RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
 
 
@@ -220,16 +220,24 @@ def coarse_meshes(samples: SurfaceSamples) -> list[str]:
 
 def rounded_positions(position: np.ndarray, lights) -> list[str]:
     """The warning about positions (P, 3) so far from the origin that single precision tells them badly apart."""
-    some = position[:: max(1, len(position) // FEW_SAMPLES)]
     lights = [light for light in lights if not light.is_distant]
+    some = position[:: max(1, len(position) // FEW_SAMPLES, len(position) * len(lights) // MOST_PAIRS)]
     if len(some) == 0 or not lights:
         return []
     apart = np.spacing(np.abs(some).max(axis=1).astype(np.float32)).astype(np.float64)
-    nearest = np.full(len(some), np.inf)
-    for light in lights:
-        distance = np.linalg.norm(some - light.center, axis=1) - light.radius
-        height = distance if light.is_facing else np.abs((some - light.center) @ light.direction)
-        nearest = np.minimum(nearest, np.maximum(distance, height))
+    nearest = np.empty(len(some))
+    center, half_u, half_v, direction = (
+        np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
+    )
+    facing = np.array([light.is_facing for light in lights])
+    reach = np.hypot(np.linalg.norm(half_u, axis=1), np.where(facing, 0.0, np.linalg.norm(half_v, axis=1)))
+    for row, point in enumerate(some):
+        offset = point - center
+        distance = np.linalg.norm(offset, axis=1) - reach
+        height = np.where(facing, distance, np.abs((offset * direction).sum(axis=1)))
+        # A surface that shines does not light itself.
+        is_own = (distance < 0.0) & (height < 2.0 * apart[row]) & ~facing
+        nearest[row] = np.where(is_own, np.inf, np.maximum(distance, height)).min()
     share = apart / np.maximum(nearest, 1e-30)
     if np.mean(share > ROUNDED) <= ROUNDED_SHARE:
         return []

@@ -181,6 +181,10 @@ def test_positions_that_stay_far_are_named_with_their_effect():
     # 6 m beside a square of 8 m, in its plane: no closer by its radius than 4.3 m, which is enough.
     square = replace(light, shape="RECTANGLE", half_u=(4.0, 0.0, 0.0), half_v=(0.0, 4.0, 0.0))
     assert gbuffer.rounded_positions(position + [10.0, 0.0, -1.0], [square]) == []
+    # A surface that shines does not light itself.
+    square = replace(square, direction=(0.0, 0.0, -1.0))
+    position = square.center + np.linspace(-1.0, 1.0, 100)[:, None] * square.half_u
+    assert gbuffer.rounded_positions(position, [square]) == []
 
 
 def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
 from ..shading import brdf, polygon
+from ..shading.light_tree import stand_ins
 from .light_tree import light_chances, light_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
@@ -68,6 +69,8 @@ SMALLEST_ANGLE = 1e-4
 # Of what lies between the horizons. A sample is split where more than this comes from below either.
 SMALLEST_SHARE = 5e-3
 BLOCK = 2048
+# Of more flat lights so many rectangles are looked at that stand for them: no finer than the directions are.
+MOST_LIGHTS = 512
 # Pairs of samples and lights that are looked at at once, roughly and closely.
 MOST_PAIRS, PAIRS = 2**21, 2**14
 
@@ -142,7 +145,8 @@ def horizon_excess(
     `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, left out: `light_tree.light_chances`.
     Where both horizons make no difference the first is 1 and the second 0.
     """
-    shapes = [_Shapes.of(lights, numbers) for numbers in _alike(lights)]
+    lights, shares = _few(lights)
+    shapes = [_Shapes.of(lights, numbers, shares[numbers]) for numbers in _alike(lights)]
     if choose is None:
         choose = partial(light_chances, lights=lights, rows=light_rows(lights))
     step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
@@ -185,6 +189,24 @@ def _excess(samples, shapes, chances, choose):
     return by_lobe, by_light
 
 
+def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
+    """Lights (L), of which stand for many flat ones at most MOST_LIGHTS, and which share of each (L,) shines."""
+    others, kinds = [], {}
+    for light in lights:
+        if light.is_facing or light.is_distant:
+            others.append(light)
+        elif light.area_vector.any():
+            kinds.setdefault(light.spread, []).append(light)
+    shares = [np.ones(len(others))]
+    for own in kinds.values():
+        share = np.ones(len(own))
+        if len(own) > MOST_LIGHTS:
+            own, share = stand_ins(own, MOST_LIGHTS)
+        others += own
+        shares.append(share)
+    return tuple(others), np.concatenate(shares)
+
+
 def _alike(lights) -> list[np.ndarray]:
     """The numbers of the lights that have as many corners, and are near or distant, face points or not."""
     kinds = {}
@@ -205,10 +227,11 @@ class _Shapes:
     corners: np.ndarray  # (L, V, 3)
     radius: np.ndarray  # (L,) of a ball that they are in
     axes: np.ndarray  # (L, 3, 3) two in the plane, and back from where they shine
+    share: np.ndarray  # (L,) of them that shines
 
     @classmethod
-    def of(cls, lights, number) -> _Shapes:
-        """Those of the numbers, which are alike."""
+    def of(cls, lights, number, share) -> _Shapes:
+        """Those of the numbers, which are alike, and of which a `share` (L,) shines."""
         own = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
@@ -216,7 +239,7 @@ class _Shapes:
             radius = np.array([light.radius for light in own])
         axes = np.array([[*_plane_axes(light), -light.direction] for light in own])
         brightness = np.array([np.abs(light.radiance).sum() for light in own])
-        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, radius, axes)
+        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, radius, axes, share)
 
     @property
     def is_facing(self) -> bool:
@@ -263,7 +286,7 @@ class _Shapes:
             is_hit = self._meets(own, offset, pair, towards)
             pair, ray = pair[is_hit], ray[is_hit]
             met, of_met = np.unique(pair, return_inverse=True)
-            angle = self._solid_angle(own[met], offset[met])[of_met]
+            angle = (self.share[own[met]] * self._solid_angle(own[met], offset[met]))[of_met]
             found.append((self.number[own[pair]], point[pair], ray, self.brightness[own[pair]], angle))
         return tuple(np.concatenate(values) for values in zip(*found, strict=True))
 

@@ -12,10 +12,11 @@ all lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..scene import AreaLight
 from . import small_lights
 from .polygon import dot
 from .tails import NEAR_RADII
@@ -115,9 +116,45 @@ class _Sums:
         return found
 
 
-def ranges(center, normal):
+def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
+    """Rectangles that stand for many flat AreaLights with an area, neighbors that face alike together, and which share
+    of each (N,) shines: `most`, a power of two and at most as many as there are lights."""
+    center, area, covariance, _ = small_lights.all_of(lights)
+    size = np.linalg.norm(area, axis=1)
+    normal = area / size[:, None]
+    order, start, end, _ = ranges(center, normal, most)
+    sums = _Sums(order, start[-most:], end[-most:])
+    whole = sums(size)
+    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
+    origin = center.mean(axis=0)
+    offset = center - origin
+    middle = sums(size[:, None] * offset) / whole[:, None]
+    spread = covariance + offset[:, :, None] * offset[:, None, :]
+    spread = sums(size[:, None, None] * spread) / whole[:, None, None] - middle[:, :, None] * middle[:, None, :]
+    axis = sums(size[:, None] * normal)
+    length = np.linalg.norm(axis, axis=1, keepdims=True)
+    axis = np.where(length > 1e-9 * whole[:, None], axis / np.maximum(length, 1e-300), normal[order[sums.start]])
+    along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    variances, axes = np.linalg.eigh(along @ spread @ along)
+    # Uniform rectangles with these variances, none of them smaller than what shines of it.
+    half_v, half_u = (np.sqrt(3.0 * np.maximum(variances[:, k], 0.0)) for k in (1, 2))
+    half_u = np.maximum(half_u, 1e-6 * np.sqrt(whole))
+    half_v = np.maximum(half_v, 0.25 * whole / half_u)
+    rows = zip(middle + origin, half_u[:, None] * axes[:, :, 2], half_v[:, None] * axes[:, :, 1], axis, strict=True)
+    share = whole / (4.0 * half_u * half_v)
+    radiance *= share[:, None]
+    like = replace(lights[0], shape="RECTANGLE", corners=None)
+    names = ("center", "half_u", "half_v", "direction")
+    found = [
+        like.altered(**dict(zip(names, row, strict=True)), radiance=own)
+        for row, own in zip(rows, radiance, strict=True)
+    ]
+    return found, share
+
+
+def ranges(center, normal, most=np.inf):
     """Lights in an order (L,) in which those of every node are start to end (N,), and the children (N, 2) of nodes:
-    halves along where the lights differ most, level by level."""
+    halves along where the lights differ most, level by level, down to one that has `most`."""
     count = len(center)
     order = np.arange(count)
     starts, ends, children = [np.array([0])], [np.array([count])], []
@@ -128,7 +165,7 @@ def ranges(center, normal):
         own = np.full((len(start), 2), -1)
         own[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
         children.append(own)
-        if len(inner) == 0:
+        if len(inner) == 0 or len(start) >= most:
             return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
         start, end = start[inner], end[inner]
         first += 2 * len(inner)

@@ -133,7 +133,7 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
         lights = tuple(replace(light, is_distant=True) for light in lights)
     if kind in ("ball", "disk"):
         lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
-    shape = horizons._Shapes.of(lights, np.arange(len(lights)))
+    shape = horizons._Shapes.of(lights, np.arange(200), np.ones(200))
     directions = horizons._Directions.of(samples)
     number, sample, ray, *_ = shape.hits(*shape.crossings(samples), samples.position, directions)
     found = set(zip(number.tolist(), sample.tolist(), ray.tolist(), strict=True))
@@ -154,6 +154,25 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
             meets = (u < 1.0) & (v < 1.0) & (steepness < 0.0) & (offset @ light.direction < 0.0)
         expected |= {(index, *pair) for pair in zip(*(part.tolist() for part in np.nonzero(meets)), strict=True)}
     assert found == expected and len(found) > 300
+
+
+def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
+    """They leave as much to the smooth horizon, but for 5 % of the light between the horizons, which is little."""
+    generator = np.random.default_rng(3)
+    samples, lights = samples_around(generator, 100), lights_around(generator, 1500)
+    chances = horizons.lobe_chances(samples, np.arange(100), False)
+    found, sizes = [], []
+    excess = horizons._excess
+    monkeypatch.setattr(
+        horizons, "_excess", lambda *args: sizes.append(sum(len(s.number) for s in args[1])) or excess(*args)
+    )
+    for most in (512, len(lights)):
+        monkeypatch.setattr(horizons, "MOST_LIGHTS", most)
+        found.append(np.array(horizons.horizon_excess(samples, lights, chances)))
+    assert sizes[0] == 512 and sizes[-1] == 1500
+    weight = found[1].sum(axis=0)
+    few, all_of_them = (horizons.smooth_share(*own) for own in found)
+    assert (weight * np.abs(few - all_of_them)).sum() < 0.05 * weight.sum() and np.ptp(all_of_them) > 0.9
 
 
 def test_bounds_of_thousands_of_lights_are_those_of_a_few():

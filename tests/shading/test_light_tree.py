@@ -134,6 +134,28 @@ def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):  # 
     assert np.array_equal(one.specular, two.specular) and np.array_equal(one.diffuse, two.diffuse)
 
 
+def test_stand_ins_have_the_light_and_the_place_of_their_lights():
+    lights = many_lights(300)
+    found, share = light_tree.stand_ins(lights, 16)
+    assert len(found) == 16 and (0.0 < share).all() and (share < 1.0).all()
+    for own in (lights, found):
+        assert all(light.direction @ light.area_vector != 0.0 for light in own)
+    light, center = (
+        [sum(np.linalg.norm(one.area_vector) * value(one) for one in own) for own in (lights, found)]
+        for value in (lambda one: one.radiance, lambda one: one.radiance.sum() * one.center)
+    )
+    assert np.allclose(*light) and np.allclose(*center, atol=0.02 * light[0].sum() * 10.0)
+    # One flat square in 16 x 16 parts stands for itself.
+    step = (np.arange(16) + 0.5) / 8.0 - 1.0
+    parts = [
+        area_light("Part", "RECTANGLE", (x, y, 3.0), (1 / 16, 0, 0), (0, -1 / 16, 0), direction=(0, 0, -1))
+        for x in step for y in step
+    ]  # fmt: skip
+    (whole,), share = light_tree.stand_ins(parts, 1)
+    assert np.allclose(np.linalg.norm([whole.half_u, whole.half_v], axis=1), 1.0) and np.allclose(share, 1.0)
+    assert np.allclose(whole.radiance, parts[0].radiance) and np.allclose(whole.center, (0, 0, 3))
+
+
 def test_nodes_have_the_power_and_the_moments_of_their_lights():
     lights = many_lights(37)
     tree = LightTree.of(lights)

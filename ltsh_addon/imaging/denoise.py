@@ -7,7 +7,7 @@ with the help of the albedo and the normal that are seen, which are denoised bef
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -70,9 +70,12 @@ class Denoiser:
     def denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """The radiance `color` (H, W, 3) without its noise, float32; never negative. `albedo` and `normal` (H, W, 3)
         may be noisy too. Values that are not finite count as 0."""
-        albedo = self._filtered({"albedo": albedo})
-        normal = self._filtered({"normal": normal})
-        return self._filtered({"color": color, "albedo": albedo, "normal": normal}, hdr=True, cleanAux=True)
+        return self.all_denoised([color], albedo, normal)[0]
+
+    def all_denoised(self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
+        """As `denoised`, of several pictures of the same surfaces."""
+        guides = {"albedo": self._filtered({"albedo": albedo}), "normal": self._filtered({"normal": normal})}
+        return [self._filtered({"color": color, **guides}, hdr=True, cleanAux=True) for color in colors]
 
     def _filtered(self, images: dict[str, np.ndarray], **settings: bool) -> np.ndarray:
         """The first of the `images`, filtered with the help of the others."""

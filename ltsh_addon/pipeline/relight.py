@@ -24,7 +24,8 @@ from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
-SAME_REST = "bounced light, and all else that Cycles has rendered, is as the lights were; there is no PNG"
+SAME_REST = "bounced light{}, and all else that Cycles has rendered, is as the lights were; there is no PNG"
+BUT_GROUPS = ", but for that of light groups {}"
 KEPT_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
     "render the picture again for the last digits there"
@@ -86,11 +87,14 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
         warnings += (KEPT_WEIGHTS.format(split, len(kept.extraction.samples)),)
     extraction = replace(kept.extraction, lights=lights, warnings=warnings)
     results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
+    comparison = picture.Comparison(options, extraction, results, kept.shadows)
     if kept.rest:
-        extraction = replace(extraction, warnings=(*extraction.warnings, SAME_REST))
-        comparison = _Finished(options, extraction, results, kept.shadows, kept)
-    else:
-        comparison = picture.Comparison(options, extraction, results, kept.shadows)
+        groups = [repr(group) for group in kept.rest if group]
+        warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
+        name = technique_of(kept)
+        rest = _changed_rest(kept, lights, tables[name], results[name].shading, progress)
+        extraction = replace(extraction, warnings=warnings)
+        comparison = _Finished(options, extraction, results, kept.shadows, kept, rest)
     changed = [{"light": change.name, **{key: value for key, value in asdict(change).items() if key != "name"}}
                for change in changes]  # fmt: skip
     report = {**comparison.report(), "relit": changed}
@@ -99,21 +103,51 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
 
 @dataclass(frozen=True)
 class _Finished(picture.Comparison):
-    """A finished picture, with what is not ours as it was."""
+    """A finished picture, of which the `rest` (H, W, 4) is not ours."""
 
     kept: KeptPicture | None = None
+    rest: np.ndarray | None = None
 
     def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
-        found, rest = {}, self.kept.rest[""]
+        found = {}
         for name, pixels in super().layers().items():
             technique, _, part = name.partition(".")
             pass_name = part.partition("@")[0]
             if technique in self.results and pass_name in self.options.passes:
                 found[name] = pixels * self.kept.taken[pass_name][..., None]
-        combined = rest.copy()
-        for name in self.options.passes:
-            combined[..., :3] += found[f"{technique_of(self.kept)}.{name}"]
-        return {"combined": combined, **found, "rest": rest}
+        combined = self.rest.copy()
+        for pass_name in self.options.passes:
+            combined[..., :3] += found[f"{technique_of(self.kept)}.{pass_name}"]
+        return {"combined": combined, **found, "rest": self.rest}
+
+
+def _changed_rest(kept: KeptPicture, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
+    """What is not ours (H, W, 4) with changed lights: what a light group bounces follows its direct light, which is
+    `shaded` with them by `table`."""
+    rest, before = kept.rest[""].copy(), None
+    for group, bounced in kept.rest.items():
+        pairs = [pair for pair in zip(kept.extraction.lights, lights, strict=True) if pair[0].group == group]
+        if group == "" or not pairs:
+            rest[..., :3] += 0.0 if group == "" else bounced[..., :3]
+            continue
+        factors = np.array([tint(old.radiance, new.radiance) for old, new in pairs])
+        factor = factors.mean(axis=0)
+        if np.ptp(factors, axis=0).any():
+            if before is None:
+                report = None if progress is None else (lambda fraction: progress("lights", fraction))
+                own = kept.extraction.samples, kept.extraction.lights, table, kept.options["passes"]
+                (before,) = shade_lights(*own, (kept.shadows,), progress=report)
+            now, then = (_light_of_group(kept, one, group) for one in (shaded, before))
+            factor = np.divide(now, then, out=factor, where=then > 0.0)
+        rest[..., :3] += factor * bounced[..., :3]
+    return rest
+
+
+def _light_of_group(kept: KeptPicture, shaded, group: str) -> np.ndarray:
+    """The light (3,) of a light group in the whole picture."""
+    number, film = shaded.groups.index(group), kept.extraction.film
+    images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
+    return sum((kept.taken[name][..., None] * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
 def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
@@ -206,8 +240,12 @@ MOST_PAIRS = 1 << 23
 LINES = 16
 SHARED = "they share their shadow rays, so they change together"
 WEAKEST = "the weakest lights of the picture, which change together"
-NOT_OF_LIGHTS = "the background, what glows, and in finished pictures bounced light: they do not follow the lights"
+NOT_OF_LIGHTS = (
+    "the background, what glows, and in finished pictures what lights in no light group bounce: they do not follow the "
+    "lights"
+)
 SHARED_OUT = "bounced light of light group {!r} is shared out among {} by their direct light"
+NOT_SHADED = "Cycles' light of a light group none of whose lights is shaded here"
 
 
 @dataclass(frozen=True)
@@ -220,6 +258,8 @@ class Row:
     settings: dict[str, list[float]] = field(default_factory=dict)  # of those that are lights in Blender
     light: dict | None = None  # record of the only one, where it is plain
     note: str = ""
+    group: str = ""  # whose bounced light it has this share of
+    share: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -244,7 +284,7 @@ class LightPictures:
             with Path(path).open("rb") as file, np.load(file) as data:
                 facts, layers, alpha = json.loads(str(data["document"])), data["layers"], data["alpha"]
             rows = tuple(
-                Row(**{**row, "lights": tuple(row["lights"]), "color": tuple(row["color"])})
+                Row(**{**row, **{name: tuple(row[name]) for name in ("lights", "color", "share")}})
                 for row in facts.pop("rows")
             )
             if layers.ndim != 4 or layers.shape != (len(rows), *alpha.shape, 3):
@@ -271,8 +311,18 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
             return None if progress is None else progress("lights", share[0] + fraction * share[1])
 
         layers[first : first + most] = _layers(kept, table, part, report)
-    rows = [_row(extraction, own) for own in members]
-    notes = _share_out_bounces(kept, rows, members, layers)
+    rows = _with_bounces(kept, [_row(extraction, own) for own in members], members, layers)
+    for row, layer in zip(rows, layers, strict=True):
+        layer += bounced_light(kept, row)
+    for group, values in kept.rest.items():
+        if group and values.any() and all(row.group != group for row in rows):
+            rows.append(Row(f"Light group {group}", (), note=NOT_SHADED))
+            layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
+    notes = [
+        SHARED_OUT.format(group, listed(repr(row.name) for row in own))
+        for group in kept.rest
+        if group and len(own := [row for row in rows if row.group == group]) > 1
+    ]
     rest = kept.rest.get("")
     if rest is not None:
         rows.append(Row(REST, (), note=NOT_OF_LIGHTS))
@@ -343,22 +393,22 @@ def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.nd
     return layers
 
 
-def _share_out_bounces(kept: KeptPicture, rows, members, layers) -> list[str]:
-    """Add the bounced light of each light group to the `layers` of its lights; what is only about right."""
-    notes = []
-    for group, bounced in kept.rest.items():
-        if group == "":
-            continue
-        own = [row for row, numbers in enumerate(members) if kept.extraction.lights[numbers[0]].group == group]
+def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[Row]:
+    """The rows with their shares of what their light groups bounce, by their `layers` of direct light."""
+    found = list(rows)
+    for group in filter(None, kept.rest):
+        own = [row for row, (first, *_) in enumerate(members) if kept.extraction.lights[first].group == group]
         weights = layers[own].sum(axis=(1, 2), dtype=np.float64)
-        shares = (
-            weights / np.maximum(weights.sum(axis=0), 1e-30) if weights.any() else np.full_like(weights, 1 / len(own))
-        )
-        for row, share in zip(own, shares, strict=True):
-            layers[row] += (share * bounced[..., :3]).astype(np.float32)
-        if len(own) > 1:
-            notes.append(SHARED_OUT.format(group, listed(repr(rows[row].name) for row in own)))
-    return notes
+        whole = weights.sum(axis=0)
+        for row, weight in zip(own, weights, strict=True):
+            share = np.divide(weight, whole, out=np.full(3, 1.0 / len(own)), where=whole > 0.0)
+            found[row] = replace(rows[row], group=group, share=tuple(share.tolist()))
+    return found
+
+
+def bounced_light(kept: KeptPicture, row: Row) -> np.ndarray:
+    """The part (H, W, 3) of the picture of a row that is bounced light; 0.0 where it has none."""
+    return (np.array(row.share) * kept.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
 
 
 class Mixer:
@@ -438,8 +488,8 @@ class MovedLights:
             occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
         return cls(kept, occluders)
 
-    def picture(self, light: AreaLight) -> np.ndarray:
-        """The picture (H, W, 3) of one light. Raises SceneError."""
+    def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
+        """The picture (H, W, 3) of one light, with what the `row` of it bounced before. Raises SceneError."""
         if self._company is None:
             self._start()
         kept, film, task = self._kept, self._kept.extraction.film, None
@@ -452,7 +502,8 @@ class MovedLights:
             for name, values in found.items():
                 taken = kept.taken.get(name)
                 radiance[block] += values if taken is None else taken.ravel()[film.pixel[block], None] * values
-        return film.image(kept.extraction.exposure * radiance).astype(np.float32)
+        image = film.image(kept.extraction.exposure * radiance).astype(np.float32)
+        return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:
         """End the processes; the next light starts others."""

@@ -2,6 +2,9 @@
 
     combined = ours + rest,  rest = denoised(Combined of Cycles - its direct light where ours takes its place)
 
+The same is done with the Combined pass of each light group of the view layer, of which Cycles writes no direct light:
+that of all lights is shared out as ours is. So what a light group bounces can change with its lights.
+
 Ours, a specular and a diffuse picture, takes the place of Cycles' direct light pixel by pixel. Where something is not
 shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
 """
@@ -30,6 +33,8 @@ from .options import SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 # Names of the passes of Cycles in `pass_names`: light and color of each pass of ours.
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
+# A pass of Cycles, followed by the name of a light group.
+OF_GROUP = "Combined_"
 COMBINED, REST = "combined", "rest"
 SHOWN = "shown.png"
 # Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
@@ -47,6 +52,7 @@ class Finished:
 
     combined: np.ndarray  # (H, W, 4)
     rest: np.ndarray  # (H, W, 4), what is not ours
+    rests: dict[str, np.ndarray]  # the same (H, W, 3) of each light group of the view layer, by "" (H, W, 4) without
     ours: dict[str, np.ndarray]  # (H, W, 3) by layer: ltsh4.specular, ltsh4.specular@Key, ...
     channels: dict[str, np.ndarray]  # (H, W) of Cycles, with ours in place of its direct light
     report: dict
@@ -88,7 +94,7 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> p
     if options.keep_visibility:
         path, parts = path.with_name(f"{path.stem}{lighting.KEPT_SUFFIX}"), made.comparison
         kept = parts.extraction, parts.shadows, parts.options, path
-        written = lighting.keep_picture(*kept, rest={"": made.rest}, taken=made.taken)
+        written = lighting.keep_picture(*kept, rest=made.rests, taken=made.taken)
         files += [one.relative_to(options.output).as_posix() for one in written]
     return picture.TaskResult(made.report, made.seconds, tuple(files))
 
@@ -120,7 +126,7 @@ def finish(
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles)
-        rest, denoiser, problems = _rest(cycles, ours, options, progress)
+        rest, rests, denoiser, problems = _rest(cycles, ours, options, progress)
         combined = rest.copy()
         for part in ours.values():
             combined[..., :3] += part.image
@@ -140,9 +146,9 @@ def finish(
         }
         if comparison.shadows is not None:
             seconds["shadows"] = comparison.shadows.seconds
-    layers, channels = _layers(comparison, ours), _replaced(cycles, ours)
+    layers, channels = _layers(comparison, ours), _replaced(cycles, ours, rests)
     taken = {name: part.is_taken.astype(np.float32) for name, part in ours.items()}
-    return Finished(combined, rest, layers, channels, report, seconds, taken, comparison, cycles)
+    return Finished(combined, rest, rests, layers, channels, report, seconds, taken, comparison, cycles)
 
 
 class _ProcessorClock:
@@ -208,9 +214,15 @@ class _Part:
     """One pass of ours, and where it takes the place of Cycles' direct light, which is `light` times `color`."""
 
     image: np.ndarray  # (H, W, 3), black elsewhere
+    groups: dict[str, np.ndarray]  # the same by light group
     is_taken: np.ndarray  # (H, W) bool
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
+
+    @property
+    def replaced(self) -> np.ndarray:
+        """What of Cycles (H, W, 3) it takes the place of."""
+        return np.where(self.is_taken[..., None], self.light.astype(np.float64) * self.color, 0.0)
 
 
 def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
@@ -220,52 +232,87 @@ def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
     keeps_all = bool(cycles.everything or kept.everything)
     result = next(iter(comparison.results.values()), None)
     for name, (light, color) in DIRECT.items():
-        image = np.zeros((*shape, 3))
+        image, groups = np.zeros((*shape, 3)), {}
         is_taken = np.zeros(shape, bool)
         if result is not None and not keeps_all:
             is_taken = ~kept.by_pass[name]
             image = comparison.images[next(iter(comparison.results)), name]
+            values = comparison.extraction.exposure * getattr(result.shading, name)
+            own = map(comparison.film.image, values) if len(values) > 1 else (image,)
+            groups = {
+                group: np.where(is_taken[..., None], one, 0.0)
+                for group, one in zip(result.shading.groups, own, strict=True)
+            }
         light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
-        found[name] = _Part(np.where(is_taken[..., None], image, 0.0), is_taken, light, color)
+        found[name] = _Part(np.where(is_taken[..., None], image, 0.0), groups, is_taken, light, color)
     return found
 
 
-def _rest(cycles, ours: dict[str, _Part], options, progress) -> tuple[np.ndarray, str, list[str]]:
-    """What is not ours (H, W, 4), denoised, the name of the denoiser ("" for none), and what was wrong with it."""
+def _rest(
+    cycles, ours: dict[str, _Part], options, progress
+) -> tuple[np.ndarray, dict[str, np.ndarray], str, list[str]]:
+    """What is not ours (H, W, 4), denoised; the same by light group, and by "" of what is in none; the name of the
+    denoiser ("" for none), and what was wrong with it."""
     from ..blender.process.blender_process import denoiser_libraries
 
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
     rest = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64)
     for part in ours.values():
-        rest[..., :3] -= np.where(part.is_taken[..., None], part.light.astype(np.float64) * part.color, 0.0)
-    if options.denoise == "off":
-        return rest, "", []
-    albedo, normal = (read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL))
-    try:
-        with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            rest[..., :3] = denoiser.denoised(rest[..., :3], albedo, normal)
-            return rest, denoiser.name, []
-    except NoDenoiser as error:
-        return rest, "", [f"{error}; the picture is not denoised"]
+        rest[..., :3] -= part.replaced
+    groups = sorted(
+        {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
+    )
+    found = [rest[..., :3], *(_rest_of_group(cycles, ours, group) for group in groups)]
+    name, problems = "", []
+    if options.denoise == "on":
+        guides = [read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL)]
+        try:
+            with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+                found, name = denoiser.all_denoised(found, *guides), denoiser.name
+        except NoDenoiser as error:
+            problems = [f"{error}; the picture is not denoised"]
+    rest[..., :3] = found[0]
+    return rest, _shared_out(rest, dict(zip(groups, found[1:], strict=True)), is_clean=bool(name)), name, problems
+
+
+def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:
+    """What is not ours (H, W, 3) of the light of a light group."""
+    found = read_layer(cycles.channels, f"{OF_GROUP}{group}", "RGB").astype(np.float64)
+    for part in ours.values():
+        if group in part.groups:
+            share = np.divide(part.groups[group], part.image, out=np.zeros_like(part.image), where=part.image != 0.0)
+            found -= share * part.replaced
+    return found
+
+
+def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool) -> dict[str, np.ndarray]:
+    """`groups` (H, W, 3), and by "" what they leave of `rest` (H, W, 4): of what is clean never more than there is."""
+    if is_clean and groups:
+        whole = np.maximum(sum(groups.values()), 1e-30)
+        groups = {name: one * np.minimum(rest[..., :3] / whole, 1.0) for name, one in groups.items()}
+    left = rest.copy()
+    for one in groups.values():
+        left[..., :3] -= one
+    return {"": left, **groups}
 
 
 def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
     """Ours by the names of layers, also by light group where there are several."""
     if not comparison.results:
         return {}
-    (name, result), layers = next(iter(comparison.results.items())), {}
-    groups = result.shading.groups
+    name, layers = next(iter(comparison.results)), {}
     for pass_name, part in ours.items():
         layers[f"{name}.{pass_name}"] = part.image
-        values = comparison.extraction.exposure * getattr(result.shading, pass_name)
-        for group, own in zip(lighting.group_names(groups), values if len(groups) > 1 else (), strict=False):
-            image = comparison.film.image(own)
-            layers[f"{name}.{pass_name}@{group}"] = np.where(part.is_taken[..., None], image, 0.0)
+        if len(part.groups) > 1:
+            names = lighting.group_names(part.groups)
+            layers |= {
+                f"{name}.{pass_name}@{group}": one for group, one in zip(names, part.groups.values(), strict=True)
+            }
     return layers
 
 
-def _replaced(cycles, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
+def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The channels of Cycles, but for its noisy Combined, with ours in place of its direct light."""
     channels = {name: plane for name, plane in cycles.channels.items() if not name.startswith("Combined.")}
     for name, (light, _) in DIRECT.items():
@@ -274,6 +321,10 @@ def _replaced(cycles, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
         for index, letter in enumerate("RGB"):
             key = f"{cycles.names[light]}.{letter}"
             channels[key] = np.where(part.is_taken, own[..., index], channels[key])
+    for group, rest in rests.items():
+        if group:
+            whole = rest + sum(part.groups.get(group, 0.0) for part in ours.values())
+            channels |= imaging.Layer(whole).planes(f"{OF_GROUP}{group}")
     return channels
 
 

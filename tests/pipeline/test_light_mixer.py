@@ -146,13 +146,41 @@ def test_a_finished_picture_lit_anew_keeps_the_rest(capsys, monkeypatch, room, o
     path.parent.mkdir()
     lighting.keep_picture(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
     found = run(capsys, "relight", out / "finished", "--light", "Light 1", "--power", "x3", "--json", "--quiet")
-    assert found[0] == 0 and relight.SAME_REST in found[1]
+    assert found[0] == 0 and relight.SAME_REST.format("") in found[1]
     channels = read_channels(out / "finished" / "relit" / "render.exr")
     assert np.allclose(channels["rest.A"], rest[..., 3]) and np.allclose(channels["combined.A"], rest[..., 3])
     pictures = light_pictures(KeptPicture.load(path))
     expected = np.einsum("rhwc,r->hwc", pictures.layers, [1.0, 3.0, 1.0, 1.0])
     combined = np.stack([channels[f"combined.{letter}"] for letter in "RGB"], axis=-1)
     np.testing.assert_allclose(combined, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_bounced_light_follows_a_group_also_where_its_lights_change_differently(capsys, monkeypatch, room, out):
+    """The command and the mixer share it out alike. A group without a light of ours has a row, and stays."""
+    whole = shade(capsys, monkeypatch, room, out / "first", groups=("Key", "Key", ""))
+    kept, random = kept_in(out / "first"), np.random.default_rng(4)
+    shape, path = whole.shape[:2], out / "finished" / "render.samples.npz"
+    rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3)), "Sky": random.random((*shape, 3))}
+    taken = {name: np.ones(shape) for name in ("specular", "diffuse")}
+    path.parent.mkdir()
+    lighting.keep_picture(
+        kept.extraction, None, replace(options(room, out), techniques=("ltsh4",)), path, rest=rest, taken=taken
+    )
+    pictures = light_pictures(KeptPicture.load(path))
+    names = [row.name for row in pictures.rows]
+    assert names == ["Light 0", "Light 1", "Light 2", "Light group Sky", relight.REST]
+    assert pictures.rows[3].note == relight.NOT_SHADED
+    for changes, factors in (
+        (("Light 1", "--power", "x3"), [1.0, 3.0, 1.0, 1.0, 1.0]),
+        (("Light 0", "--power", "x2", "--light", "Light 1", "--power", "x2"), [2.0, 2.0, 1.0, 1.0, 1.0]),
+        (("Light 2", "--power", "x0"), [1.0, 1.0, 0.0, 1.0, 1.0]),
+    ):
+        found = run(capsys, "relight", out / "finished", "--light", *changes, "--json", "--quiet")
+        assert found[0] == 0 and "but for that of light groups" in found[1]
+        channels = read_channels(out / "finished" / "relit" / "render.exr")
+        combined = np.stack([channels[f"combined.{letter}"] for letter in "RGB"], axis=-1)
+        expected = np.einsum("rhwc,r->hwc", pictures.layers, factors)
+        np.testing.assert_allclose(combined, expected, rtol=1e-5, atol=1e-6)
 
 
 def options(room, output):

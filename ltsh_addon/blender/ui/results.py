@@ -268,7 +268,7 @@ def update_moved(scene, moved: dict[int, AreaLight]) -> None:
     """
     mixer = mixer_of(scene)
     for number, light in moved.items():
-        layer = _moved_lights(scene).picture(light)
+        layer = _moved_lights(scene).picture(light, mixer.rows[number])
         mixer.replace(number, replace(mixer.rows[number], light=light.record()), layer)
     if bpy.app.timers.is_registered(end_processes):
         bpy.app.timers.unregister(end_processes)

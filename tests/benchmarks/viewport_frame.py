@@ -2,6 +2,7 @@
 
 The example scene as its camera sees it, by technique, in turn so that a busy machine disturbs all alike. A frame is
 what a moving camera asks for: surfaces, lighting, picture; without the surfaces it is what a moving light asks for.
+At last frames under 32 lights of all kinds and, for comparison, under four rectangles.
 Needs Blender 5.2, where a script without a window may use the graphics card. Where llvmpipe stands in for one, times
 are those of the processor.
 """
@@ -17,10 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "helpers"))
 
 import bpy
 import gpu
 import numpy as np
+import random_surfaces
 
 from ltsh_addon.blender import demo
 from ltsh_addon.blender.viewport.mirror import SceneMirror
@@ -31,6 +34,8 @@ TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # In times of ltc.
 TARGETS = {"ltsh2": 1.3, "ltsh4": 2.0, "ltsh4c": 2.6}
 PUBLISHED = {"ltsh2": 2.7, "ltsh4": 5.5}  # Allmenröder and Peters 2021, on a graphics card
+KINDS = ("plain", "disk", "ball", "facing disk", "spot", "bulb", "sun", "spot disk")
+MANY, MOST_OF_FOUR = 32, 3.0
 
 
 class Frames:
@@ -98,6 +103,21 @@ def report(times):
     print(f"{'published for the shading alone':<82}" + "".join(f"{ratio:>10.2f} x" for ratio in PUBLISHED.values()))
 
 
+def many_lights(frames, rounds):
+    """Print what MANY lights of all KINDS cost beside four rectangles."""
+    generator = np.random.default_rng(3)
+    many = [random_surfaces.light(KINDS[number % len(KINDS)], number, generator) for number in range(MANY)]
+    lights = {"many": [light if light.is_distant else light.moved(np.array([0.0, 0.0, 2.0])) for light in many]}
+    lights["four"] = [replace(light, shape="RECTANGLE", spread=np.pi, detail=()) for light in frames.mirror.lights[:4]]
+    seconds = {}
+    for name, own in lights.items():
+        frames.mirror.lights = tuple(own)
+        seconds[name] = statistics.median([frames.seconds("ltsh4") for _ in range(rounds + 1)][1:])
+    ratio = seconds["many"] / seconds["four"]
+    print(f"ltsh4, a frame under {MANY} lights of all kinds {1e3 * seconds['many']:.1f} ms, "
+          f"{ratio:.2f} times that under {len(lights['four'])} rectangles (target {MOST_OF_FOUR:.0f})")  # fmt: skip
+
+
 def main(arguments):
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -115,6 +135,7 @@ def main(arguments):
     print(f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}; {options.size} pixels, "
           f"{frames.mirror.triangles} triangles, {len(lights)} lights of {corners} edges in all")  # fmt: skip
     report(measure(frames, options.rounds))
+    many_lights(frames, options.rounds)
     return 0
 
 

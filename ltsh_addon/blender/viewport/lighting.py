@@ -19,7 +19,6 @@ from .shaders import (
     BOUNDS,
     CHOICE,
     EXCESS,
-    HORIZON_CORNERS,
     HORIZON_SAMPLERS,
     Features,
     horizon_shader,
@@ -63,9 +62,9 @@ class HorizonPass:
         `view` is the camera's place and 1, or for parallel views the unit direction toward it and 0.
         """
         self._resize(gbuffer.size)
-        corners = [HORIZON_CORNERS if light.is_round else len(light.polygon()) for light in lights.lights]
+        corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
         directions = horizons.AROUND * len(horizons.HEIGHTS)
-        self._run(BOUNDS, gbuffer, lights, shares(corners))
+        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)))
         self._run(EXCESS, gbuffer, lights, shares([directions * count for count in corners]), view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)])
         return self._textures[_RESULTS[CHOICE]]
@@ -215,4 +214,4 @@ def _loops(light: AreaLight) -> int:
     """About how many times the loops over a light's corners go round at the most."""
     if light.is_profiled:
         return 16000 if light.is_round else 2000
-    return 2500 if light.is_round else 10 * len(light.polygon())
+    return 1200 if light.is_round else 10 * len(light.polygon())

@@ -6,7 +6,7 @@ so do the features that a shader is compiled for. What is written here is what r
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
@@ -32,14 +32,16 @@ from ...shading.header import (
 )
 from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
 from ...shading.lobes import LEAST_SHARE
-from ...shading.lookup_table import LookupTable
+from ...shading.lookup_table import MIN_ALPHA, LookupTable
+from ...shading.tails import NEAR_RADII
 from . import sky, textures
 
 # Half diagonals of a light, as the lobe sees it, up to which it is sampled: there both that and the rounding of edges,
 # which grows with the inverse of the size, are below 2e-4 of the result.
 TINY_LIGHT = 0.2
-# The same for round lights of which the center is all that counts.
-POINT_LIGHT = 0.02
+# The same for those of which four points, and of round ones the center, are all that counts: 5e-4 of the result.
+SMALL_LIGHT = 0.12
+POINT_LIGHT = 2e-4
 # Nodes along disks over which a cone ends, see `shading.facing`.
 NODES_ALONG = 20
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
@@ -125,10 +127,7 @@ def _lighting_source(table, features) -> str:
     chosen = {"cosine": is_cosine, **asdict(features)}
     defined = {name.upper(): 1 for name, is_chosen in chosen.items() if is_chosen}
     parts = ["#define LTSH_GLSL 1", core_text(), definitions({**defined, **_lighting_constants(table)})]
-    levels = textures.ROUND_LEVELS
-    few = sum(count < ROUND_CORNERS[0] for _, count, _ in levels)
-    values = {"LEVELS": _level_lines(levels[few:], ""), "WHOLE_LEVELS": _level_lines(levels[:few], "whole_")}
-    parts += [glsl("light_texels"), filled(glsl("lights"), values)]
+    parts += [glsl("light_texels"), filled(glsl("lights"), {"LEVELS": "\n".join(_level_lines())})]
     if features.focused:
         parts.append(glsl("spread"))
     if features.facing:
@@ -139,7 +138,12 @@ def _lighting_source(table, features) -> str:
         parts.append(_diffuse_text(features))
     if features.sky:
         parts += [glsl("octahedron"), glsl("sky")]
-    return "\n".join([*parts, glsl("lighting")])
+    loops = {"SPECULAR_LOOPS": "", "DIFFUSE_LOOPS": ""}
+    if features.specular:
+        loops["SPECULAR_LOOPS"] = "\n".join(_specular_loops(features))
+    if features.diffuse:
+        loops["DIFFUSE_LOOPS"] = "\n".join(_diffuse_loops(features))
+    return "\n".join([*parts, filled(glsl("lighting"), loops)])
 
 
 def _lighting_constants(table) -> dict:
@@ -163,7 +167,10 @@ def _lighting_constants(table) -> dict:
         "IRRADIANCE_SIZE": sky.IRRADIANCE_SIZE,
         "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
         "TINY": float_literal(TINY_LIGHT**2),
+        "SMALL": float_literal(SMALL_LIGHT**2),
         "POINT": float_literal(POINT_LIGHT**2),
+        "NEAR_SQUARED": float_literal(NEAR_RADII**2),
+        "MIN_ALPHA": float_literal(MIN_ALPHA),
         "CHANGING": float_literal(facing.CHANGING),
         "NODES_ALONG": NODES_ALONG,
         "FEW_LAYERS": plain.layers,
@@ -188,14 +195,74 @@ def _lighting_constants(table) -> dict:
     }
 
 
-def _level_lines(levels, prefix) -> str:
-    """Statements that choose the corners of a round light from how far it reaches in units of the lobe's width."""
-    lines = []
-    for first, count, limit in reversed(levels):
-        condition = "round" if np.isinf(limit) else f"round && wide <= {float_literal(limit)}"
+def _level_lines() -> Iterator[str]:
+    """Statements that choose the corners of a round light from how wide it is seen."""
+    for first, count, limit in reversed(textures.ROUND_LEVELS):
+        condition = "round && whole" if count < ROUND_CORNERS[0] else "round"
+        if not np.isinf(limit):
+            condition += f" && wide <= {float_literal(limit)}"
         for name, value in (("first", first), ("count", count)):
-            lines.append(f"    light.{prefix}{name} = {condition} ? {value} : light.{prefix}{name};")
-    return "\n".join(lines)
+            yield f"    light.{name} = {condition} ? {value} : light.{name};"
+
+
+# Of the lights of `ltsh_todo`: their corners where they need some, and how they are integrated.
+_WAYS = {
+    "spots": "{name}_in_spots(sight, light.is_round)",
+    "whole": "{name}_of_whole(sight, light)",
+    "cut": "{name}_of_part({lobe}, sight, light, false)",
+    "tiny": "{name}_of_part({lobe}, sight, light, true)",
+}
+
+
+def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterator[str]:
+    """A loop over the lights of each way; `light(integral)` says what they add."""
+    ways = {way: integral.format(name=name, lobe=lobe) for way, integral in _WAYS.items()}
+    if features.focused:
+        ways["focused"] = ""
+    for way, integral in ways.items():
+        yield f"    left = todo.{way};"
+        yield "    do {"
+        yield "        number = ltsh_next(left);"
+        yield "        int header = ltsh_header(place.z + number);"
+        yield "        ltsh_light light = ltsh_seen_light(header, point);"
+        if way != "focused":
+            yield f"        {name}_view sight = {name}_viewed({lobe}, light);"
+        if way in ("whole", "cut", "tiny"):
+            yield "        light = ltsh_with_corners(light, sight.wide, sight.whole);"
+        yield from (f"        {line}" for line in light(integral))
+        factor = "factor"
+        yield "        float factor = ltsh_factor(number, todo);"
+        if features.shadowed:
+            factor += f" * ltsh_seen(near, place.z + number).{'x' if name == 'specular' else 'y'}"
+        yield f"        reflected *= {factor} * ltsh_light_texel(header + 4).xyz;"
+        yield "        radiance += left != 0u ? reflected : vec3(0.0);"
+        yield "        left &= left - 1u;"
+        yield "    } while (left != 0u);"
+
+
+def _specular_loops(features) -> Iterator[str]:
+    def light(integral):
+        profile = "vec2(1.0)"
+        if integral:
+            yield f"vec4 values = specular_values(weights, {integral});"
+        else:
+            yield "bool used = left != 0u;"
+            yield "vec4 values = specular_focused(shine, weights, light, header, weights.width, used);"
+            profile = "ltsh_range_of_profile(light, header)"
+        yield f"vec3 reflected = ltsh_reflected(point, ltsh_limited(values, point, light, header, {profile}));"
+
+    return _loops("specular", "shine", light, features)
+
+
+def _diffuse_loops(features) -> Iterator[str]:
+    def light(integral):
+        if integral:
+            yield f"float form_factor = diffuse_form_factor(matte, {integral});"
+        else:
+            yield "float form_factor = diffuse_focused(matte, light, header, 1.0, left != 0u).x;"
+        yield "vec3 reflected = form_factor * base.xyz;"
+
+    return _loops("diffuse", "matte", light, features)
 
 
 def _specular_text(table, is_cosine, features) -> str:
@@ -361,6 +428,7 @@ def horizon_shader(step: str):
     values = {
         step.upper(): 1,
         **textures.constants(),
+        "QUAD_FIRST": textures.QUAD_FIRST,
         "ROUND_FIRST": textures.circle_first(HORIZON_CORNERS),
         "ROUND_CORNERS": HORIZON_CORNERS,
         "SMALLEST_ANGLE": float_literal(horizons.SMALLEST_ANGLE),

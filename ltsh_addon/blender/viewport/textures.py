@@ -130,6 +130,8 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
 HEADER = 7
 WIDTH = 256
 DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
+# Not equally bright all over; with a spread or a falloff; seen as a cap of the sphere.
+UNEVEN, PROFILE, CAP = 128, 256, 512
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -140,10 +142,12 @@ def _circle(count):
     return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-# A polygon of the area of a circle has its second moments to 2e-3 with 8 corners, to 1.4e-4 with 16. Lobes that do not
-# see more than these, of lights that no horizon cuts, are as exact as with those of `light_polygons`: within 3e-5.
-_FEW_CORNERS, _FEW_LIMITS = (8, 16), (0.3, 1.5)
-_CIRCLES = (*_FEW_CORNERS, *ROUND_CORNERS)
+# A polygon of the area of a circle has its second moments to 2e-3 with 8 corners, to 1.4e-4 with 16: lobes see that of
+# lights that no horizon cuts and that are so wide after the warp (the squares of half diagonals by distances, see
+# integral.glsl). Lobes make lights on their axis twice as large, and the half diagonal is longer than the radius.
+_FEW_SIZES = {8: 0.15, 16: 1.0}
+_CIRCLES = (*_FEW_SIZES, *ROUND_CORNERS)
+_SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS), np.inf)
 _NODES = tuple(sorted({effort.layers for effort in light_cone.EFFORTS}))
 _SHARED = [
     _QUAD,
@@ -155,8 +159,8 @@ QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
 # Texel of the first node by the number of nodes.
 NODES_FIRST = dict(zip(_NODES, _FIRST[1 + len(_CIRCLES) :], strict=True))
 FIRST_LIGHT = sum(len(part) for part in _SHARED)
-# Texel of the first corner, number of corners, and up to which reach in units of the lobe's width they are taken.
-ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, (*_FEW_LIMITS, *ROUND_LIMITS, np.inf), strict=True))
+# Texel of the first corner, number of corners, and up to which width they are taken.
+ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, _SIZES, strict=True))
 
 
 def constants() -> dict[str, int | str]:
@@ -172,6 +176,9 @@ def constants() -> dict[str, int | str]:
         "FACING_FLAG": FACING,
         "BALL_FLAG": BALL,
         "CONE_FLAG": CONE,
+        "UNEVEN_FLAG": UNEVEN,
+        "PROFILE_FLAG": PROFILE,
+        "CAP_FLAG": CAP,
         "NEAR_DISK": float_literal(NEAR_DISK),
         "LEAST_SHRINKING": float_literal(LEAST_SHRINKING),
     }
@@ -241,7 +248,8 @@ def _outline(light, place):
 def _header(light, first, count, half_v, first_receiver):
     flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
     flags += DISTANT * light.is_distant + FACING * light.is_facing + BALL * (light.shape == "BALL")
-    flags += CONE * (light.cone is not None)
+    flags += CONE * (light.cone is not None) + UNEVEN * (not light.is_even) * light.is_facing
+    flags += PROFILE * light.is_profiled + CAP * _is_cap(light)
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_cone.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)
@@ -255,6 +263,17 @@ def _header(light, first, count, half_v, first_receiver):
         [tangent, 1.0 / share, reach, _bound(light)],
         [light.falloff, light.smooth, np.linalg.norm(light.area_vector), 0.0],
     ])  # fmt: skip
+
+
+def _is_cap(light) -> bool:
+    """True for what is seen as a cap of the sphere: balls, facing disks, and suns."""
+    if light.is_facing or not (light.is_round and light.is_distant):
+        return light.is_facing
+    axes = np.stack([light.half_u, light.half_v, light.center])
+    products = axes @ axes.T
+    whole = np.sqrt(np.outer(products.diagonal(), products.diagonal()))
+    apart = np.abs(products - np.diag(products.diagonal())) > 1e-6 * whole
+    return bool(not apart.any() and abs(products[0, 0] - products[1, 1]) <= 1e-6 * products[0, 0])
 
 
 def _bound(light):
@@ -300,7 +319,8 @@ def dielectric_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.nd
     return texels.reshape(len(grid), 2, 4)
 
 
-MOST_LOOPS = 40000
+# Of a draw call: loops, and lights.
+MOST_LOOPS, MOST_LIGHTS = 40000, 32
 
 
 @dataclass(frozen=True)
@@ -322,9 +342,13 @@ def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
     """The lights (first, end) of each draw call, of which each goes round as many `loops`: llvmpipe breaks off those
     of a pixel that go round more than 65535 times, and other cards do not like long ones. The first call is there
     without lights, too."""
-    number = np.cumsum([0, *loops[:-1]]) // MOST_LOOPS if len(loops) else np.zeros(0)
-    starts = [0, *(np.nonzero(np.diff(number))[0] + 1).tolist(), len(loops)]
-    return list(zip(starts[:-1], starts[1:], strict=True))
+    starts, total = [0], 0
+    for number, count in enumerate(loops):
+        if number > starts[-1] and (total + count > MOST_LOOPS or number - starts[-1] == MOST_LIGHTS):
+            starts.append(number)
+            total = 0
+        total += count
+    return list(zip(starts, [*starts[1:], len(loops)], strict=True))
 
 
 # In units of vec4: where slots start, the size of one, where the terms of conductors and where the coat starts, all.

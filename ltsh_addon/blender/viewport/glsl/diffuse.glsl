@@ -91,6 +91,34 @@ float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
 #endif
 }
 
+/* Can the lobe be integrated over a cap of the sphere by `diffuse_of_cap`? */
+bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
+{
+    bool has = whole || (lobe.is_spare && lobe.bump_alpha2 == 0.0);
+#ifdef LTSH_SHEEN
+    has = has && lobe.a == 1.0 && lobe.b == 0.0;
+#endif
+    return has;
+}
+
+/* The form factor of a light that is seen as a cap of the sphere, above all horizons or cut by one (Snyder 1996). */
+float diffuse_of_cap(diffuse_lobe lobe, ltsh_light light)
+{
+    float squared = max(dot(light.offset, light.offset), 1e-37);
+    float radius2 = dot(light.half_u, light.half_u);
+    float sine2 = radius2 / (squared + radius2);
+    vec3 axis = inversesqrt(squared) * light.offset;
+    diffuse_sum sum;
+    sum.total = -2.0 * LTSH_PI * sine2 * axis;
+    float whole = diffuse_form_factor(lobe, sum);
+    float cosine = clamp(dot(lobe.plane_0, axis), -1.0, 1.0);
+    float slope2 = squared / max(radius2, 1e-37);
+    float root = sqrt(max(slope2 * (1.0 - cosine * cosine / max(sine2, 1e-37)), 0.0));
+    float turn = -cosine * sqrt(slope2 / max(1.0 - cosine * cosine, 1e-37));
+    float part = sine2 * (cosine * acos(clamp(turn, -1.0, 1.0)) - root) + atan(root, slope2);
+    return cosine * cosine < sine2 ? max(LTSH_ONE_OVER_PI * part, 0.0) : whole;
+}
+
 #ifdef LTSH_FOCUSED
 /* To coordinates around the diffuse normal. */
 mat3 diffuse_frame(diffuse_lobe lobe)

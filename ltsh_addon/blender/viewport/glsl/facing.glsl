@@ -50,16 +50,20 @@ float ltsh_lobe_value(vec3 normal, vec3 view, float alpha, vec3 direction)
     return ratio * ratio * cosine / max(masking, 1e-30);
 }
 
-float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 normal, float alpha)
+float ltsh_emission_at_center(int header, ltsh_point point, ltsh_light light)
 {
-    int flags = int(ltsh_light_texel(header + 2).w);
-    vec2 falloff = ltsh_light_texel(header + 6).xy;
-    bool plain = (flags & LTSH_FACING_FLAG) == 0
-        || ((flags & LTSH_CONE_FLAG) == 0 && falloff.x == 0.0 && falloff.y == 0.0);
+    vec3 own = ltsh_light_texel(header).xyz - point.position;
+    float factor = ltsh_emission(header, light.flags, own, ltsh_unit(light.offset));
+    return (light.flags & LTSH_UNEVEN_FLAG) != 0 ? factor : 1.0;
+}
+
+float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 normal, float alpha, bool used)
+{
+    int flags = light.flags;
     vec3 own = ltsh_light_texel(header).xyz - point.position;
     /* Toward the axis of the cone, where its factor changes most. */
     vec3 u = light.half_u;
-    if (!plain && (flags & LTSH_CONE_FLAG) != 0) {
+    if ((flags & LTSH_CONE_FLAG) != 0) {
         int first = int(ltsh_light_texel(header).w);
         vec3 row_x = ltsh_light_texel(first).xyz;
         vec3 row_y = ltsh_light_texel(first + 1).xyz;
@@ -71,22 +75,23 @@ float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 no
         u = dot(rise, rise) > 0.0 ? length(light.half_u) * ltsh_unit(rise) : u;
     }
     vec3 v = cross(light.direction, u);
-    float middle = plain ? 1.0 : ltsh_emission(header, flags, own, ltsh_unit(light.offset));
+    float middle = ltsh_emission(header, flags, own, ltsh_unit(light.offset));
     float least = middle;
     float most = middle;
     float rim = 0.0;
-    for (int i = 0; i < (plain ? 0 : 6); ++i) {
+    int i = 0;
+    do {
         float angle = float(i) * (LTSH_PI / 3.0);
         float value = ltsh_emission(header, flags, own, ltsh_unit(light.offset + cos(angle) * u + sin(angle) * v));
         least = min(least, value);
         most = max(most, value);
         rim += value / 6.0;
-    }
-    float mean = plain ? 1.0 : 0.5 * (middle + rim);
-    bool changes = !plain && most - least > LTSH_CHANGING * most;
+    } while (++i < 6);
+    bool changes = used && most - least > LTSH_CHANGING * most;
     float total = 0.0;
     float weights = 0.0;
-    for (int i = 0; i < (changes ? LTSH_NODES_ALONG : 0); ++i) {
+    i = 0;
+    do {
         float angle = LTSH_PI * float(i + 1) / float(LTSH_NODES_ALONG + 1);
         for (int j = -1; j < 2; ++j) {
             vec3 place = light.offset + cos(angle) * u + float(j) * 0.7745967 * sin(angle) * v;
@@ -97,6 +102,6 @@ float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 no
             total += weight * ltsh_emission(header, flags, own, direction);
             weights += weight;
         }
-    }
-    return changes && weights > 0.0 ? total / weights : mean;
+    } while (++i < (changes ? LTSH_NODES_ALONG : 1));
+    return changes && weights > 0.0 ? total / weights : 0.5 * (middle + rim);
 }

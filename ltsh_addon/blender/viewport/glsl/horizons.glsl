@@ -7,7 +7,8 @@
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
 struct seen_light {
-    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float radiance; float end; bool faces;
+    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float area; float radiance; float end;
+    bool faces; bool is_round; bool is_disk;
 };
 
 seen_light light_from(int number, vec3 position, vec3 normal)
@@ -22,6 +23,10 @@ seen_light light_from(int number, vec3 position, vec3 normal)
     light.half_u = placed.half_u;
     light.half_v = placed.half_v;
     light.direction = placed.direction;
+    int flags = int(ltsh_light_texel(header + 2).w);
+    light.is_round = half_u.w == 0.0;
+    light.is_disk = (flags & LTSH_CAP_FLAG) != 0;
+    light.area = light.is_round ? LTSH_PI * length(cross(placed.half_u, placed.half_v)) : ltsh_light_texel(header + 6).z;
     light.count = half_u.w > 0.0 ? int(half_u.w) : LTSH_ROUND_CORNERS;
     light.first = half_u.w > 0.0 ? int(center.w) : LTSH_ROUND_FIRST;
     light.radiance = radiance.x + radiance.y + radiance.z;
@@ -43,9 +48,10 @@ bool has_two_horizons(ivec2 texel)
 #endif
 
 #ifndef LTSH_CHOICE
-/* Solid angle in sr, and area. Van Oosterom and Strackee 1983, eq. 8; the volumes are those of a pyramid, exact for
-   small lights, too. */
-vec2 extent(seen_light light)
+#ifdef LTSH_EXCESS
+/* Solid angle in sr. Van Oosterom and Strackee 1983, eq. 8; the volumes are those of a pyramid, exact for small lights,
+   too. */
+float solid_angle(seen_light light)
 {
     vec3 normal = cross(light.half_u, light.half_v);
     float height = dot(light.offset, normal);
@@ -53,22 +59,26 @@ vec2 extent(seen_light light)
     vec3 a = light.offset + start.x * light.half_u + start.y * light.half_v;
     float far_a = length(a);
     vec2 before = ltsh_corner(light.first + 1) - start;
-    vec2 total = vec2(0.0);
-    for (int i = 2; i < light.count; ++i) {
+    float total = 0.0;
+    int end = light.is_disk ? 3 : light.count;
+    int i = 2;
+    do {
         vec2 after = ltsh_corner(light.first + i) - start;
         vec3 b = a + before.x * light.half_u + before.y * light.half_v;
         vec3 c = a + after.x * light.half_u + after.y * light.half_v;
         float far_b = length(b);
         float far_c = length(c);
-        float twice = before.x * after.y - before.y * after.x;
-        float volume = height * twice;
+        float volume = height * (before.x * after.y - before.y * after.x);
         float below = far_a * far_b * far_c + dot(a, b) * far_c + dot(b, c) * far_a + dot(c, a) * far_b;
-        total.x += abs(volume) > 0.0 || abs(below) > 0.0 ? 2.0 * atan(volume, below) : 0.0;
-        total.y += 0.5 * twice;
+        total += abs(volume) > 0.0 || abs(below) > 0.0 ? 2.0 * atan(volume, below) : 0.0;
         before = after;
-    }
-    return vec2(light.faces ? abs(total.x) : 0.0, length(normal) * abs(total.y));
+    } while (++i < end);
+    float squared = dot(light.offset, light.offset);
+    float sine2 = dot(light.half_u, light.half_u) / (squared + dot(light.half_u, light.half_u));
+    float cap = 2.0 * LTSH_PI * sine2 / (1.0 + sqrt(max(1.0 - sine2, 0.0)));
+    return light.faces ? (light.is_disk ? cap : abs(total)) : 0.0;
 }
+#endif
 
 /* Cosines of the sums of two angles of 0 to pi, with the sign -1 of their differences, from their cosines. */
 vec2 cosines_of_sums(vec2 first, float second, float sign)
@@ -77,7 +87,7 @@ vec2 cosines_of_sums(vec2 first, float second, float sign)
 }
 
 /* The most and the least that the light may send to the pixel, as `light_tree.light_bounds`; whether it sends anything. */
-vec3 bounds(seen_light light, vec3 smooth_normal, float area)
+vec3 bounds(seen_light light, vec3 smooth_normal)
 {
     float far = length(light.offset);
     vec3 axis = light.offset / max(far, 1e-30);
@@ -95,7 +105,7 @@ vec3 bounds(seen_light light, vec3 smooth_normal, float area)
     vec2 least = cosines_of_sums(cosines, width, 1.0);
     bool seen = cosines.y > 0.0 && most.x > 0.0 && most.y > light.end;
     bool whole = seen && width > 0.0 && least.x > 0.0 && least.y > light.end;
-    float power = light.radiance * area;
+    float power = light.radiance * light.area;
     vec2 sent = power * vec2(most.x * most.y / (far * far), least.x * least.y / (farthest * farthest));
     return vec3(seen ? sent.x : 0.0, whole ? sent.y : 0.0, seen ? 1.0 : 0.0);
 }
@@ -111,7 +121,7 @@ void main()
     vec3 total = vec3(0.0);
     for (int i = place.x; i < end; ++i) {
         seen_light light = light_from(i, position, smooth_normal);
-        total += bounds(light, smooth_normal, extent(light).y);
+        total += bounds(light, smooth_normal);
     }
     color = vec4(total, 0.0);
 }
@@ -121,15 +131,22 @@ void main()
 /* Whether neither horizon has all of the light on one side, or they differ about it. */
 bool crosses(seen_light light, vec3 smooth_normal, vec3 true_normal)
 {
-    bool some = false;
-    bool every = true;
-    for (int i = 0; i < light.count; ++i) {
-        vec2 corner = ltsh_corner(light.first + i);
-        vec3 place_of_corner = light.offset + corner.x * light.half_u + corner.y * light.half_v;
-        bool first = dot(smooth_normal, place_of_corner) > 0.0;
-        bool second = dot(true_normal, place_of_corner) > 0.0;
-        some = some || first || second;
-        every = every && first && second;
+    vec2 height = vec2(dot(smooth_normal, light.offset), dot(true_normal, light.offset));
+    vec2 height_u = vec2(dot(smooth_normal, light.half_u), dot(true_normal, light.half_u));
+    vec2 height_v = vec2(dot(smooth_normal, light.half_v), dot(true_normal, light.half_v));
+    vec2 reach = sqrt(height_u * height_u + height_v * height_v);
+    bool some = any(greaterThan(height + reach, vec2(0.0)));
+    bool every = all(greaterThan(height - reach, vec2(0.0)));
+    if (!light.is_round) {
+        some = false;
+        every = true;
+        int i = 0;
+        do {
+            vec2 corner = ltsh_corner(light.first + i);
+            vec2 own = height + corner.x * height_u + corner.y * height_v;
+            some = some || any(greaterThan(own, vec2(0.0)));
+            every = every && all(greaterThan(own, vec2(0.0)));
+        } while (++i < light.count);
     }
     return some && !every && light.faces;
 }
@@ -149,14 +166,18 @@ bool hits(seen_light light, vec3 ray)
     vec2 spot = (along - skew * along.yx) / (1.0 - skew * skew) / vec2(long_u, long_v);
     bool inside = false;
     vec2 start = ltsh_corner(light.first + light.count - 1);
-    for (int i = 0; i < light.count; ++i) {
+    bool is_quad = light.first == LTSH_QUAD_FIRST;
+    int corners = light.is_round || is_quad ? 1 : light.count;
+    int i = 0;
+    do {
         vec2 end = ltsh_corner(light.first + i);
         bool spans = (start.y > spot.y) != (end.y > spot.y);
         float rise = end.y - start.y;
         float edge = start.x + (spot.y - start.y) * (end.x - start.x) / (rise == 0.0 ? 1.0 : rise);
         inside = spans && spot.x < edge ? !inside : inside;
         start = end;
-    }
+    } while (++i < corners);
+    inside = is_quad ? max(abs(spot.x), abs(spot.y)) < 1.0 : (light.is_round ? dot(spot, spot) < 1.0 : inside);
     return inside && steepness < 0.0;
 }
 
@@ -221,19 +242,24 @@ void main()
     /* As `horizons.lobe_chances` of a single sample. */
     vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
     chances /= max(chances.x + chances.y, 1e-12);
-    int end = has_two_horizons(texel) ? place.y : 0;
+    int count = has_two_horizons(texel) ? place.y - place.x : 0;
+    /* The lights that matter, a bit for each: what stands for a graphics card runs all that is not in a loop of its own
+       for every light. */
+    uint left = 0u;
+    int number = 0;
+    do {
+        seen_light light = light_from(place.x + number, position, smooth_normal);
+        left |= number < count && crosses(light, smooth_normal, true_normal) ? 1u << uint(number) : 0u;
+    } while (++number < count);
     vec2 excess = vec2(0.0);
-    for (int i = place.x; i < end; ++i) {
-        seen_light light = light_from(i, position, smooth_normal);
-        int directions = crosses(light, smooth_normal, true_normal) ? LTSH_AROUND * LTSH_HEIGHTS : 0;
-        float density = 0.0;
-        if (directions > 0) {
-            vec2 seen = extent(light);
-            vec3 own = bounds(light, smooth_normal, seen.y);
-            float by_least = all_bounds.y > 0.0 ? own.y / all_bounds.y : own.z / max(all_bounds.z, 1.0);
-            density = 0.5 * (own.x / max(all_bounds.x, 1e-30) + by_least) / max(seen.x, 1e-12);
-        }
-        for (int k = 0; k < directions; ++k) {
+    do {
+        int directions = left != 0u ? LTSH_AROUND * LTSH_HEIGHTS : 0;
+        seen_light light = light_from(place.x + (left != 0u ? findLSB(left) : 0), position, smooth_normal);
+        vec3 own = bounds(light, smooth_normal);
+        float by_least = all_bounds.y > 0.0 ? own.y / all_bounds.y : own.z / max(all_bounds.z, 1.0);
+        float density = 0.5 * (own.x / max(all_bounds.x, 1e-30) + by_least) / max(solid_angle(light), 1e-12);
+        int k = 0;
+        do {
             float turn = (float(k / LTSH_HEIGHTS) + 0.5) / float(LTSH_AROUND) * 2.0 - 1.0;
             float grown = exp(LTSH_CONCENTRATION * turn);
             float angle = LTSH_PI * 0.5 * (grown - 1.0 / grown) / LTSH_SINH;
@@ -247,11 +273,13 @@ void main()
             float chosen = chances.x * lobe + chances.y * max(dot(towards, diffuse_normal), 0.0) / LTSH_PI;
             float reflected = lobe * seen_by_light(towards, towards_eye, bent.xyz, bent.w)
                 * reflectance(means, sqrt(max(0.5 + 0.5 * dot(towards, towards_eye), 0.0)));
-            float amount = hits(light, towards) ? light.radiance * reflected * width : 0.0;
+            bool counts = k < directions && hits(light, towards);
+            float amount = light.radiance * reflected * width;
             float share = density * density / max(density * density + chosen * chosen, 1e-30);
-            excess += amount * vec2(1.0 - share, share);
-        }
-    }
+            excess += counts ? amount * vec2(1.0 - share, share) : vec2(0.0);
+        } while (++k < directions);
+        left &= left - 1u;
+    } while (left != 0u);
     color = vec4(excess, 0.0, 0.0);
 }
 #endif

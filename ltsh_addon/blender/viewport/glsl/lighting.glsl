@@ -38,6 +38,61 @@ vec2 ltsh_seen(ltsh_nearby near, int light)
 }
 #endif
 
+/* Of up to 32 lights those that a lobe needs by four spots, by their edges, by those of the part above horizons, by
+   triangles of that, and by their profile; and those that are not equally bright all over: a bit for each. What stands
+   for a graphics card runs all that is not in a loop of its own for every light. */
+struct ltsh_todo { uint spots; uint whole; uint cut; uint tiny; uint focused; uint uneven; };
+
+ltsh_todo ltsh_todo_with(ltsh_todo todo, int number, bool used, ltsh_light light, bool whole, float size)
+{
+    uint bit = used ? 1u << uint(number) : 0u;
+    bool tiny = size < LTSH_TINY;
+    bool small = whole && size < LTSH_SMALL && (light.is_round || light.first == LTSH_QUAD_FIRST);
+    bool focused = (light.flags & LTSH_PROFILE_FLAG) != 0;
+    todo.focused |= focused ? bit : 0u;
+    bit = focused ? 0u : bit;
+    todo.uneven |= (light.flags & LTSH_UNEVEN_FLAG) != 0 ? bit : 0u;
+    todo.spots |= small ? bit : 0u;
+    todo.whole |= whole && !tiny ? bit : 0u;
+    todo.cut |= !whole && !tiny ? bit : 0u;
+    todo.tiny |= tiny && !small ? bit : 0u;
+    return todo;
+}
+
+int ltsh_next(uint left) { return left != 0u ? findLSB(left) : 0; }
+
+int ltsh_header(int light) { return LTSH_FIRST_LIGHT + light * LTSH_LIGHT_HEADER; }
+
+float ltsh_area(int header, ltsh_light light)
+{
+    bool facing = (light.flags & LTSH_FACING_FLAG) != 0;
+    return facing ? LTSH_PI * dot(light.half_u, light.half_u) : ltsh_light_texel(header + 6).z;
+}
+
+#ifdef LTSH_FACING
+/* Of lights that are not equally bright all over, by their place among those of a draw call: their mean. */
+float ltsh_factors[32];
+#endif
+
+float ltsh_factor(int number, ltsh_todo todo)
+{
+#ifdef LTSH_FACING
+    return (todo.uneven >> uint(number) & 1u) != 0u ? ltsh_factors[number] : 1.0;
+#else
+    return 1.0;
+#endif
+}
+
+#ifdef LTSH_SPECULAR
+vec4 ltsh_limited(vec4 values, ltsh_point point, ltsh_light light, int header, vec2 profile)
+{
+#ifndef LTSH_COSINE
+    values = specular_limited(values, point, light, ltsh_area(header, light), profile);
+#endif
+    return values;
+}
+#endif
+
 void main()
 {
     ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
@@ -75,62 +130,106 @@ void main()
 #ifdef LTSH_SHADOWED
     ltsh_nearby near = ltsh_grid_at(point);
 #endif
-    int end = here ? place.w : 0;
-    for (int i = place.z; i < end; ++i) {
-        int header = LTSH_FIRST_LIGHT + i * LTSH_LIGHT_HEADER;
-        int flags = int(ltsh_light_texel(header + 2).w);
-        bool received = ltsh_receives(header, point);
-#ifdef LTSH_FOCUSED
-        bool focused = ltsh_light_texel(header + 5).x > 0.0;
-#else
-        bool focused = false;
-#endif
-        vec3 reflected = vec3(0.0);
-        vec2 seen = vec2(1.0);
-#ifdef LTSH_SHADOWED
-        seen = ltsh_seen(near, i);
-#endif
+    int count = here ? place.w - place.z : 0;
+    ltsh_todo nothing = ltsh_todo(0u, 0u, 0u, 0u, 0u, 0u);
 #ifdef LTSH_SPECULAR
-        ltsh_light shining = ltsh_seen_light(header, point, weights.width);
-        bool shines = received && glossy && (flags & LTSH_SPECULAR_FLAG) != 0;
-        shining.count = shines && !focused ? shining.count : 0;
-        shining.whole_count = shines && !focused ? shining.whole_count : 0;
-        vec4 values = specular_values(weights, specular_integral(shine, shining));
-#ifdef LTSH_FOCUSED
-        shining = ltsh_seen_light(header, point, weights.width);
-        values += specular_focused(shine, weights, shining, header, weights.width, shines && focused);
-#endif
+    {
+    ltsh_todo todo = nothing;
+    int number = 0;
+    do {
+        int header = ltsh_header(place.z + number);
+        ltsh_light light = ltsh_seen_light(header, point);
+        bool shines = number < count && glossy && (light.flags & LTSH_SPECULAR_FLAG) != 0;
+        shines = shines && ltsh_receives(header, light, point);
+        specular_view sight = specular_viewed(shine, light);
+        bool used = shines && !sight.dark;
+        bool is_point = used && light.is_round && (light.flags & LTSH_PROFILE_FLAG) == 0 && sight.size < LTSH_POINT;
+        is_point = is_point && all(greaterThan(sight.height, 1e3 * (abs(sight.height_u) + abs(sight.height_v))));
+        todo = ltsh_todo_with(todo, number, used && !is_point, light, sight.whole, sight.size);
+        vec4 values = specular_values(weights, specular_at_center(sight, LTSH_PI));
 #ifndef LTSH_COSINE
-        vec2 profile = vec2(1.0);
-#ifdef LTSH_FOCUSED
-        profile = focused ? ltsh_range_of_profile(shining, header) : profile;
+        values = specular_true_in_tails(values, point, light, ltsh_area(header, light));
 #endif
-        float area = ltsh_light_texel(header + 6).z;
-        area = (flags & LTSH_FACING_FLAG) != 0 ? LTSH_PI * dot(shining.half_u, shining.half_u) : area;
-        values = specular_limited(values, point, shining, area, profile);
-#endif
+        float factor = 1.0;
 #ifdef LTSH_FACING
-        values *= shines ? ltsh_mean_emission(header, point, shining, point.normal, weights.width) : 1.0;
+        factor = ltsh_emission_at_center(header, point, light);
 #endif
-        reflected += seen.x * ltsh_reflected(point, values);
+#ifdef LTSH_SHADOWED
+        factor *= ltsh_seen(near, place.z + number).x;
+#endif
+        vec3 reflected = factor * ltsh_reflected(point, values) * ltsh_light_texel(header + 4).xyz;
+        radiance += is_point ? reflected : vec3(0.0);
+    } while (++number < count);
+    uint left;
+#ifdef LTSH_FACING
+    left = todo.uneven;
+    do {
+        number = ltsh_next(left);
+        int header = ltsh_header(place.z + number);
+        ltsh_light light = ltsh_seen_light(header, point);
+        float factor = ltsh_mean_emission(header, point, light, point.normal, weights.width, left != 0u);
+        ltsh_factors[number] = factor;
+        uint kept = left != 0u && factor == 0.0 ? ~(1u << uint(number)) : ~0u;
+        todo.spots &= kept;
+        todo.whole &= kept;
+        todo.cut &= kept;
+        todo.tiny &= kept;
+        left &= left - 1u;
+    } while (left != 0u);
+#endif
+@SPECULAR_LOOPS@
+    }
 #endif
 #ifdef LTSH_DIFFUSE
-        ltsh_light lighting = ltsh_seen_light(header, point, 1.0);
-        bool lights_up = received && (flags & LTSH_DIFFUSE_FLAG) != 0;
-        lighting.count = lights_up && !focused ? lighting.count : 0;
-        lighting.whole_count = lights_up && !focused ? lighting.whole_count : 0;
-        float form_factor = diffuse_form_factor(matte, diffuse_integral(matte, lighting));
-#ifdef LTSH_FOCUSED
-        lighting = ltsh_seen_light(header, point, 1.0);
-        form_factor += diffuse_focused(matte, lighting, header, 1.0, lights_up && focused).x;
+    {
+    ltsh_todo todo = nothing;
+    uint caps = 0u;
+    int number = 0;
+    do {
+        int header = ltsh_header(place.z + number);
+        ltsh_light light = ltsh_seen_light(header, point);
+        bool lights_up = number < count && (light.flags & LTSH_DIFFUSE_FLAG) != 0;
+        lights_up = lights_up && ltsh_receives(header, light, point);
+        diffuse_view sight = diffuse_viewed(matte, light);
+        bool used = lights_up && !sight.dark;
+        bool is_cap = used && (light.flags & LTSH_CAP_FLAG) != 0 && diffuse_has_caps(matte, sight.whole);
+        bool is_even = (light.flags & LTSH_UNEVEN_FLAG) == 0;
+        caps |= is_cap ? 1u << uint(number) : 0u;
+        todo = ltsh_todo_with(todo, number, used && !(is_cap && is_even), light, sight.whole, sight.size);
+        float form_factor = diffuse_of_cap(matte, light);
+#ifdef LTSH_SHADOWED
+        form_factor *= ltsh_seen(near, place.z + number).y;
 #endif
+        vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;
+        radiance += is_cap && is_even ? reflected : vec3(0.0);
+    } while (++number < count);
+    uint left;
 #ifdef LTSH_FACING
-        form_factor *= lights_up ? ltsh_mean_emission(header, point, lighting, matte.plane_0, -1.0) : 1.0;
+    left = todo.uneven;
+    do {
+        number = ltsh_next(left);
+        int header = ltsh_header(place.z + number);
+        ltsh_light light = ltsh_seen_light(header, point);
+        float factor = ltsh_mean_emission(header, point, light, matte.plane_0, -1.0, left != 0u);
+        ltsh_factors[number] = factor;
+        bool is_cap = (caps >> uint(number) & 1u) != 0u;
+        float form_factor = factor * diffuse_of_cap(matte, light);
+#ifdef LTSH_SHADOWED
+        form_factor *= ltsh_seen(near, place.z + number).y;
 #endif
-        reflected += seen.y * form_factor * base.xyz;
+        vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;
+        radiance += left != 0u && is_cap ? reflected : vec3(0.0);
+        uint kept = left != 0u && (is_cap || factor == 0.0) ? ~(1u << uint(number)) : ~0u;
+        todo.spots &= kept;
+        todo.whole &= kept;
+        todo.cut &= kept;
+        todo.tiny &= kept;
+        left &= left - 1u;
+    } while (left != 0u);
 #endif
-        radiance += reflected * ltsh_light_texel(header + 4).xyz;
+@DIFFUSE_LOOPS@
     }
+#endif
 #ifdef LTSH_SKY
     /* It comes with the first lights. */
     vec4 mean = texelFetch(sky, ivec2(0, 0), 0);

@@ -26,8 +26,7 @@ ltsh_light ltsh_whole_sky(vec3 normal)
     light.direction = -normal;
     light.first = LTSH_QUAD_FIRST;
     light.count = 4;
-    light.whole_first = LTSH_QUAD_FIRST;
-    light.whole_count = 4;
+    light.flags = 0;
     light.bound = 1.01;
     light.is_round = false;
     return light;
@@ -35,7 +34,8 @@ ltsh_light ltsh_whole_sky(vec3 normal)
 
 vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights weights, vec4 mean)
 {
-    specular_sum all_of_it = specular_integral(lobe, ltsh_whole_sky(point.normal));
+    ltsh_light whole = ltsh_whole_sky(point.normal);
+    specular_sum all_of_it = specular_of_part(lobe, specular_viewed(lobe, whole), whole, false);
     vec3 radiance = mean.rgb * ltsh_reflected(point, specular_values(weights, all_of_it));
     mat3 back = inverse(transpose(mat3(lobe.row_x, lobe.row_y, lobe.row_z)));
     float stretch = abs(determinant(back));

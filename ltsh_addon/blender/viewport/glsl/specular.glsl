@@ -180,6 +180,43 @@ vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float are
 }
 #endif
 
+#ifndef LTSH_COSINE
+/* The same for lights so small that their center stands for all of them: in the tail the values are the true ones. */
+vec4 specular_true_in_tails(vec4 values, ltsh_point point, ltsh_light light, float area)
+{
+    float squared = dot(light.offset, light.offset);
+    float away = sqrt(squared);
+    float height = dot(point.normal, light.offset);
+    float seen = dot(point.view, light.offset);
+    float mu = dot(point.normal, point.view);
+    float mirrored = max(2.0 * mu * height - seen, 0.0);
+    vec3 sum = light.half_u + light.half_v;
+    vec3 difference = light.half_u - light.half_v;
+    float radius2 = max(dot(sum, sum), dot(difference, difference));
+    bool tail = mirrored * mirrored < squared - LTSH_NEAR_SQUARED * radius2;
+    float alpha = max(point.roughness * point.roughness, LTSH_MIN_ALPHA);
+    float alpha2 = alpha * alpha;
+    float halved = squared + away * seen;
+    float middle = height + mu * away;
+    float ratio = halved / (halved - 0.5 * (1.0 - alpha2) * middle * middle);
+    height = max(height, 0.0);
+    float masking = mu * sqrt(alpha2 * squared + (1.0 - alpha2) * height * height)
+        + height * sqrt(alpha2 + (1.0 - alpha2) * mu * mu);
+    float value = -0.5 * LTSH_ONE_OVER_PI * alpha2 * area * dot(light.offset, light.direction);
+    value *= ratio * ratio * height / (masking * squared * away);
+    float cosine = sqrt(clamp(0.5 * halved / squared, 0.0, 1.0));
+    float ior = max(point.ior, 1.0);
+    values.x = tail && values.x > 0.0 ? value : values.x;
+    cosine = tail ? cosine : 0.0;
+    float complement = 1.0 - cosine;
+    float fourth = complement * complement * complement * complement;
+    values.y = min(values.y, fourth * complement * values.x);
+    values.w = min(values.w, ltsh_dielectric_reflectance(cosine, ior) * values.x);
+    values.w = max(values.w, ltsh_dielectric_reflectance(1.0, ior) * values.x);
+    return values;
+}
+#endif
+
 vec3 ltsh_reflected(ltsh_point point, vec4 values)
 {
     vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;

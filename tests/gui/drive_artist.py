@@ -1,29 +1,46 @@
-"""An artist's first hour: a new scene, lights, objects and materials by mouse and keys; preview, solo, mute, undo;
-compare, wipe, bake, apply, save, reload. Its pictures stand beside those of EEVEE and Cycles.
+"""An artist's first hour, by mouse and keys: a new scene, the preview, lights and objects with their materials, solo,
+mute, undo; save, compare, wipe, bake, apply, reload. Its pictures stand beside those of EEVEE and Cycles.
 
-Only the values of materials are set by their properties; all else is clicked or typed.
+Materials are made in the Properties editor during the preview, as artists do. Set by their properties are only names,
+directions of lights, and what is smooth.
 """
+
+from pathlib import Path
 
 import bpy
 import eyes
 import hands
 import numpy as np
+from bpy_extras.view3d_utils import location_3d_to_region_2d
 
 SECONDS = 2400
 SIZE = "1600x900"
 # From the right and upper end of the sidebar, see `hands`: name, star and eye of the first light of the list.
 NAME, STAR, EYE, ROW = 225, 78, 58, 174
+# The same of the menu of presets, and, while a light is chosen during the preview, of its fields.
+PRESETS, DRAFT = (83, 15), (95, 55)
+LIGHT_FIELDS = {"power": (107, 332), "color": (107, 378), "size": (107, 424), "size y": (107, 447)}
+# From the right and upper end of the Properties editor: its tab of materials, and what is in it.
+MATERIAL_TAB, NEW = (13, 423), (101, 143)
+FIELDS = {"color": (86, 274), "metallic": (86, 299), "roughness": (86, 325), "transmission": (86, 549)}
+TRANSMISSION = (220, 518)
+HEX = (-55, -31)  # from the color to its field, while the color is edited
+SAVE = (65, 21)  # from the right and lower end of the file browser
+COMPARE, BAKE_HEADER, BAKE, APPLY = (149, 351), (223, 436), (149, 497), (160, 530)
 SOLID_SECONDS = 3.0
 
 
 def main(rig):
     yield from new_scene(rig)
+    yield from previewed(rig)
     yield from lights_added(rig)
     yield from objects_added(rig)
-    yield from previewed(rig)
+    yield from looked_at(rig)
     yield from lights_changed(rig)
     yield from beside_others(rig)
+    yield from saved_as(rig)
     yield from compared(rig)
+    yield from wiped(rig)
     yield from baked(rig)
     yield from saved(rig)
 
@@ -80,61 +97,111 @@ def moved(rig, **axes):
         yield from hands.keys(rig, "Return")
 
 
+def field(rig, place, text, kind="VIEW_3D", which="UI"):
+    """Double-click a field and type."""
+    rig.xdo("mousemove", *hands.to_window(rig, kind, which, *place))
+    yield hands.CLICK_SECONDS
+    rig.xdo("click", "--repeat", 2, "--delay", 80, 1)
+    yield hands.CLICK_SECONDS
+    yield from hands.keys(rig, "ctrl+a")
+    rig.xdo("type", text)
+    yield hands.CLICK_SECONDS
+    yield from hands.keys(rig, "Return")
+
+
+def color(rig, place, code, kind="VIEW_3D", which="UI"):
+    """Click a color and type its hexadecimal code."""
+    x, y = hands.to_window(rig, kind, which, *place)
+    yield from hands.click(rig, x, y)
+    rig.xdo("mousemove", x + HEX[0], y + HEX[1])
+    yield hands.CLICK_SECONDS
+    rig.xdo("click", "--repeat", 2, "--delay", 80, 1)
+    yield hands.CLICK_SECONDS
+    yield from hands.keys(rig, "ctrl+a")
+    rig.xdo("type", code)
+    yield hands.CLICK_SECONDS
+    yield from hands.keys(rig, "Return", "Return")
+    yield from hands.over(rig)
+
+
 def lights_added(rig):
-    lights = (("Key", {"x": 2.5, "y": -2, "z": 3}, 300.0, (1.0, 0.8, 0.6)),
-              ("Fill", {"x": -3, "y": -2, "z": 2.5}, 120.0, (0.5, 0.7, 1.0)),
-              ("Rim", {"x": 0, "y": 3.5, "z": 2.5}, 200.0, (1.0, 1.0, 1.0)))  # fmt: skip
-    for name, place, power, color in lights:
+    lights = (("Key", {"x": 2.5, "y": -2, "z": 3}, "300", "FFE7CB"),
+              ("Fill", {"x": -3, "y": -2, "z": 2.5}, "120", "BCDAFF"),
+              ("Rim", {"x": 0, "y": 3.5, "z": 2.5}, "200", ""))  # fmt: skip
+    for name, place, power, code in lights:
         ob = yield from added(rig, "area")
-        ob.name, ob.data.shape, ob.data.size, ob.data.size_y = name, "RECTANGLE", 2.0, 1.0
-        ob.data.energy, ob.data.color = power, color
+        ob.name, ob.data.shape = name, "RECTANGLE"
         yield from moved(rig, **place)
         rig.check(abs(ob.location.z - place["z"]) < 1e-3, f"typing moves {name}")
-        track = ob.constraints.new("TRACK_TO")
-        track.target, track.track_axis, track.up_axis = bpy.data.objects["Camera"], "TRACK_NEGATIVE_Z", "UP_Y"
-        bpy.context.view_layer.update()
-        ob.constraints.remove(track)
         ob.rotation_euler = (-ob.location).to_track_quat("-Z", "Y").to_euler()
+        yield 1
+        yield from field(rig, LIGHT_FIELDS["power"], power)
+        yield from field(rig, LIGHT_FIELDS["size"], "2")
+        if code:
+            yield from color(rig, LIGHT_FIELDS["color"], code)
+        rig.check((ob.data.energy, ob.data.size) == (float(power), 2.0), f"the panel sets {name}: {ob.data.energy} W")
+        rig.check(bool(code) == (ob.data.color[0] != ob.data.color[2]), f"and its color: {tuple(ob.data.color)}")
+    rig.shot("artist_02_lights.png")
 
 
 def objects_added(rig):
-    floor = yield from added(rig, "plane")
-    floor.scale = (6.0, 6.0, 1.0)
-    ball = yield from added(rig, "uv sphere")
-    ball.location, ball.scale = (-1.2, 0.0, 0.7), (0.7, 0.7, 0.7)
-    bpy.ops.object.shade_smooth()
-    glass = yield from added(rig, "cylinder")
-    glass.location, glass.scale = (1.3, -0.8, 0.6), (0.4, 0.4, 0.6)
-    monkey = yield from added(rig, "monkey")
-    monkey.location, monkey.rotation_euler = (0.4, 0.6, 0.75), (-0.5, 0.0, 0.6)
-    monkey.scale = (0.7, 0.7, 0.7)
-    bpy.ops.object.shade_smooth()
-    floor.name, ball.name, glass.name, monkey.name = "Floor", "Ball", "Cylinder", "Monkey"
-    material(floor, "Floor", Roughness=0.35, Base_Color=(0.35, 0.33, 0.3, 1.0))
-    material(ball, "Gold", Roughness=0.2, Metallic=1.0, Base_Color=(1.0, 0.75, 0.3, 1.0))
-    material(glass, "Glass", Roughness=0.05, Transmission_Weight=1.0, Base_Color=(0.7, 0.9, 1.0, 1.0))
-    material(monkey, "Clay", Roughness=0.5, Base_Color=(0.7, 0.25, 0.2, 1.0))
+    for words, name, place, scale, smooth, values in (
+        ("plane", "Floor", {}, "6", False, {"roughness": "0.35", "color": "A09C94"}),
+        ("uv sphere", "Ball", {"x": -1.2, "z": 0.7}, "0.7", True,
+         {"metallic": "1", "roughness": "0.2", "color": "FFDE95"}),
+        ("cylinder", "Cylinder", {"x": 1.3, "y": -0.8, "z": 0.6}, "0.5", False,
+         {"roughness": "0.05", "transmission": "1", "color": "D9F3FF"}),
+        ("monkey", "Monkey", {"x": 0.4, "y": 0.6, "z": 0.75}, "0.7", True, {"color": "D98A7B"}),
+    ):  # fmt: skip
+        ob = yield from added(rig, words)
+        ob.name = name
+        yield from moved(rig, **place)
+        yield from typed(rig, "s")
+        rig.xdo("type", scale)
+        yield hands.CLICK_SECONDS
+        yield from hands.keys(rig, "Return")
+        rig.check(abs(ob.scale.x - float(scale)) < 1e-3, f"typing scales {name}")
+        if smooth:
+            bpy.ops.object.shade_smooth()
+        yield from material(rig, ob, values)
+    bpy.data.objects["Monkey"].rotation_euler = (-0.5, 0.0, 0.6)
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 480, 270
     rig.camera_view()
     yield 2
     rig.shot("artist_02_objects.png")
 
 
-def material(ob, name, **values):
-    made = bpy.data.materials.new(name)
-    if not made.use_nodes:
-        made.use_nodes = True
-    inputs = made.node_tree.nodes["Principled BSDF"].inputs
-    for key, value in values.items():
-        inputs[key.replace("_", " ")].default_value = value
-    ob.data.materials.append(made)
+def material(rig, ob, values):
+    """A new material for the active object, by the Properties editor."""
+    editor = {"kind": "PROPERTIES", "which": "WINDOW"}
+    yield from hands.click(rig, *hands.to_window(rig, "PROPERTIES", "NAVIGATION_BAR", *MATERIAL_TAB))
+    yield from hands.click(rig, *hands.to_window(rig, *editor.values(), *NEW))
+    yield from hands.until(lambda: ob.material_slots)
+    rig.check(len(ob.material_slots) == 1, f"New gives {ob.name} a material")
+    yield 1
+    if "transmission" in values:
+        yield from hands.click(rig, *hands.to_window(rig, *editor.values(), *TRANSMISSION))
+        yield 1
+    for name, text in values.items():
+        yield from (color if name == "color" else field)(rig, FIELDS[name], text, **editor)
+    rig.shot(f"artist_02_{ob.name.lower()}.png")
+    inputs = ob.material_slots[0].material.node_tree.nodes["Principled BSDF"].inputs
+    names = {"metallic": "Metallic", "roughness": "Roughness", "transmission": "Transmission Weight"}
+    found = {key: round(inputs[name].default_value, 3) for key, name in names.items() if key in values}
+    wanted = {key: float(values[key]) for key in found}
+    rig.check(found == wanted, f"the Properties editor sets its material during the preview: {found}")
+    rig.check(inputs["Base Color"].default_value[2] != inputs["Base Color"].default_value[0], "and its color")
 
 
 def previewed(rig):
     yield from hands.click_button(rig, hands.PREVIEW)
-    pixels = yield from at_rest(rig, "artist_03_preview.png")
+    yield from hands.until(lambda: bpy.context.scene.render.engine == "LTSH")
     rig.check(bpy.context.scene.render.engine == "LTSH", "a click on the large button starts the preview")
-    rig.check(pixels.std() > 0.05, "and shows a picture")
+
+
+def looked_at(rig):
+    pixels = yield from at_rest(rig, "artist_03_preview.png")
+    rig.check(pixels.std() > 0.05, "the preview shows a picture")
 
 
 def at_rest(rig, name, seconds=25):
@@ -155,6 +222,7 @@ def lights_changed(rig):
     rig.check(active is not None and active.type == "LIGHT", f"the list selects {active and active.name}")
     key = bpy.data.objects["Key"]
     hands.select(rig, key)
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Selected")
     place, size = key.location.copy(), key.data.size
     x, y = hands.view_middle(rig)
     yield from hands.over(rig, x=0.4)
@@ -222,22 +290,82 @@ def beside_others(rig):
     yield SOLID_SECONDS
 
 
+def saved_as(rig):
+    """Ctrl S asks for a name."""
+    yield from typed(rig, "ctrl+s")
+    yield from hands.until(lambda: browser()[1] is not None)
+    yield 2
+    window, area = browser()
+    area.spaces.active.params.directory = str(rig.out).encode()
+    area.spaces.active.params.filename = "artist.blend"
+    yield 2
+    rig.shot("artist_12_saving.png")
+    yield from hands.click(rig, window.x + window.width - SAVE[0], rig.size[1] - window.y - SAVE[1])
+    yield from hands.until(lambda: bpy.data.filepath)
+    rig.check(Path(bpy.data.filepath).name == "artist.blend", f"the file is saved: {bpy.data.filepath}")
+    yield 2
+
+
+def browser():
+    """The window and the area of a file browser, None where there is none."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "FILE_BROWSER":
+                return window, area
+    return None, None
+
+
+def click_in_view(rig, name, right=0, up=0, key=""):
+    """Click an object in the 3D view, with a key held; its origin is (right, up) pixels from there."""
+    region, ob = rig.region(), bpy.data.objects[name]
+    x, y = location_3d_to_region_2d(region, rig.space.region_3d, ob.matrix_world.translation)
+    rig.xdo("mousemove", round(region.x + x + right), round(rig.size[1] - region.y - y - up))
+    yield hands.CLICK_SECONDS
+    if key:
+        rig.xdo("keydown", key)
+        yield 0.3
+    rig.xdo("click", 1)
+    yield hands.CLICK_SECONDS
+    if key:
+        rig.xdo("keyup", key)
+        yield 0.3
+
+
 def compared(rig):
-    bpy.ops.wm.save_as_mainfile(filepath=str(rig.out / "artist.blend"))
-    hands.settings().cycles_samples, hands.settings().anti_aliasing, hands.settings().shadow_rays = 64, 1, 64
+    yield from hands.click_button(rig, PRESETS)
+    yield 1
+    rig.shot("artist_12_presets.png")
+    yield from hands.click_button(rig, DRAFT)
+    yield from hands.until(lambda: hands.settings().cycles_samples == 64)
+    rig.check(hands.settings().cycles_samples == 64, "the menu of presets has Draft")
+    hands.settings().resolution_percentage = 100
     rig.area("DOPESHEET_EDITOR").ui_type = "IMAGE_EDITOR"
     yield 2
-    hands.operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
-    yield from hands.job_started(rig, "Compare with Cycles starts a job")
+    yield from click_in_view(rig, "Ball")
+    rig.check(bpy.context.view_layer.objects.active.name == "Ball", "a click in the view selects the ball")
+    yield 1
+    yield from hands.click_button(rig, COMPARE)
+    yield from hands.job_started(rig, "a click on Compare with Cycles starts a job")
     yield from hands.wait_for_job(rig, 600, ["artist_12_comparing.png"])
     image = rig.area("IMAGE_EDITOR").spaces.active.image
     rig.check(image is not None and image.name == "LTSH Comparison", "the pictures open by themselves")
     yield 2
     rig.shot("artist_13_compared.png")
-    hands.settings().split = 0.3
     rig.check(len(bpy.context.window_manager.windows) == 1, "in the editor that was free")
-    rig.area("IMAGE_EDITOR").ui_type = "DOPESHEET"
+
+
+def wiped(rig):
+    """Drag the line in the Image Editor; without one the pictures open in a window of their own."""
+    yield from hands.results_opened(rig)
     yield 1
+    region = rig.region("IMAGE_EDITOR")
+    (x, y), (end, _) = (region.view2d.view_to_region(split, 0.4) for split in (hands.settings().split, 0.3))
+    height = rig.size[1] - region.y - y
+    yield from hands.drag(rig, (region.x + x, height), (region.x + end, height))
+    yield from hands.line_at(rig, 0.3, 0.05)
+    rig.shot("artist_13_wiped.png")
+    hands.operate(rig, bpy.ops.screen.area_close, kind="IMAGE_EDITOR")
+    yield 2
     hands.operate(rig, bpy.ops.ltsh.open_results)
     yield 4
     windows = bpy.context.window_manager.windows
@@ -249,23 +377,30 @@ def compared(rig):
 
 def baked(rig):
     hands.settings().bake_size, hands.settings().bake_view = "256", "above"
-    for name in ("Floor", "Monkey"):
-        hands.select(rig, bpy.data.objects[name])
-    bpy.data.objects["Floor"].select_set(True)
+    yield from click_in_view(rig, "Floor", up=-150)
+    yield from click_in_view(rig, "Monkey", key="shift")
+    chosen = {ob.name for ob in bpy.context.selected_objects}
+    rig.check(chosen == {"Floor", "Monkey"}, f"clicks in the view select both: {chosen}")
     yield 1
-    hands.operate(rig, bpy.ops.ltsh.bake, "INVOKE_DEFAULT")
-    yield from hands.job_started(rig, "Bake Selected starts a job")
+    yield from hands.click_button(rig, BAKE_HEADER)
+    yield 2
+    rig.shot("artist_15_bake.png")
+    yield from hands.click_button(rig, BAKE)
+    yield from hands.job_started(rig, "a click on Bake Selected starts a job")
     yield from hands.wait_for_job(rig, 600)
     for window in list(bpy.context.window_manager.windows)[1:]:
         hands.close_window(window)
-    yield 1
-    hands.operate(rig, bpy.ops.ltsh.apply_bake)
+    yield 3
+    rig.shot("artist_15_baked.png")
+    yield from hands.click_button(rig, APPLY)
+    yield 2
     slots = [bpy.data.objects[name].material_slots[0].material.name for name in ("Floor", "Monkey")]
-    rig.check(all("(baked" in name for name in slots), f"Apply Bake shows the textures: {slots}")
+    rig.check(all("(baked" in name for name in slots), f"a click on Apply Bake shows the textures: {slots}")
     rig.space.shading.type = "MATERIAL"
-    yield 25
-    rig.shot("artist_15_applied.png")
+    yield 40
+    rig.shot("artist_16_applied.png")
     rig.space.shading.type = "SOLID"
+    yield 1
 
 
 def saved(rig):
@@ -279,6 +414,7 @@ def saved(rig):
     image = next(image for image in bpy.data.images if image.name.startswith("Floor"))
     rig.check(image.size[0] == 256 and np.ptp(np.array(image.pixels)) > 0.0, "from its file")
     hands.operate(rig, bpy.ops.ltsh.restore_materials)
-    rig.check(bpy.data.objects["Floor"].material_slots[0].material.name == "Floor", "Restore Materials gives it back")
+    name = bpy.data.objects["Floor"].material_slots[0].material.name
+    rig.check("(baked" not in name, f"Restore Materials gives it back: {name}")
     yield 1
-    rig.shot("artist_16_reloaded.png")
+    rig.shot("artist_17_reloaded.png")

@@ -352,6 +352,10 @@ def _entry_of(context, ob):
     return next((entry for entry in overview(context.scene).lights if entry.name == ob.name), None)
 
 
+# As Blender's own panel has them.
+SHORT_NAMES = {"shadow_soft_size": "Radius", "spot_size": "Spot Size", "spot_blend": "Blend"}
+
+
 def light_properties(light) -> list[str]:
     """What can be set at a light, by its type and shape."""
     names = ["energy", "exposure", "color"]
@@ -382,7 +386,7 @@ class _Lights(_Entries):
         split_names(layout, context)
         column = layout.column()
         for name in light_properties(ob.data):
-            column.prop(ob.data, name)
+            column.prop(ob.data, name, text=SHORT_NAMES.get(name))
 
 
 class _Materials(_Entries):

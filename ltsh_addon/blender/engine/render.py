@@ -35,6 +35,7 @@ from ..ui.job import (
     Step,
     finished_steps,
     progress_text,
+    seen,
     shading_steps,
     stage_title,
 )
@@ -127,8 +128,10 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             while not pictures.empty():
                 self._show(pictures.get(), job.view_layer)
 
-        progress = self._progress(Plan(job.steps()), show_new)
+        plan = Plan(job.steps(), seen=seen)
+        progress = self._progress(plan, show_new)
         picture = stoppable(lambda report: final_picture(job, scene_file, report, pictures.put), progress)
+        plan.end(seen)
         for problem in picture.problems:
             self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:

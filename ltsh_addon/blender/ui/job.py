@@ -44,7 +44,7 @@ STAGE_TITLES = {
     "lights": "Light Mixer",
 }
 # Costs count as if so many seconds had been measured.
-PRIOR_SECONDS = 5.0
+PRIOR_SECONDS, LITTLE_SECONDS = 5.0, 1.0
 # Below, what a stage reports says too little about its length.
 LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
 # An end that is not reported is not shown.
@@ -215,13 +215,36 @@ def _shading(technique: str, points: float) -> float:
     return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
 
 
-class Plan:
-    """Follows a job through its `steps`; the first begins at once, some may never be reported."""
+# Seconds and costs of the stages of the jobs that have ended in this session, by kind.
+Seen = dict[str, tuple[float, float]]
+seen: Seen = {}
 
-    def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic):
-        self._steps, self._now = tuple(steps), now
+
+def _kind(stage: str) -> str:
+    """What stages have in common that take as long for their cost: those of all objects of a bake are alike."""
+    first = stage.partition(" ")[0]
+    return first if first in ("bake", "shade") else stage
+
+
+def paces(seen: Seen) -> dict[str, float]:
+    """Seconds for a cost of 1 by kind of stage, and by "" that of all others."""
+    # Small stages say little about large ones.
+    found = {kind: (seconds + LITTLE_SECONDS) / (cost + LITTLE_SECONDS) for kind, (seconds, cost) in seen.items()}
+    seconds, cost = (sum(values) for values in zip(*seen.values(), strict=True)) if seen else (0.0, 0.0)
+    return {**found, "": (seconds + PRIOR_SECONDS) / (cost + PRIOR_SECONDS)}
+
+
+class Plan:
+    """Follows a job through its `steps`; the first begins at once, some may never be reported. For their cost they are
+    expected to take as long as in the jobs `seen` before."""
+
+    def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, seen: Seen | None = None):
+        pace, self._asked = paces(seen or {}), tuple(steps)
+        self._steps = tuple(replace(step, cost=step.cost * pace.get(_kind(step.stage), pace[""])) for step in steps)
+        self._now = now
         self._at, self._share = 0, 0.0
         self._measured: dict[str, float] = {}
+        self._seen: Seen = {}
         self._done_cost = self._done_seconds = 0.0
         self._started = self._stage_started = self._reported = now()
         self._fraction = 0.0
@@ -249,8 +272,18 @@ class Plan:
     def _end_step(self) -> None:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
         self._measured[step.stage] = seconds
+        kind, cost = _kind(step.stage), self._asked[self._at].cost
+        before = self._seen.get(kind, (0.0, 0.0))
+        self._seen[kind] = before[0] + seconds, before[1] + cost
         self._done_cost += step.cost
         self._done_seconds += seconds
+
+    def end(self, seen: Seen) -> None:
+        """The job has ended well; `seen` gets what its stages took."""
+        self._reported = self._now()
+        if self._at == self.count - 1:
+            self._end_step()
+        seen.update(self._seen)
 
     def share(self) -> float:
         """Of the whole job that is done, in [0, `MOST`]."""
@@ -351,6 +384,8 @@ class Job:
             self.error = self.error or message["error"]
         elif "end" in message:
             self.finished = True
+            if not self.error:
+                self.plan.end(seen)
             self.remove_folder()
 
     def wait(self, seconds: float = 0.05) -> None:

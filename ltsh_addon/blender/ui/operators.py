@@ -12,7 +12,7 @@ from bpy.app.translations import pgettext_iface as translated
 from ...scene import SceneError, error_line
 from ..saving import save_working_copy
 from . import comparison, preflight, results
-from .job import Job, Plan, clock, new_folder, progress_text, runs_of, stage_title, steps
+from .job import Job, Plan, clock, new_folder, progress_text, runs_of, seen, stage_title, steps
 
 
 def save_scene_copy(path: Path) -> None:
@@ -111,7 +111,7 @@ class _JobOperator:
         folder = new_folder()
         copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
         runs = runs_of(context, self.command, copy)
-        job = Job(self.bl_label, Plan(steps(runs)), folder, self.command, context.scene.session_uid)
+        job = Job(self.bl_label, Plan(steps(runs), seen=seen), folder, self.command, context.scene.session_uid)
         job.output = runs[-1].options.output
         try:
             save_scene_copy(copy)

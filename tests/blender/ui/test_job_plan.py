@@ -84,6 +84,43 @@ def test_a_stage_that_comes_again_is_expected_to_take_as_long_again():
     assert plan.number == 3 and plan.seconds_left() == pytest.approx(32.0)
 
 
+def test_a_job_is_expected_to_take_as_long_as_the_last_one():
+    """Of twice the size, on a machine that takes three times as long for samples and ten times for the rest."""
+    costs, paces = (2.0, 30.0, 20.0), (10.0, 3.0, 10.0)
+    plan, clock = plan_of(*costs)
+    for stage, cost, pace in zip(STAGES, costs, paces, strict=False):
+        plan.report(stage, 0.0)
+        clock.now += cost * pace
+    seen = {}
+    plan.end(seen)
+    assert seen == {stage: (cost * pace, cost) for stage, cost, pace in zip(STAGES, costs, paces, strict=False)}
+    larger = [Step(stage, 2.0 * cost) for stage, cost in zip(STAGES, costs, strict=False)]
+    takes = sum(2.0 * cost * pace for cost, pace in zip(costs, paces, strict=True))
+    assert Plan(larger, lambda: clock.now).seconds_left() < takes / 4.0
+    assert Plan(larger, lambda: clock.now, seen).seconds_left() == pytest.approx(takes, rel=0.15)
+
+
+def test_stages_that_no_job_had_are_expected_at_the_pace_of_all_and_objects_of_a_bake_are_alike():
+    seen = {"bake": (80.0, 40.0), "open": (40.0, 20.0)}
+    plan = Plan([Step("bake wall", 100.0), Step("images", 100.0)], lambda: 0.0, seen)
+    assert plan.seconds_left() == pytest.approx(400.0, rel=0.1)
+
+
+def test_a_small_job_says_little_about_a_large_one():
+    """A stage that took a second for next to nothing."""
+    assert Plan([Step("open", 100.0)], lambda: 0.0, {"open": (1.0, 0.001)}).seconds_left() < 250.0
+
+
+def test_a_job_that_ends_early_teaches_what_it_has_done():
+    plan, clock = plan_of(10.0, 10.0, 10.0)
+    clock.now += 20.0
+    plan.report("samples", 0.5)
+    clock.now += 3.0
+    seen = {}
+    plan.end(seen)
+    assert seen == {"open": (20.0, 10.0)}
+
+
 def test_stages_that_are_left_out_are_passed_over_and_unknown_ones_change_nothing():
     plan, _ = plan_of(1.0, 1.0, 1.0, 1.0, 1.0)
     plan.report("B", 0.0)

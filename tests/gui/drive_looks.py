@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import bpy
-from hands import close_window, drag, operate, over, results_opened, settings
+from hands import close_window, drag, operate, over, results_opened, select, settings
 
 SECONDS = 1200
 SIZE = "1600x900"
@@ -26,8 +26,12 @@ def main(rig):
     yield 2
     rig.check(rig.region("IMAGE_EDITOR", "UI").active_panel_category == "LTSH", "the tab of the Image Editor is open")
     rig.shot("1_dark.png")
+    operate(rig, bpy.ops.ltsh.preview)
+    select(rig, bpy.data.objects["Sunset"])
+    yield 6
+    rig.shot("1_dark_preview.png")
     theme("Blender_Light")
-    yield 1
+    yield 3
     rig.shot("2_light.png")
     theme("Blender_Dark")
     yield from narrow(rig)
@@ -37,7 +41,13 @@ def main(rig):
     # Panels move to their new places, slowly on a busy machine.
     yield 6
     rig.shot("4_twice_the_scale.png")
+    # Those that are further down.
+    yield from over(rig, "VIEW_3D", "UI")
+    rig.xdo("click", "--repeat", 20, 5)
+    yield 3
+    rig.shot("4_further_down.png")
     bpy.context.preferences.view.ui_scale = 1.0
+    operate(rig, bpy.ops.ltsh.preview)
     rig.area("PROPERTIES").spaces.active.context = "RENDER"
     yield 1
     operate(rig, bpy.ops.screen.screen_full_area, kind="PROPERTIES")
@@ -49,7 +59,26 @@ def main(rig):
     rig.shot("5_render_properties.png")
     operate(rig, bpy.ops.screen.back_to_previous, kind="PROPERTIES")
     yield 1
+    yield from two_windows(rig)
     yield from preferences(rig)
+
+
+def two_windows(rig):
+    """Two views of a scene, the preview in the second."""
+    operate(rig, bpy.ops.screen.area_dupli, "INVOKE_DEFAULT")
+    yield 3
+    second = bpy.context.window_manager.windows[-1]
+    area = next(area for area in second.screen.areas if area.type == "VIEW_3D")
+    with bpy.context.temp_override(window=second, area=area):
+        bpy.ops.ltsh.preview()
+    yield 6
+    rig.check(area.spaces.active.shading.type == "RENDERED", "the preview is in the second window")
+    rig.check(rig.space.shading.type == "SOLID", "and in that alone")
+    rig.shot("7_two_windows.png")
+    with bpy.context.temp_override(window=second, area=area):
+        bpy.ops.ltsh.preview()
+    close_window(second)
+    yield 1
 
 
 def theme(name):

@@ -1,0 +1,195 @@
+"""What comes in between: undo, Escape and another file during the preview, F12, a bake and in the light mixer."""
+
+import tempfile
+from pathlib import Path
+
+import bpy
+import eyes
+import hands
+import numpy as np
+
+SIZE = "1280x900"
+SECONDS = 1800
+ENDING_SECONDS = 20.0
+
+
+def main(rig):
+    other = str(Path(bpy.data.filepath).with_name("other.blend"))
+    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    before = folders()
+    yield from hands.open_panel(rig)
+    yield 1
+    yield from during_the_preview(rig, other)
+    yield from during_a_render(rig, other, before)
+    yield from during_a_bake(rig, other, before)
+    yield from in_the_mixer(rig, other)
+    rig.shot("7_end.png")
+
+
+def folders():
+    return sorted(str(path) for path in Path(tempfile.gettempdir()).parent.glob("ltsh-*"))
+
+
+def typed(rig, *names):
+    yield from hands.over(rig)
+    yield from hands.keys(rig, *names)
+
+
+def opened(rig, path):
+    """Open a file as File > Open does; the panel is there again."""
+    bpy.ops.wm.open_mainfile(filepath=path)
+    yield 1
+    yield from hands.open_panel(rig)
+    yield 1
+
+
+def engine():
+    return bpy.context.scene.render.engine
+
+
+def during_the_preview(rig, other):
+    artist = engine()
+    yield from hands.click_button(rig, hands.PREVIEW)
+    yield 3
+    rig.check(engine() == "LTSH" and rig.space.shading.type == "RENDERED", "the preview is on")
+    light = bpy.data.objects["Neon"]
+    hands.select(rig, light)
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Selected")
+    place = light.location.copy()
+    x, y = hands.view_middle(rig)
+    yield from typed(rig, "g")
+    for step in range(1, 6):
+        rig.xdo("mousemove", x - 30 * step, y)
+        yield 0.2
+    rig.check((light.location - place).length > 0.01, "the mouse drags the light")
+    yield from hands.keys(rig, "Escape")
+    rig.check((light.location - place).length < 1e-6, "Escape puts it back")
+    yield from typed(rig, "Delete")
+    yield from hands.until(lambda: "Neon" not in bpy.context.scene.objects)
+    rig.check("Neon" not in bpy.context.scene.objects, "Delete removes it")
+    yield from typed(rig, "ctrl+z")
+    yield from hands.until(lambda: "Neon" in bpy.context.scene.objects)
+    rig.check(engine() == "LTSH", "one undo brings the light back, and the preview stays")
+    rig.shot("1_preview.png")
+    yield from typed(rig, "ctrl+z", "ctrl+z", "ctrl+z")
+    yield from hands.until(lambda: engine() == artist)
+    rig.check(engine() == artist and rig.space.shading.type == "SOLID", f"undo ends the preview: {engine()}")
+    yield from typed(rig, "ctrl+shift+z", "ctrl+shift+z", "ctrl+shift+z")
+    rig.check(engine() == "LTSH", "redo brings it back")
+    rig.space.shading.type = "RENDERED"
+    yield 0.5
+    # While shadows are traced and the view is refined.
+    yield from opened(rig, other)
+    rig.check(engine() == artist and not eyes.view().artist_engine, "another file has its own engine, and no preview")
+
+
+def during_a_render(rig, other, before):
+    """Undo and another file while F12 renders."""
+    for what in ("undo", "file"):
+        scene = bpy.context.scene
+        scene.render.engine = "LTSH"
+        scene.render.resolution_x, scene.render.resolution_y = 1280, 720
+        hands.settings().anti_aliasing = 16
+        light = bpy.data.objects["Neon"]
+        hands.operate(rig, bpy.ops.ed.undo_push, message="Before")
+        light.location.x += 1.0
+        hands.operate(rig, bpy.ops.ed.undo_push, message="Moved")
+        ended = yield from eyes.render_started(rig)
+        yield from hands.until(lambda: folders() != before, 20)
+        yield 4
+        rig.check(folders() != before and not ended, "F12 renders")
+        rig.shot(f"2_rendering_{what}.png")
+        if what == "undo":
+            moved = light.location.x
+            yield from hands.over(rig, *picture_area(rig))
+            yield from hands.keys(rig, "ctrl+z")
+            yield 2
+            rig.fact("the light while F12 renders and after Ctrl Z", [moved, bpy.data.objects["Neon"].location.x])
+            rig.shot("2_undone.png")
+            yield from hands.over(rig, *picture_area(rig))
+            rig.xdo("key", "Escape")
+            yield from hands.until(lambda ended=ended: ended, ENDING_SECONDS)
+            rig.check(bool(ended), f"Escape or undo ends it: {ended}")
+            yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
+            rig.check(folders() == before, f"nothing of it is left: {folders()}")
+            rig.xdo("key", "Escape")
+            yield 1
+        yield from opened(rig, other)
+        yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
+        rig.check(folders() == before, f"after another file nothing of the render is left: {folders()}")
+        rig.check(not hands.module("ui.results")._rendered, "nor in the mixer")
+        rig.shot(f"3_opened_{what}.png")
+
+
+def picture_area(rig):
+    """The area that shows the render."""
+    kinds = [area.type for area in rig.window.screen.areas]
+    return ("IMAGE_EDITOR", "WINDOW") if "IMAGE_EDITOR" in kinds else ("VIEW_3D", "WINDOW")
+
+
+def during_a_bake(rig, other, before):
+    for what in ("Escape", "undo", "file"):
+        settings = hands.settings()
+        settings.bake_size, settings.anti_aliasing = "1024" if what != "undo" else "256", 1
+        hands.select(rig, bpy.data.objects["floor"])
+        light = bpy.data.objects["Neon"]
+        energy = light.data.energy
+        hands.operate(rig, bpy.ops.ed.undo_push, message="Before")
+        light.data.energy = 2.0 * energy
+        hands.operate(rig, bpy.ops.ed.undo_push, message="Brighter")
+        hands.operate(rig, bpy.ops.ltsh.bake, "INVOKE_DEFAULT")
+        yield from hands.job_started(rig, "a bake starts")
+        job = hands.job()
+        yield from hands.until(lambda job=job: job.stage != "Starting", 60)
+        if what == "Escape":
+            yield from typed(rig, "Escape")
+            yield from hands.until(lambda: hands.job() is None)
+            rig.check(job.cancelled, "Escape ends it")
+            bpy.data.objects["Neon"].data.energy = energy
+        elif what == "undo":
+            yield from typed(rig, "ctrl+z")
+            rig.check(abs(bpy.data.objects["Neon"].data.energy - energy) < 1e-4, "undo reaches the light")
+            yield from hands.wait_for_job(rig, 600)
+            rig.check(not job.error and job.shown == 1, f"and the bake ends well: {job.error}")
+            yield 1
+            rig.check(hands.image_pixels("LTSH floor ltsh4.combined") != (), "with its texture")
+            rig.shot("4_baked.png")
+            yield from typed(rig, "ctrl+z")
+            rig.check("LTSH floor ltsh4.combined" not in bpy.data.images, "one undo takes it away")
+        else:
+            yield from opened(rig, other)
+            rig.check(hands.job() is None and job.cancelled, "another file ends it")
+        yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
+        rig.check(folders() == before, f"{what}: nothing of it is left: {folders()}")
+
+
+def in_the_mixer(rig, other):
+    """Undo of a mixed value, and another file while a mix is shown."""
+    settings = hands.settings()
+    settings.anti_aliasing, settings.resolution_percentage = 1, 40
+    hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
+    yield from hands.job_started(rig, "shading starts")
+    yield from hands.wait_for_job(rig, 600)
+    yield 1
+    settings = hands.settings()
+    rig.check(len(settings.mixed) > 1, "the mixer has lights")
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Shaded")
+    settings.mixed[0].power = 3.0
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Brighter")
+    brighter = np.array(hands.image_pixels("LTSH Comparison"))
+    settings.mixed[0].muted = True
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Muted")
+    yield 1
+    muted = np.array(hands.image_pixels("LTSH Comparison"))
+    rig.check(np.abs(brighter - muted).max() > 1e-3, "muting changes the picture")
+    rig.shot("5_mixed.png")
+    yield from typed(rig, "ctrl+z")
+    yield 1
+    rig.check(not hands.settings().mixed[0].muted, "undo unmutes")
+    rig.check(np.allclose(hands.image_pixels("LTSH Comparison"), brighter, atol=1e-5), "and the picture follows")
+    yield from typed(rig, "ctrl+shift+z")
+    yield 1
+    rig.check(np.allclose(hands.image_pixels("LTSH Comparison"), muted, atol=1e-5), "redo mutes, and so it does again")
+    yield from opened(rig, other)
+    rig.check("LTSH Comparison" not in bpy.data.images and not hands.settings().mixed, "another file has no mix")
+    rig.shot("6_opened.png")

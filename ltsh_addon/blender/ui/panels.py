@@ -386,7 +386,7 @@ class _Lights(_Entries):
         split_names(layout, context)
         column = layout.column()
         for name in light_properties(ob.data):
-            column.prop(ob.data, name, text=SHORT_NAMES.get(name))
+            column.prop(ob.data, name, text=SHORT_NAMES.get(name, ob.data.bl_rna.properties[name].name))
 
 
 class _Materials(_Entries):

@@ -285,13 +285,14 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     samples and reference both show as any render does.
     """
     render, cycles = scene.render, scene.cycles
-    for owner, name, label in (
-        (render, "use_motion_blur", "motion blur"),
-        (render, "use_multiview", "stereoscopy"),
-        (camera.data.dof, "use_dof", f"depth of field of camera {camera.name!r}"),
+    lens = f"depth of field of camera {camera.name!r}"
+    for owner, name, label, remedy in (
+        (render, "use_motion_blur", "motion blur", ""),
+        (render, "use_multiview", "stereoscopy", ""),
+        (camera.data.dof, "use_dof", lens, "; shade and render have it with several points per pixel (--aa)"),
     ):
         if getattr(owner, name):
-            warnings.append(f"{label} is switched off, in the Cycles reference as well")
+            warnings.append(f"{label} is switched off, in the Cycles reference as well{remedy}")
             setattr(owner, name, False)
     warnings.extend(steps_after_rendering(scene))
     scene.camera = camera

@@ -91,14 +91,15 @@ def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
 
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
-    """Pixels of a one-sample render that show a surface (its depth is finite) which wrote no AOV and is no holdout."""
+    """Pixels of a one-sample render that show a surface (it has a normal) which wrote no AOV and is no holdout."""
     return int(np.count_nonzero(_shows_surface(channels) & (read_aov(channels, "hit") == 0.0)))
 
 
 def _shows_surface(channels: dict[str, np.ndarray]) -> np.ndarray:
     """Mask (H, W)."""
-    depth = read_layer(channels, "Depth", "Z" if any(key.endswith("Depth.Z") for key in channels) else "V")
-    return (depth < 1e9) & (read_layer(channels, "Combined", "A") != 0.0)
+    # Depth is that of the first sample of a pixel, whichever is rendered.
+    normal = read_layer(channels, "Normal", "XYZ")
+    return normal.any(axis=-1) & (read_layer(channels, "Combined", "A") != 0.0)
 
 
 def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:

@@ -5,6 +5,8 @@
 The same is done with the Combined pass of each light group of the view layer, of which Cycles writes no direct light:
 that of all lights is shared out as ours is. So what a light group bounces can change with its lights.
 
+With depth of field, of which few points of the lens leave noise in ours too, the sum is denoised as a whole.
+
 Ours, a specular and a diffuse picture, takes the place of Cycles' direct light pixel by pixel. Where something is not
 shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
 """
@@ -126,7 +128,7 @@ def finish(
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles)
-        rest, rests, denoiser, problems = _rest(cycles, ours, options, progress)
+        rest, rests, denoiser, problems = _rest(cycles, ours, comparison.extraction.has_lens, options.denoise, progress)
         combined = rest.copy()
         for part in ours.values():
             combined[..., :3] += part.image
@@ -249,7 +251,7 @@ def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
 
 
 def _rest(
-    cycles, ours: dict[str, _Part], options, progress
+    cycles, ours: dict[str, _Part], is_noisy: bool, denoise: str, progress
 ) -> tuple[np.ndarray, dict[str, np.ndarray], str, list[str]]:
     """What is not ours (H, W, 4), denoised; the same by light group, and by "" of what is in none; the name of the
     denoiser ("" for none), and what was wrong with it."""
@@ -263,16 +265,18 @@ def _rest(
     groups = sorted(
         {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
     )
-    found = [rest[..., :3], *(_rest_of_group(cycles, ours, group) for group in groups)]
+    # What of ours goes through the denoiser too.
+    own = sum(part.image for part in ours.values()) if is_noisy else 0.0
+    found = [rest[..., :3] + own, *(_rest_of_group(cycles, ours, group) for group in groups)]
     name, problems = "", []
-    if options.denoise == "on":
+    if denoise == "on":
         guides = [read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL)]
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
                 found, name = denoiser.all_denoised(found, *guides), denoiser.name
         except NoDenoiser as error:
             problems = [f"{error}; the picture is not denoised"]
-    rest[..., :3] = found[0]
+    rest[..., :3] = found[0] - own
     return rest, _shared_out(rest, dict(zip(groups, found[1:], strict=True)), is_clean=bool(name)), name, problems
 
 
@@ -290,7 +294,7 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
     """`groups` (H, W, 3), and by "" what they leave of `rest` (H, W, 4): of what is clean never more than there is."""
     if is_clean and groups:
         whole = np.maximum(sum(groups.values()), 1e-30)
-        groups = {name: one * np.minimum(rest[..., :3] / whole, 1.0) for name, one in groups.items()}
+        groups = {name: one * np.clip(rest[..., :3] / whole, 0.0, 1.0) for name, one in groups.items()}
     left = rest.copy()
     for one in groups.values():
         left[..., :3] -= one

@@ -38,7 +38,7 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     layer = render_settings.only_view_layer(scene, warnings, job["view_layer"], "rendered")
     width, height = render_settings.set_resolution(scene, job["width"], job["height"])
-    everything = _kept_by_cycles(scene, layer, camera)
+    everything = _kept_by_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
     files = _render_chunks(scene, layer, folder, job, progress)
@@ -74,13 +74,12 @@ def show_finished(job: dict, folder: Path, progress) -> dict:
     return {}
 
 
-def _kept_by_cycles(scene, layer, camera) -> list[str]:
+def _kept_by_cycles(scene, layer) -> list[str]:
     """Why all direct light of the picture is left to Cycles."""
     world = layer.world_override or scene.world
     outputs = [] if world is None or tree_in_use(world) is None else tree_in_use(world).nodes
     rendered = [ob for ob in scene.objects if not ob.hide_render]
     found = {
-        f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
         "motion blur": scene.render.use_motion_blur,
         "the volume of the world": any(
             node.bl_idname == "ShaderNodeOutputWorld" and node.inputs["Volume"].is_linked for node in outputs

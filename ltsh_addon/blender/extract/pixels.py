@@ -42,12 +42,14 @@ from .origin import move_to_origin
 def render_pixel_samples(
     scene, view_layer, folder: Path, offsets: np.ndarray, progress, extra_passes: tuple[str, ...] = (), end=math.inf
 ) -> list[str]:
-    """Names of the files in `folder`, one for each of the `offsets` (N, 2) from the pixels' centers. At the processor
-    time `end` those that are left are not rendered."""
+    """Names of the files in `folder`, one for each of the `offsets` (N, 2) from the pixel centers; with depth of field
+    each has other points of the lens. At the processor time `end` those that are left are not rendered."""
     declare_aovs(view_layer)
-    enable_passes(view_layer, ("combined", "diffuse_color", "z", *extra_passes))
+    enable_passes(view_layer, ("combined", "diffuse_color", "normal", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
-    files, sub_samples = [], len(offsets)
+    files, sub_samples, cycles = [], len(offsets), scene.cycles
+    if scene.camera.data.dof.use_dof:
+        cycles.samples, cycles.use_sample_subset, cycles.sample_subset_length = sub_samples, True, 1
     # Only the camera differs: the others need no second look at the scene, and show the same bits.
     scene.render.use_persistent_data = sub_samples > 1
     with pinned_pixel_filter(scene), without_scripts(scene):
@@ -56,13 +58,16 @@ def render_pixel_samples(
                 break
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
+            cycles.sample_offset = index  # of a subset
             with shifted_pixels(scene, offset):
                 render_exr(scene, folder / files[-1])
-    scene.render.use_persistent_data = False
+    scene.render.use_persistent_data = cycles.use_sample_subset = False
     remove_aovs(view_layer)
     return files
 
 
+# Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
+FINISHED_LENS = 32
 # What may be asked for -> the pass of Cycles that has it.
 EXTRA_PASSES = {"emission": "emit", "background": "environment"}
 # File with what stands in the way of light.
@@ -241,9 +246,17 @@ def extract(job: dict, folder: Path, progress) -> dict:
     picture = _picture(scene, job)
     has_shadows = job.get("shadows") == "on"
     for_finished = job.get("for_finished", False)
+    # By the points of the pixels; those of the reference are others.
+    lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
+    has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
+    is_sharp = lens.use_dof = lens.use_dof and not has_lens
     inventory = prepare_scene(
         scene, view_layer, camera, warnings, with_occluders=has_shadows, for_finished=for_finished
     )
+    lens.use_dof = has_lens
+    if is_sharp and for_finished:
+        points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
+        inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")
     seconds["start"] = time.monotonic() - started
 
     if has_shadows:
@@ -279,6 +292,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "unshaded": inventory.unshaded,
         "kept": {**vars(inventory.kept), "warnings": inventory.warnings} if for_finished else None,
         "samples": samples,
+        "has_lens": has_lens,
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,

@@ -114,6 +114,7 @@ class Extraction:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     light_settings: dict[str, list[float]] = field(default_factory=dict)
     processor_seconds: float = 0.0  # of the child
+    has_lens: bool = False  # depth of field: samples are seen through different points of the lens
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
@@ -138,7 +139,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
         kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
-        if options.for_finished:
+        # Points of a blurred pixel may be far from each other.
+        if options.for_finished and not manifest["has_lens"]:
             samples, film = gbuffer.merged(samples, film)
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
@@ -161,6 +163,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
             processor_seconds=manifest["processor_seconds"],
+            has_lens=manifest["has_lens"],
         )
 
 

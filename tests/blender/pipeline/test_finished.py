@@ -1,6 +1,7 @@
 """A finished picture is what Cycles renders: each kind of path alone, nothing twice, nothing lost."""
 
 import json
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -12,7 +13,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import RenderOptions, render
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, render, shade_scene
 from ltsh_addon.pipeline.lighting import KeptPicture
 from ltsh_addon.pipeline.relight import LightChange, light_pictures, relight
 from ltsh_addon.scene import PASSES
@@ -90,6 +91,12 @@ def transparent_film():
     bpy.data.objects.remove(scene.objects["Plane"])
 
 
+def depth_of_field():
+    """The ball and the floor before it and behind it are some 20 pixels out of focus."""
+    lens = floor_and_ball(gray(), 1).camera.data.dof
+    lens.use_dof, lens.focus_distance, lens.aperture_fstop, lens.aperture_blades = True, 2.0, 0.15, 5
+
+
 # What is built, and the share of the pixels on which each pass is ours.
 SCENES = {
     "direct diffuse": (lambda: floor_and_ball(bsdf("BsdfDiffuse")), (1, 1)),
@@ -103,6 +110,7 @@ SCENES = {
     "lamp in sight": (shown_lamp, (1, 1)),
     "left out light": (narrow_lamp, (0, 0)),
     "transparent film": (transparent_film, (1, 1)),
+    "depth of field": (depth_of_field, (1, 1)),
 }
 
 
@@ -135,6 +143,26 @@ def test_a_finished_picture_is_what_cycles_renders(name, tmp_path):
     worst = (np.abs(ours - expected) / tolerance).max()
     assert worst < 1.0, f"{name}: {worst:.2f} times what is tolerated"
     assert np.abs(blocks(made.combined) - blocks(true))[..., 3].max() < EDGE_ERROR
+
+
+def test_depth_of_field_is_that_of_cycles_where_points_are_few_and_shade_has_it_too(out, tmp_path):
+    depth_of_field()
+    path, few = parts.save(tmp_path / "room.blend"), {"sub_samples": 8, "cycles_samples": 2}
+    report = render.finish(RenderOptions(path, output=out, **few)).report
+    reason = "depth of field of camera 'Camera' with fewer than 32 points per pixel (--aa)"
+    assert report["finished"]["all_by_cycles"] == [reason]
+    assert not any("switched off" in line and "depth" in line for line in report["warnings"])
+    ours = render.finish(RenderOptions(path, output=out, sub_samples=POINTS, cycles_samples=2)).ours
+    options = PictureOptions(path, output=out, techniques=("ltsh4",), sub_samples=POINTS)
+    assert not any("depth of field" in line for line in shade_scene(options)["warnings"])
+    layers = imaging.read_layers(out / "shade.exr")
+    for name in PASSES:
+        found, expected = layers[f"ltsh4.{name}"], ours[f"ltsh4.{name}"]
+        noise = blocks(np.abs(found - expected)) / BLOCK
+        assert (np.abs(blocks(found) - blocks(expected)) < EDGE_ERROR * expected.max() + 4.0 * noise).all()
+    # With one point a pixel is seen through the middle of the lens.
+    (warning,) = [line for line in shade_scene(replace(options, sub_samples=1))["warnings"] if "depth of field" in line]
+    assert warning.endswith("shade and render have it with several points per pixel (--aa)")
 
 
 def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path, capsys):

@@ -1,6 +1,5 @@
 """What comes in between: undo, Escape and another file during the preview, F12, a bake and in the light mixer."""
 
-import tempfile
 from pathlib import Path
 
 import bpy
@@ -16,18 +15,25 @@ ENDING_SECONDS = 20.0
 def main(rig):
     other = str(Path(bpy.data.filepath).with_name("other.blend"))
     bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
-    before = folders()
     yield from hands.open_panel(rig)
     yield 1
     yield from during_the_preview(rig, other)
-    yield from during_a_render(rig, other, before)
-    yield from during_a_bake(rig, other, before)
+    yield from during_a_render(rig, other)
+    yield from during_a_bake(rig, other)
     yield from in_the_mixer(rig, other)
     rig.shot("7_end.png")
 
 
-def folders():
-    return sorted(str(path) for path in Path(tempfile.gettempdir()).parent.glob("ltsh-*"))
+def copy_of_render():
+    """The folder of the copy that F12 renders, None where there is none."""
+    folder = hands.module("engine.render")._copy.get("folder")
+    return None if folder is None else Path(folder.name)
+
+
+def gone(rig, folder, what):
+    """Check that a folder goes."""
+    yield from hands.until(lambda: not folder.exists(), ENDING_SECONDS)
+    rig.check(not folder.exists(), f"nothing is left {what}")
 
 
 def typed(rig, *names):
@@ -83,7 +89,7 @@ def during_the_preview(rig, other):
     rig.check(engine() == artist and not eyes.view().artist_engine, "another file has its own engine, and no preview")
 
 
-def during_a_render(rig, other, before):
+def during_a_render(rig, other):
     """Undo and another file while F12 renders."""
     for what in ("undo", "file"):
         scene = bpy.context.scene
@@ -95,9 +101,10 @@ def during_a_render(rig, other, before):
         light.location.x += 1.0
         hands.operate(rig, bpy.ops.ed.undo_push, message="Moved")
         ended = yield from eyes.render_started(rig)
-        yield from hands.until(lambda: folders() != before, 20)
+        yield from hands.until(copy_of_render, 20)
+        folder = copy_of_render()
         yield 4
-        rig.check(folders() != before and not ended, "F12 renders")
+        rig.check(folder is not None and folder.exists() and not ended, f"F12 renders: {ended}")
         rig.shot(f"2_rendering_{what}.png")
         if what == "undo":
             moved = light.location.x
@@ -110,13 +117,11 @@ def during_a_render(rig, other, before):
             rig.xdo("key", "Escape")
             yield from hands.until(lambda ended=ended: ended, ENDING_SECONDS)
             rig.check(bool(ended), f"Escape or undo ends it: {ended}")
-            yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
-            rig.check(folders() == before, f"nothing of it is left: {folders()}")
+            yield from gone(rig, folder, "of the render that was stopped")
             rig.xdo("key", "Escape")
             yield 1
         yield from opened(rig, other)
-        yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
-        rig.check(folders() == before, f"after another file nothing of the render is left: {folders()}")
+        yield from gone(rig, folder, "of the render, after another file")
         rig.check(not hands.module("ui.results")._rendered, "nor in the mixer")
         rig.shot(f"3_opened_{what}.png")
 
@@ -127,7 +132,7 @@ def picture_area(rig):
     return ("IMAGE_EDITOR", "WINDOW") if "IMAGE_EDITOR" in kinds else ("VIEW_3D", "WINDOW")
 
 
-def during_a_bake(rig, other, before):
+def during_a_bake(rig, other):
     for what in ("Escape", "undo", "file"):
         settings = hands.settings()
         settings.bake_size, settings.anti_aliasing = "1024" if what != "undo" else "256", 1
@@ -159,8 +164,7 @@ def during_a_bake(rig, other, before):
         else:
             yield from opened(rig, other)
             rig.check(hands.job() is None and job.cancelled, "another file ends it")
-        yield from hands.until(lambda: folders() == before, ENDING_SECONDS)
-        rig.check(folders() == before, f"{what}: nothing of it is left: {folders()}")
+        yield from gone(rig, job.folder, f"of the bake, after {what}")
 
 
 def in_the_mixer(rig, other):

@@ -55,7 +55,7 @@ def after_the_add_on(function):
 
 
 def our_folders():
-    return sorted(str(path) for path in Path(tempfile.gettempdir()).parent.glob("ltsh-*"))
+    return sorted(str(path) for path in Path(tempfile.gettempdir()).glob("ltsh-*"))
 
 
 def is_gone(ended):

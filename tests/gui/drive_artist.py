@@ -92,7 +92,7 @@ def moved(rig, **axes):
     """Move the selected object by typing."""
     for axis, value in axes.items():
         yield from typed(rig, "g", axis)
-        rig.xdo("type", str(value))
+        rig.xdo("type", "--", str(value))
         yield hands.CLICK_SECONDS
         yield from hands.keys(rig, "Return")
 

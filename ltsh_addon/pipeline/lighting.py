@@ -28,8 +28,8 @@ from ..shading.light_tree import FEWEST
 KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # Pairs of a sample and a light whose radiance is kept at a time.
 MOST_PAIRS = 1 << 25
-# Of one sample, however many a pixel has.
-FEWEST_RAYS = 8
+# Of one sample, however many a pixel has, unless all of them have fewer: the first eight say where more are needed.
+FEWEST_RAYS = 16
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Shadows:
 
 def rays_of_point(rays: int, points: int) -> int:
     """Of `rays` those of one of the `points` of a pixel or texel."""
-    return max(FEWEST_RAYS, rays // points)
+    return max(min(FEWEST_RAYS, rays), rays // points)
 
 
 class ShadowTracer:

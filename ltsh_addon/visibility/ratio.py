@@ -57,6 +57,9 @@ WORTH_POWER = 0.75
 # Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
 TYPICAL_SHARE = 0.4
 LEVELS = (16, 32, 64, 128, 256, 512)
+# How many times the most rays of a pair the brightest ones take: where lobes are narrow and lights half seen few pixels
+# have most of the noise of a picture.
+BRIGHTEST = 4
 # Samples that tell what is typical, and pairs of them and a light.
 TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20
 # How often neighbors of mixed pairs that turn out mixed pass that on.
@@ -122,7 +125,8 @@ def visible_shares(
     progress: Progress | None = None,
     starts: Starts | None = None,
 ) -> Visibility:
-    """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights.
+    """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights; from 16
+    on four times as many, 1024 at most, for pairs that are much brighter than the picture.
 
     `film` says which samples are neighbors; left out: those before and after. Where the passes are baked, each by
     itself, Cycles chooses rays by its lobes alone. `tracer` is as `visibility.open_tracer`
@@ -360,11 +364,14 @@ class Pairs:
         # They are there for all that they are made of.
         share = 1.0 if isinstance(self.emitter, Sky | Cluster) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
+        limit = rays
+        if share < 1.0 and rays > PROBES:
+            limit = min(BRIGHTEST * rays, MOST_RAYS)
         if isinstance(self.emitter, Sky):
             # What only the sky lights is dark beside what a sun in it does.
             wanted = np.maximum(wanted, 0.25 * rays)
-        levels = [level for level in LEVELS if level < rays] + [rays]
-        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, rays)))
+        levels = [level for level in LEVELS if level < limit] + [limit]
+        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
         choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
         return number, choice

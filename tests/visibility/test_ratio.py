@@ -300,6 +300,21 @@ def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
             assert 0.6 < found.noise(name) / real < 2.5, (rays, name, found.noise(name), real)
 
 
+def test_a_small_highlight_that_is_half_seen_gets_more_rays_than_all_else(monkeypatch):
+    """It has most of the noise of a picture, of which four times the rays leave less than a half."""
+    samples, film = floor(64, roughness=0.05)
+    lamp = panel(half_u=np.array([0.15, 0.0, 0.0]), half_v=0.15 * panel().half_v)
+    bars = past_spheres(*(((x, 1.5, 0.7), 0.0375) for x in (-0.135, -0.045, 0.045, 0.135)))
+    images, rays = {}, {}
+    for name, brightest, most in (("truth", 1, 1024), ("before", 1, 32), ("now", ratio.BRIGHTEST, 32)):
+        monkeypatch.setattr(ratio, "BRIGHTEST", brightest)
+        found = ratio.visible_shares(samples, [lamp], bars, rays=most, film=film)
+        images[name], rays[name] = found.radiance["specular"], found.rays
+    errors = {name: np.linalg.norm(images[name] - images["truth"]) for name in ("before", "now")}
+    assert errors["now"] < 0.5 * errors["before"]
+    assert rays["now"] < 1.1 * rays["before"]
+
+
 def test_a_wire_that_probes_miss_casts_all_of_its_shadow():
     """Neighbors of pairs that found something in the way are asked again: in the mean nothing is lost."""
     samples, film = floor(64)

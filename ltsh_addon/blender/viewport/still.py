@@ -31,7 +31,7 @@ from .textures import read_texture
 # Redraws of which the median is told.
 TIMED = 3
 # Of a light and one point of a pixel, however many it has.
-FEWEST_RAYS = 8
+FEWEST_RAYS = 16
 # Where scripts may always use graphics, its compiled shaders serve the next picture.
 _renderer: list[ViewRenderer] = []
 
@@ -181,7 +181,7 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     if job["shadows"] == "on":
         problem = too_many(len(mirror.lights), size)
         override = depsgraph.view_layer_eval.material_override
-        rays = max(FEWEST_RAYS, job["shadow_rays"] // job["refine"])
+        rays = max(min(FEWEST_RAYS, job["shadow_rays"]), job["shadow_rays"] // job["refine"])
         if problem:
             notes.append(problem)
         else:

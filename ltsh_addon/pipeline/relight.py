@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import imaging
 from ..files import replacing, temporary_folder
-from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
+from ..scene import REFERENCE, AreaLight, Film, Progress, SurfaceSamples, error_line, listed
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
 from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_of_point, shade_lights
@@ -497,12 +497,11 @@ class MovedLights:
         if self._tracer is not None:
             rays = rays_of_point(kept.options["shadow_rays"], film.sub_samples)
             task = task_of_light(self._samples, light, self._tracer, kept.options["passes"], rays)
-        radiance = np.zeros((len(film.pixel), 3), np.float32)
-        for block, found in zip(self._blocks, self._company.lit(light, task), strict=True):
-            for name, values in found.items():
-                taken = kept.taken.get(name)
-                radiance[block] += values if taken is None else taken.ravel()[film.pixel[block], None] * values
-        image = film.image(kept.extraction.exposure * radiance).astype(np.float32)
+        found = self._company.lit(light, task)
+        image = np.zeros((film.height, film.width, 3), np.float32)
+        for name in kept.options["passes"]:
+            own = kept.extraction.exposure * np.concatenate([radiance[name] for radiance in found])
+            image += film.image(own) * (kept.taken[name][..., None] if name in kept.taken else 1.0)
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:
@@ -516,8 +515,10 @@ class MovedLights:
         kept, samples, film = self._kept, self._kept.extraction.samples, self._kept.extraction.film
         self._samples = replace(samples, position=samples.position - kept.extraction.origin)
         starts = range(0, max(len(samples), 1), BLOCK_SAMPLES)
-        self._blocks = [slice(start, start + BLOCK_SAMPLES) for start in starts]
-        blocks = tuple((self._samples.take(block), film.take(block)) for block in self._blocks)
+        blocks = [slice(start, start + BLOCK_SAMPLES) for start in starts]
+        # Which samples are neighbors is all that rays ask of their film.
+        film = Film(film.width, film.height, film.pixel)
+        blocks = tuple((self._samples.take(block), film.take(block)) for block in blocks)
         (table,) = picture.load_tables((technique_of(kept),)).values()
         with ExitStack() as stack:
             self._tracer = None

@@ -88,7 +88,8 @@ soak:
 	@python=$$($(SETUP) python newest) && "$$python" -m pytest -m soak && "$$python" tests/soak/kill_soak.py $(KILL_OPTIONS) && \
 	"$$python" tests/soak/fuzz.py $(FUZZ_OPTIONS) && \
 	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/pipeline/test_hostile_scenes.py -k many_lights && \
-	"$$python" tests/benchmarks/animation.py $(ANIMATION_OPTIONS) && \
+	"$$python" tests/benchmarks/animation.py shade $(ANIMATION_OPTIONS) && \
+	"$$python" tests/benchmarks/animation.py render $(ANIMATION_OPTIONS) && \
 	"$$python" tests/soak/soak.py $(SOAK_OPTIONS)
 
 tables:

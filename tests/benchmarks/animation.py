@@ -1,10 +1,12 @@
 """What an animation costs beside a single frame: time per frame, and memory of both processes over the frames.
 
-python tests/benchmarks/animation.py [--frames N] [--scene FILE.blend]
+python tests/benchmarks/animation.py [shade|render] [--frames N] [--scene FILE.blend]
 
-Without a scene the example scene is taken. A single frame is `ltsh shade` of one frame, with Blender's start. Processor
-time, unlike that of the clock, hangs little on what else the machine does. Memory is read every half second (Linux).
-Ends with 1 where it grows with the frames.
+Without a scene `shade` takes the example scene, and `render` five still balls. A single frame has Blender's start in
+its time. Processor time, unlike that of the clock, hangs little on what else the machine does. Memory is read every
+half second (Linux). Of `render` also how much pixels of still things flicker, beside Cycles with Open Image Denoise,
+which gets another seed for each frame and no less time. Ends with 1 where memory grows with the frames, or where
+pixels flicker more than a third as much as with Cycles.
 """
 
 import argparse
@@ -21,18 +23,22 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+import finished  # noqa: E402
 import measure  # noqa: E402
+
+from ltsh_addon import imaging  # noqa: E402
+from ltsh_addon.blender.process.blender_process import kept_blender  # noqa: E402
 
 # Of either process, from the second quarter of the time to the last; a picture per frame would be 240 MiB and more.
 MOST_GROWTH = 16.0
 
 
 def run(arguments, readings):
-    """Seconds that `ltsh shade` takes, and those of processors.
+    """Seconds that a command takes, and those of processors.
 
     `readings` receives seconds, MiB of the process, of its children, and processor seconds of all.
     """
-    command = [sys.executable, "-m", "ltsh_addon", "shade", *map(str, arguments), "--quiet"]
+    command = [sys.executable, "-m", "ltsh_addon", *map(str, arguments), "--quiet"]
     start, used = time.perf_counter(), _of_children()
     program = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
@@ -56,20 +62,26 @@ def _of_children():
     return usage.ru_utime + usage.ru_stime
 
 
-def report(frames, scene=None, resolution="64x36") -> bool:
-    """Print what `frames` frames cost; True where memory stays as it is."""
+# Of `render`: few, so that 240 frames end today.
+QUALITY = {"shade": ["--techniques", "ltsh4"], "render": ["--aa", "5", "--cycles-samples", "16"]}
+FLICKER, CYCLES_FRAMES = 1.0 / 3.0, 24
+
+
+def report(command, frames, scene=None, resolution="64x36") -> str:
+    """Print what `frames` frames cost; what is wrong."""
     with tempfile.TemporaryDirectory(prefix="ltsh-animation-") as name:
         folder = Path(name)
         if scene is None:
-            from ltsh_addon.blender.process import client
-
-            scene = folder / "demo.blend"
-            client.build_demo(scene)
-        common = [Path(scene).absolute(), "--techniques", "ltsh4", "--resolution", resolution]
+            scene = folder / "scene.blend"
+            finished.build("demo" if command == "shade" else "studio", scene)
+        common = [command, Path(scene).absolute(), *QUALITY[command], "--resolution", resolution]
         singles = [run([*common, "-o", folder / f"single_{n}", "--frames", 1], []) for n in range(3)]
         rows: list = []
         whole, processors = run([*common, "-o", folder / "all", "--frames", f"1-{frames}"], rows)
         records = json.loads((folder / "all" / "timing.json").read_text())["seconds"]
+        if command == "render":
+            finished.SIZE = tuple(map(int, resolution.split("x")))
+            flicker = _flicker_of_ours(folder / "all"), _flicker_of_cycles(Path(scene), folder, processors / frames)
     rows, each = np.array(rows), np.array([record["total"] for record in records.values()])
     single, of_single = map(min, zip(*singles, strict=True))
     print(f"  single frame with Blender's start      {single:7.2f} s, {of_single:7.2f} s of processors")
@@ -77,7 +89,32 @@ def report(frames, scene=None, resolution="64x36") -> bool:
     print(f"  a frame of them beside a single one    {whole / frames / single:7.2f} x, "
           f"{processors / frames / of_single:7.2f} x    (target below 1.10)")  # fmt: skip
     print(f"  what is no frame's own work            {100.0 * (whole - each.sum()) / whole:7.1f} % of the time")
-    return _over_time(rows, each)
+    if command == "render":
+        print("  standard deviation of a pixel over the frames, by the mean radiance: "
+              f"{100.0 * flicker[0]:.4f} %, Cycles with OIDN {100.0 * flicker[1]:.4f} %")  # fmt: skip
+        if flicker[0] > FLICKER * flicker[1]:
+            return "pixels flicker"
+    return "memory grows with the frames" if not _over_time(rows, each) else ""
+
+
+def _deviation(images) -> float:
+    """Root mean square of the standard deviations of pixels over `images`, by the mean."""
+    count, total, squares = 0, 0.0, 0.0
+    for image in images:
+        count, total, squares = count + 1, total + image.astype(float), squares + np.square(image, dtype=float)
+    variance = np.maximum(squares / count - np.square(total / count), 0.0) * count / (count - 1)
+    return float(np.sqrt(variance.mean()) / (total / count).mean())
+
+
+def _flicker_of_ours(folder: Path) -> float:
+    return _deviation(imaging.read_layers(path)["combined"][..., :3] for path in sorted(folder.rglob("*.exr")))
+
+
+def _flicker_of_cycles(scene: Path, folder: Path, seconds: float) -> float:
+    """Of as many samples as the seconds of a frame of ours allow, the start of Blender and denoising left out."""
+    with kept_blender(folder):
+        seeds = [finished.seeded(scene, number + 1) for number in range(CYCLES_FRAMES)]
+        return _deviation(finished.by_cycles(seed, folder, seconds=seconds + finished.START)[0] for seed in seeds)
 
 
 def _over_time(rows, each) -> bool:
@@ -101,13 +138,14 @@ def _over_time(rows, each) -> bool:
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("command", nargs="?", default="shade", choices=tuple(QUALITY))
     parser.add_argument("--frames", type=int, default=240)
     parser.add_argument("--scene", type=Path)
     parser.add_argument("--resolution", default="64x36")
     options = parser.parse_args()
-    print(f"animation, {options.resolution} pixels")
-    if not report(options.frames, options.scene, options.resolution):
-        raise SystemExit("memory grows with the frames")
+    print(f"animation by {options.command}, {options.resolution} pixels")
+    if problem := report(options.command, options.frames, options.scene, options.resolution):
+        raise SystemExit(problem)
 
 
 if __name__ == "__main__":

@@ -309,7 +309,8 @@ def animation(options):
 
     frames = 16 if options.quick else 48
     heading(f"{frames} frames of the demo scene, 64 x 36 pixels, ltsh4 (240 of them: make soak)")
-    report(frames)
+    if problem := report("shade", frames):
+        print(f"  wrong: {problem}")
 
 
 def viewport(options):

@@ -27,6 +27,7 @@ LIMITS = 1, 400
 CASES = {
     "bake": (bake_scenes.textured_scene, "--size 64 --margin 3 --error --cycles-samples 4 --quiet"),
     "shade": (bake_scenes.textured_scene, "--frames 1-2 --resolution 64x48 --quiet"),
+    "render": (bake_scenes.textured_scene, "--frames 1-2 --resolution 32x24 --aa 3 --cycles-samples 4 --quiet"),
     "compare": (bake_scenes.textured_scene, "--frames 1-2 --resolution 64x48 --cycles-samples 4 --quiet"),
 }
 

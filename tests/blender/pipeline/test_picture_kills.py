@@ -7,10 +7,11 @@ import sys
 
 import bake_scenes
 import kills
+import numpy as np
 import programs
 import pytest
 
-from ltsh_addon import cli
+from ltsh_addon import cli, imaging
 
 OPTIONS = "--frames 1-2 --resolution 64x48 --techniques ltc,ltsh4 --cycles-samples 4 --quiet".split()
 
@@ -35,6 +36,23 @@ def test_after_signals_at_random_moments_resume_gives_the_same_bytes(trial):
         trial.end_after("random", moment, number)
     trial.check("random")
     assert trial.end_while_writing("writing")
+    trial.check("writing")
+
+
+def test_an_animation_of_finished_pictures_stands_still_and_goes_on_after_a_kill(tmp_path):
+    """Frames of a scene that does not move are the same to the last bit: they have the same noise."""
+    bake_scenes.textured_scene()
+    path, options = bake_scenes.save(tmp_path), "--frames 1-2 --resolution 32x24 --cycles-samples 4 --aa 3 --quiet"
+
+    def command(output, *more):
+        return programs.command_line("render", path, "-o", output, *options.split(), *more)
+
+    trial = kills.Trial(command, tmp_path)
+    first, second = (imaging.read_layers(path) for path in sorted((tmp_path / "whole").glob("*.exr")))
+    assert first["rest"].any() and first["ltsh4.diffuse"].any()
+    assert all(np.array_equal(first[name], second[name]) for name in first)
+    assert trial.end_while_writing("writing")
+    assert not {"render_0002.exr", "report.json"} & set(kills.contents(tmp_path / "writing"))
     trial.check("writing")
 
 

@@ -114,7 +114,7 @@ class LTSH_UL_mixer(bpy.types.UIList):
     rows: ClassVar[dict[str, Row]] = {}
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
-        line, row = layout.row(align=True), self.rows.get(item.name)
+        line, row = layout.row(align=True), LTSH_UL_mixer.rows.get(item.name)
         line.enabled = row is not None
         line.prop(item, "muted", text="", icon="HIDE_ON" if item.muted else "HIDE_OFF", emboss=False)
         line.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)

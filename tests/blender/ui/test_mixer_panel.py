@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from job_window import image_pixels
+from recorded_layout import Layout, buttons, drawn, stand_in
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.ui import mixer, results
@@ -140,6 +141,20 @@ def test_what_cannot_be_written_is_named(scene):
     bpy.data.objects["Fill"].name = "Elsewhere"
     problems = mixer.applied(scene)
     assert problems[0].startswith("Key: its settings are animated") and problems[1] == "Fill: not in the scene any more"
+
+
+def test_a_redraw_looks_at_files_once_not_for_every_row(scene, monkeypatch):
+    looks, look = [], results.result_of
+    monkeypatch.setattr(results, "result_of", lambda scene: looks.append(scene) or look(scene))
+    shown = drawn(mixer.LTSH_PT_IMAGE_mixer)
+    assert "ltsh.apply_mixer" in buttons(shown)
+    of_panel = len(looks)
+    for item in scene.ltsh.mixed:
+        layout = Layout()
+        stand_in(mixer.LTSH_UL_mixer)().draw_item(bpy.context, layout, scene.ltsh, item, 0, None, "", 0)
+        assert [one.what for one in layout.shown] == ["muted", "solo", item.name, "power", "color"]
+        assert layout.shown[2].icon == ("INFO" if item.name == REST else "LIGHT")
+    assert len(looks) == of_panel <= 2
 
 
 def test_lights_that_share_data_must_get_the_same(scene):

@@ -7,9 +7,10 @@ color. No ray is traced, but by `MovedLights` for those that have moved.
 from __future__ import annotations
 
 import json
+import threading
 import zipfile
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -474,22 +475,43 @@ class MovedLights:
     """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
 
     With the first of them processes start that keep the samples, so that others take half a second; `close` ends them.
+    Threads may share it.
     """
 
-    def __init__(self, kept: KeptPicture, occluders: Occluders | None):
-        self._kept, self._occluders = kept, occluders
+    def __init__(self, read: Callable[[], tuple[KeptPicture, Occluders | None]]):
+        """`read` is called when the first picture is asked for, which raises what it raises."""
+        self._read, self._kept, self._occluders = read, None, None
         self._company, self._ending = None, ExitStack()
+        self._lock, self._is_ready = threading.Lock(), False
 
     @classmethod
     def load(cls, path: Path) -> MovedLights:
-        """Those of the picture that kept its samples in `path`. Raises OSError, ValueError."""
-        kept, occluders = KeptPicture.load(path), None
-        if kept.shadows is not None:
-            occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
-        return cls(kept, occluders)
+        """Those of the picture that kept its samples in `path`: OSError and ValueError where that cannot be read."""
+
+        def read():
+            kept, occluders = KeptPicture.load(path), None
+            if kept.shadows is not None:
+                occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
+            return kept, occluders
+
+        return cls(read)
+
+    def get_ready(self, light: AreaLight) -> None:
+        """Begin, once and in a thread, with what the first picture takes; `light` is any of those that there are."""
+        if not self._is_ready:
+            self._is_ready = True
+            threading.Thread(target=self._try, args=(light,), name="LTSH lights", daemon=True).start()
+
+    def _try(self, light: AreaLight) -> None:
+        with suppress(Exception):  # who asks for a picture gets to know
+            self.picture(light)
 
     def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, with what the `row` of it bounced before. Raises SceneError."""
+        with self._lock:
+            return self._picture(light, row)
+
+    def _picture(self, light: AreaLight, row: Row | None) -> np.ndarray:
         if self._company is None:
             self._start()
         kept, film, task = self._kept, self._kept.extraction.film, None
@@ -506,12 +528,15 @@ class MovedLights:
 
     def close(self) -> None:
         """End the processes; the next light starts others."""
-        self._company = None
-        self._ending.close()
+        with self._lock:
+            self._company = None
+            self._ending.close()
 
     def _start(self) -> None:
         from ..blender.process.blender_rays import open_rays
 
+        if self._kept is None:
+            self._kept, self._occluders = self._read()
         kept, samples, film = self._kept, self._kept.extraction.samples, self._kept.extraction.film
         self._samples = replace(samples, position=samples.position - kept.extraction.origin)
         starts = range(0, max(len(samples), 1), BLOCK_SAMPLES)

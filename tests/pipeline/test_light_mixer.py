@@ -239,8 +239,12 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     finally:
         together.close()
     assert all(child._process.poll() is not None for child in children)
+    # Made ready in a thread, while the light still moves.
+    together.get_ready(light)
     np.testing.assert_array_equal(together.picture(lights[2]), expected[2])
     together.close()
+    with pytest.raises(OSError, match="nothing"):
+        MovedLights.load(out / "nothing.samples.npz").picture(light)
 
 
 def test_no_samples_give_a_black_picture(capsys, monkeypatch, room, out):

@@ -16,7 +16,7 @@ from ..lights.linking import Receivers
 from . import comparison, results
 from .panels import draw_text, gray, in_both_places, split_names
 
-UPDATE = "Update Moved Lights"
+UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
 # By what share of its distance and size a light may be elsewhere that has not moved.
 UNMOVED = 1e-5
 
@@ -97,7 +97,7 @@ def state_of(row: Row, item) -> tuple[str, str]:
     if lost and row.settings:
         return "ERROR", f"{listed(lost, 3)}: not in the scene any more"
     if row.light is not None and _stands_elsewhere(bpy.data.objects.get(row.name), row.light):
-        return "ERROR", f"{row.name}: moved since this picture; {UPDATE} shades it where it is"
+        return "ERROR", f"{row.name}: {MOVED}; {UPDATE} shades it where it is"
     for name, (power, exposure, color) in targets(row, item).items():
         ob = bpy.data.objects[name]
         now = (ob.data.energy, ob.data.exposure, *ob.data.color) if ob.type == "LIGHT" else ()
@@ -118,7 +118,9 @@ class LTSH_UL_mixer(bpy.types.UIList):
         line.enabled = row is not None
         line.prop(item, "muted", text="", icon="HIDE_ON" if item.muted else "HIDE_OFF", emboss=False)
         line.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)
-        state = "ERROR" if row is None else state_of(row, item)[0]
+        state, note = ("ERROR", "") if row is None else state_of(row, item)
+        if MOVED in note:
+            results.get_ready(context.scene, row)
         line.label(text=item.name, icon=state, translate=False)
         values = line.row(align=True)
         values.scale_x = 0.9

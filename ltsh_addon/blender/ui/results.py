@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -241,7 +242,7 @@ def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:
     """Let the mixer of `scene` change the lights of a final render, and shade those that move."""
     forget_renders()
     size = sum(getattr(kept.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
-    moved = MovedLights(kept, kept.extraction.occluders) if size <= MOST_BYTES else None
+    moved = MovedLights(lambda: (kept, kept.extraction.occluders)) if size <= MOST_BYTES else None
     _rendered[scene.name] = Mixer(pictures), moved
     _take_rows(scene)
 
@@ -270,13 +271,24 @@ def update_moved(scene, moved: dict[int, AreaLight]) -> None:
     for number, light in moved.items():
         layer = _moved_lights(scene).picture(light, mixer.rows[number])
         mixer.replace(number, replace(mixer.rows[number], light=light.record()), layer)
-    if bpy.app.timers.is_registered(end_processes):
-        bpy.app.timers.unregister(end_processes)
-    bpy.app.timers.register(end_processes, first_interval=IDLE_SECONDS)
+    _end_later()
     if scene.name not in _rendered:
         path = result_of(scene).folder / MIXER_FILE
         mixer.pictures.save(path)
         _mixer["stamp"] = str(path), path.stat().st_mtime_ns
+
+
+def get_ready(scene, row: Row) -> None:
+    """Begin with what shading lights that have moved takes: the light of a `row` is elsewhere, or still moving."""
+    with suppress(SceneError):
+        _moved_lights(scene).get_ready(AreaLight(**row.light))
+        _end_later()
+
+
+def _end_later() -> None:
+    if bpy.app.timers.is_registered(end_processes):
+        bpy.app.timers.unregister(end_processes)
+    bpy.app.timers.register(end_processes, first_interval=IDLE_SECONDS)
 
 
 def _moved_lights(scene) -> MovedLights:

@@ -227,6 +227,10 @@ def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
     bpy.context.view_layer.update()
     row, item = next(pair for pair in results.mixer_pairs(scene) if pair[0].name == "Fill")
     assert mixer.state_of(row, item)[1].startswith("Fill: moved since this picture")
+    # The list has it made ready meanwhile.
+    layout = drawn(mixer.LTSH_PT_IMAGE_mixer) and Layout()
+    stand_in(mixer.LTSH_UL_mixer)().draw_item(bpy.context, layout, scene.ltsh, item, 0, None, "", 0)
+    assert [one.icon for one in layout.shown if one.kind == "label"] == ["ERROR"] and results._mixer["moved"]._is_ready
     assert bpy.ops.ltsh.update_moved_lights() == {"FINISHED"}
     assert [mixer.state_of(*pair)[1] for pair in results.mixer_pairs(scene)] == ["", "", ""]
     found = shown()

@@ -310,6 +310,8 @@ class Pairs:
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
+        # The faces of meshes are in the way of rays to themselves.
+        self.at_surface = isinstance(emitter, Cluster) or light.shape == "POLYGON"
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
         origins = light.origins(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
@@ -415,7 +417,7 @@ class Pairs:
             toward /= np.maximum(distance, _TINY)
             if self.light.is_distant:
                 distance[:] = _FARTHEST
-            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None])
+            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             found = (
                 self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             )
@@ -452,7 +454,7 @@ class Pairs:
         arriving, others = np.zeros(distance.shape, np.float32), None
         met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
         flat = np.flatnonzero(met)
-        aimed = self.surface.starts.aimed(view.index, directions, distance)
+        aimed = self.surface.starts.aimed(view.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
         arriving.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
         if self.chosen_by.surface:
@@ -487,7 +489,7 @@ class Pairs:
         directions, distance = (_taken(rows, flat) for rows in rays)
         column = flat % arriving.shape[1]
         index = view.index[column]
-        start = starts.at_surface(index, directions)
+        start, toward, distance = starts.from_surface(index, directions, distance)
         # The light chooses directions above the smooth horizon, the surface those above that of the mesh.
         smooth, flat_facing = (
             dot(np.take(normal, index, axis=0).T, directions)
@@ -498,7 +500,7 @@ class Pairs:
         if meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        found = self._transmittance(self.surface_mask, start[:, chosen], directions[:, chosen], distance[chosen])
+        found = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
         differ = np.flatnonzero(found != arriving.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None

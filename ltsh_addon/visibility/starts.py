@@ -152,29 +152,33 @@ class Starts:
             found[:, :, part] += lift
         return found
 
-    def at_surface(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Origins (3, R) of rays along unit `directions` (3, R) that start at the samples `index` (R,) themselves, as
-        those that Cycles sends on from a surface."""
+    def from_surface(
+        self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `aimed`, of rays (R,) each from a sample of its own, that start at the samples themselves, as those that
+        Cycles sends on from a surface."""
         normal = self.geometric_normal[index].T
-        found = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
-        found += self.position[index].T
-        return found
+        moved = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
+        return moved + self.position[index].T, *_toward(directions, distances, moved)
 
-    def aimed(self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray) -> tuple[np.ndarray, ...]:
+    def aimed(
+        self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray, at_surface: bool = False
+    ) -> tuple[np.ndarray, ...]:
         """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
 
-        They end at `distances`, finite, along `directions` from the sample, wherever they start.
+        They end at `distances`, finite, along `directions` from the sample, wherever they start. What they are aimed at
+        may be met itself where it is `at_surface`: rays that start but the clearance above the sample would meet faces
+        that they graze too early.
         """
         origins = self.origins_of_rows(index, directions)
         moved = origins - self.position[index].T[:, None]
+        if at_surface:
+            return origins, *_toward(directions, distances, moved)
         lifted = np.flatnonzero(_dot_rows(moved, moved) > 4.0 * self.clearance[index] ** 2)
         if len(lifted):
             directions, distances = directions.copy(), distances.copy()
-            rows = directions.reshape(3, -1)
-            toward = rows[:, lifted] * distances.ravel()[lifted] - moved.reshape(3, -1)[:, lifted]
-            length = np.sqrt(_dot_rows(toward, toward))
-            rows[:, lifted] = toward / np.maximum(length, np.float32(1e-30))
-            distances.ravel()[lifted] = length
+            rows, ends = directions.reshape(3, -1), distances.ravel()
+            rows[:, lifted], ends[lifted] = _toward(rows[:, lifted], ends[lifted], moved.reshape(3, -1)[:, lifted])
         return origins, directions, distances
 
     def _lifts(self, index, directions, facing, terminator):
@@ -190,6 +194,13 @@ class Starts:
         # As in Cycles, light from behind the own triangle meets it.
         own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
         return amount * np.where(is_inside, inside, outside), own
+
+
+def _toward(directions, distances, moved):
+    """Unit directions (3, ...) and distances (...) of rays to where others end, that start `moved` (3, ...) m away."""
+    toward = directions * distances - moved
+    length = np.sqrt(_dot_rows(toward, toward))
+    return toward / np.maximum(length, np.float32(1e-30)), length
 
 
 def _dot_rows(first, second):

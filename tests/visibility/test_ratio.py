@@ -40,7 +40,7 @@ class Tracer:
         self.position = samples.position
         return self
 
-    def aimed(self, index, directions, distances):
+    def aimed(self, index, directions, distances, at_surface=False):
         origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
         return origins.astype(np.float32), directions, distances
 

@@ -8,8 +8,8 @@ from occluder_scenes import answers, random_occluders, random_rays, samples_on, 
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.cycles.images import EXTENSIONS, INTERPOLATIONS
-from ltsh_addon.scene import SceneError
-from ltsh_addon.visibility import OccluderMesh, Occluders, Transparency, open_tracer, rays
+from ltsh_addon.scene import PASSES, AreaLight, SceneError
+from ltsh_addon.visibility import OccluderMesh, Occluders, Transparency, open_tracer, rays, visible_shares
 from ltsh_addon.visibility.occluders import cut_outs
 
 
@@ -406,3 +406,49 @@ def test_a_sample_off_all_triangles_starts_beside_its_surface(libraries):
     assert starts.terminator == 0 and 0 < starts.clearance[0] < 1e-4
     above, below = starts.origins(np.array([0, 0]), np.array([[0, 0, 1], [0, 0, -1]], np.float32))
     assert below[2] < 4.0 < above[2]
+
+
+def glowing_faces(mesh):
+    """A light for each triangle of a mesh whose front is outside."""
+    lights = []
+    for corners in mesh.vertices.astype(np.float64)[mesh.triangles]:
+        normal, u = np.cross(corners[1] - corners[0], corners[2] - corners[0]), corners[1] - corners[0]
+        if np.linalg.norm(normal) > 1e-9:
+            normal /= np.linalg.norm(normal)
+            axes = np.stack([u, np.cross(normal, u)]) / np.linalg.norm(u)
+            place = (corners - corners[0]) @ axes.T
+            middle, half = 0.5 * (place.min(axis=0) + place.max(axis=0)), 0.5 * np.ptp(place, axis=0)
+            lights.append(
+                AreaLight(
+                    "Lamp", "POLYGON", center=corners[0] + middle @ axes, half_u=half[0] * axes[0],
+                    half_v=half[1] * axes[1], direction=normal, radiance=np.ones(3), corners=corners,
+                )
+            )  # fmt: skip
+    return lights
+
+
+@pytest.mark.parametrize("rows", [4, 8], ids=["each face by itself", "faces that share their rays"])
+def test_a_convex_lamp_does_not_stand_in_its_own_light(libraries, rows):
+    """Nothing is between a point and a face of a convex body that it sees, however close the body comes to a floor so
+    large that rays start well above it."""
+    vertices, triangles = sphere(rows)
+    lamp = OccluderMesh((vertices + [0.0, 0.0, 1.001]).astype(np.float32), triangles)
+    corners = 1000.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    floor = OccluderMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    rng, up = np.random.default_rng(4), np.tile([0.0, 0.0, 1.0], (300, 1))
+    angle, radius = rng.uniform(0.0, 2.0 * np.pi, 300), rng.uniform(0.05, 2.0, 300)
+    position = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * radius], axis=1)
+    lights = glowing_faces(lamp)
+    with open_tracer(Occluders((floor, lamp), [0, 1], [np.eye(3, 4)] * 2), libraries) as tracer:
+        found = visible_shares(surface_samples(position, up, up), lights, tracer, rays=64, workers=1)
+    assert len(found.numbers) == (1 if rows == 8 else len(lights))
+    # Of faces that are seen nearly edge-on, rounding decides, and they give next to no light.
+    offsets = np.array([[light.corners - place for place in position] for light in lights])
+    height = -np.einsum("epck,ek->epc", offsets, [light.direction for light in lights])
+    is_sure = (height > 0.01 * np.linalg.norm(offsets, axis=-1)).all(axis=-1)
+    for name in PASSES:
+        share = getattr(found, name)
+        if rows == 4:
+            np.testing.assert_array_equal(share[is_sure], 1.0)
+        else:
+            assert share.min() > 0.99 and share.mean() > 0.9999

@@ -55,13 +55,13 @@ def test_diffuse_light_of_many_is_that_of_each():
     assert relative_error(found, expected) < OFF
 
 
-@pytest.mark.parametrize("lowest_roughness", [0.02, 0.3])
-def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(lowest_roughness):
+@pytest.mark.parametrize("name, lowest_roughness", [("ltsh4", 0.02), *((name, 0.3) for name in shading.SHIPPED_TABLES)])
+def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(name, lowest_roughness):
     """The tails of lobes are true where lights are points. Some lobes are sharper than single precision can tell."""
     samples, lights = floor_samples(40, lowest_roughness), many_lights(200)
     truth = shading.shade(samples, lights, shading.REFERENCE, passes=["specular"], workers=1).specular
-    found = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1).specular
-    each = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1, dtype=np.float64).specular
+    found = shading.shade(samples, lights, name, passes=["specular"], workers=1).specular
+    each = shading.shade(samples, lights, name, passes=["specular"], workers=1, dtype=np.float64).specular
     assert relative_error(found, truth) < relative_error(each, truth) + OFF
 
 

@@ -386,8 +386,6 @@ def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
 def prepare_surfaces(warnings: list[str]) -> None:
     """Object settings that change how a surface itself is shaded."""
     for ob in bpy.data.objects:
-        if ob.type == "LIGHT":
-            ob.visible_camera = False
         if ob.type not in SURFACE_TYPES:
             continue
         if ob.is_shadow_catcher:

@@ -44,7 +44,7 @@ with Cycles, and measure how far apart they are. OUT gets compare.exr (all layer
 in float), compare.png (side by side, signed errors below), report.html and
 report.json."""
 SHADE = """Shade what the camera sees. OUT gets shade.exr, with a layer for each technique and
-pass, and report.json."""
+pass, shade.png, which also shows what glows and the world behind, and report.json."""
 DEMO_EXAMPLES = """examples:
   %(prog)s -o out/demo
   %(prog)s -o out/demo --resolution 960x540 --cycles-samples 4096

@@ -102,6 +102,17 @@ def _shows_surface(channels: dict[str, np.ndarray]) -> np.ndarray:
     return normal.any(axis=-1) & (read_layer(channels, "Combined", "A") != 0.0)
 
 
+def not_reflected(channels: dict[str, np.ndarray], names: dict[str, str], is_transparent: bool) -> np.ndarray:
+    """Of a one-sample render (H, W, 7): what surfaces and lights in sight emit, what is seen of the world behind them,
+    and the alpha of the picture; `names` are those of passes, and the film may be transparent."""
+    emission, background = (read_layer(channels, names[key], "RGB") for key in ("emission", "background"))
+    if is_transparent:
+        background, alpha = np.zeros_like(background), _shows_surface(channels)
+    else:
+        alpha = read_layer(channels, "Combined", "A")
+    return np.concatenate([emission, background, alpha[..., None]], axis=-1)
+
+
 def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
     """Hits (count,) of a one-sample render on each of the materials that are not shaded, as `inject_aovs` numbers
     them."""

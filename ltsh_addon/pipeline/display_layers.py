@@ -58,6 +58,8 @@ def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | No
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
+    # What is shown has emission and background, too; figures and scales are those of the light.
+    shown = {name: layers.pop(name)[..., :3] for name in _whole_pictures(layers)}
     names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
     names = [name for name in names if not name.endswith(UNSHADOWED)]
     passes = [name for name in BAKE_PASSES if f"{names[0]}.{name}" in layers]
@@ -68,7 +70,7 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
             for layer in (f"{name}.{pass_name}", f"{ERROR}{name}.{pass_name}"):
                 if layer in layers:
                     written[layer] = f"{prefix}{layer}.exr"
-                    write_channels(folder / written[layer], _unnamed(layers[layer]))
+                    write_channels(folder / written[layer], _unnamed(shown.get(layer, layers[layer])))
     height, width = layers[f"{names[0]}.{passes[0]}"].shape[:2]
     return {
         "size": [width, height],
@@ -80,6 +82,11 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
         "figures": _figures(layers, names, passes, report),
         "scales": {pass_name: _scale(layers, names, pass_name) for pass_name in passes},
     }
+
+
+def _whole_pictures(layers) -> list[str]:
+    """Names of the layers with all that a picture shows: they have alpha."""
+    return [name for name, pixels in layers.items() if name.endswith(f".{COMBINED}") and pixels.shape[-1] == 4]
 
 
 def _techniques(layers) -> list[str]:

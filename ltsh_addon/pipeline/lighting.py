@@ -249,6 +249,7 @@ class KeptPicture:
             origin=np.array(found["origin"]),
             border=None if border is None else Border(**border),
             color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
+            **{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED},
         )
         shadows = document["shadows"]
         if shadows is not None:
@@ -268,6 +269,8 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
+# Of an Extraction, where it has them.
+NOT_REFLECTED = ("emission", "background")
 KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
@@ -301,6 +304,8 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
     arrays |= {f"film.{name}": getattr(film, name) for name in ("first", "count") if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
+    seen = {name: getattr(extraction, name) for name in NOT_REFLECTED}
+    arrays |= {f"picture.{name}": values.astype(np.float32) for name, values in seen.items() if values is not None}
     arrays |= {f"rest.{name}": np.asarray(values, np.float32) for name, values in (rest or {}).items()}
     arrays |= {f"taken.{name}": np.asarray(values, np.float32) for name, values in (taken or {}).items()}
     arrays["document"] = np.array(json.dumps(document))

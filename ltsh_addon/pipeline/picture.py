@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import imaging, shading
-from ..files import check_takes_files
+from ..files import check_takes_files, save_array, temporary_folder, write_bytes
 from ..reading import NUMBER, check, some
 from ..scene import (
     CYCLES,
@@ -36,6 +36,8 @@ REFERENCE_SEED = 20160725
 MOST_VISIBILITY_LAYERS = 64
 # Follows the name of a technique in layers without shadows beside those with.
 UNSHADOWED = "_unshadowed"
+# All that a picture shows, through the view transform of its scene.
+COMBINED, SHOWN = "combined", "shown.png"
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
 SAMPLE_LAYERS = {
     "position": "XYZ",
@@ -72,7 +74,7 @@ class TaskResult:
 
 
 def shade_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
-    """Shade a scene per pixel, write shade.exr, report.json and timing.json; the report with times as "seconds".
+    """Shade a scene per pixel, write shade.exr, shade.png, report.json and timing.json; the report with "seconds".
 
     Raises SceneError, TableError, OSError, Cancelled.
     """
@@ -80,7 +82,7 @@ def shade_scene(options: PictureOptions, progress: Progress | None = None) -> di
 
 
 def compare_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
-    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html too."""
+    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html."""
     return _with_report(options, True, progress)
 
 
@@ -156,6 +158,17 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     Raises as `shade_scene` does.
     """
+    if with_cycles:
+        return _made(options, True, None, progress)
+    from ..blender.process.blender_process import kept_blender
+
+    # It shows the picture, too.
+    with temporary_folder() as folder, kept_blender(folder):
+        return _made(options, False, folder, progress)
+
+
+def _made(options: PictureOptions, with_cycles: bool, folder: Path | None, progress) -> TaskResult:
+    """As `make_picture`; temporary files of what is shown go to `folder`."""
     from ..blender.process import client
 
     if with_cycles and options.cycles_samples < 2:
@@ -166,7 +179,9 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     tables = prepare(options)
     width, height = options.resolution or (None, None)
     samples = options.cycles_samples if with_cycles else 0
-    job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples)
+    size = {"width": width, "height": height}
+    rest = set(PASSES) <= set(options.passes)
+    job = child_job(client.ExtractOptions, options, **size, cycles_samples=samples, rest=rest)
     extraction = client.extract(job, progress=progress)
     shadows = None
     if extraction.occluders is not None:
@@ -175,9 +190,16 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     comparison = Comparison(options, extraction, results, shadows)
     report = comparison.report()
-    files = comparison.write(Path(options.output), report, with_cycles, progress)
+    output, shown = Path(options.output), None
+    if folder is not None:
+        save_array(folder / client.PICTURE, comparison.whole(most_accurate(results)).astype(np.float32))
+        client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
+        shown = (folder / SHOWN).read_bytes()
+    files = comparison.write(output, report, with_cycles, progress)
+    if shown is not None:
+        files.append(Path(files[0]).with_suffix(".png").as_posix())
+        write_bytes(output / files[-1], shown)
     if options.keep_visibility:
-        output = Path(options.output)
         kept = lighting.keep_picture(
             extraction, shadows, options, (output / files[0]).with_suffix(lighting.KEPT_SUFFIX)
         )
@@ -287,6 +309,22 @@ class Comparison:
     def cycles(self) -> dict[str, np.ndarray]:
         """Halves (2, H, W, 3) per pass; empty without a Cycles reference."""
         return self.extraction.reference or {}
+
+    @cached_property
+    def rest(self) -> np.ndarray | None:
+        """What of the picture (H, W, 4) is no reflected light; None where it is not known."""
+        return None if self.extraction.background is None else self.extraction.rest
+
+    def whole(self, name: str) -> np.ndarray:
+        """All (H, W, 4) that the picture of a technique shows: its passes, over `rest` where that is known."""
+        light = sum(self.images[name, pass_name] for pass_name in self.options.passes)
+        return self._with_rest(light)
+
+    def _with_rest(self, light: np.ndarray) -> np.ndarray:
+        """Reflected light (H, W, 3) and all else of the picture (H, W, 4)."""
+        if self.rest is None:
+            return np.concatenate([light, self.film.coverage()[..., None]], axis=-1)
+        return np.concatenate([self.rest[..., :3] + light, self.rest[..., 3:]], axis=-1)
 
     @cached_property
     def images(self) -> dict[tuple[str, str], np.ndarray]:
@@ -443,10 +481,9 @@ class Comparison:
             layers[f"cycles.{pass_name}"] = mean
             for half, pixels in zip("AB", halves, strict=True):
                 layers[f"cycles_{half}.{pass_name}"] = pixels
-            for name, result in self.results.items():
-                error = self.images[name, pass_name] - mean
-                layers[f"error_{name}.{pass_name}"] = np.where(self._mask(result)[..., None], error, 0.0)
-        layers |= self._visibility_layers()
+            for name in self.results:
+                layers[f"error_{name}.{pass_name}"] = self._error(name, pass_name)
+        layers |= self._whole_layers() | self._visibility_layers()
         # Of a surface with several lobes its first.
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)
@@ -455,6 +492,26 @@ class Comparison:
             layers[f"samples.{field}"] = imaging.Layer(film.image(values), letters)
         layers["coverage.hit"] = imaging.Layer(self.film.coverage(), "V")
         return layers
+
+    def _whole_layers(self) -> dict[str, np.ndarray]:
+        """What the pictures show, of Cycles with its direct light; none where the passes are not all of the light."""
+        if self.rest is None:
+            return {}
+        layers, is_surface = {}, self.film.coverage() > 0.0
+        cycles = sum(self.cycles[name].mean(axis=0) for name in PASSES) if self.cycles else None
+        for name, result in self.results.items():
+            missing = is_surface & ~self._mask(result)
+            layers[f"{name}.{COMBINED}"] = np.where(missing[..., None], 0.0, self.whole(name))
+            if cycles is not None:
+                layers[f"error_{name}.{COMBINED}"] = sum(self._error(name, part) for part in PASSES)
+        if cycles is not None:
+            layers[f"{CYCLES}.{COMBINED}"] = self._with_rest(cycles)
+        return layers
+
+    def _error(self, name: str, pass_name: str) -> np.ndarray:
+        """Technique minus Cycles (H, W, 3), 0 where it did not shade."""
+        error = self.images[name, pass_name] - self.cycles[pass_name].mean(axis=0)
+        return np.where(self._mask(self.results[name])[..., None], error, 0.0)
 
     def _visibility_layers(self) -> dict[str, imaging.Layer]:
         """The share of each light that is seen, 1 where no surface is; none where there are very many. Lights that
@@ -482,14 +539,15 @@ class Comparison:
         """The sheet of the sum of `passes`."""
         halves = sum(self.cycles[name] for name in passes)
         mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
-        hit = self.film.coverage() > 0.0
-        tiles = []
+        hit, tiles = self.film.coverage() > 0.0, []
+        # All light together is shown as the picture is seen; its errors are those of the light.
+        behind = 0.0 if self.rest is None or len(passes) == 1 else self.rest[..., :3]
         for name, result in self.results.items():
-            image, mask = sum(self.images[name, part] for part in passes), self._mask(result)
-            error, missing = np.where(mask[..., None], image - mean, 0.0), None
+            image, missing = sum(self.images[name, part] for part in passes) + behind, None
             if result.subset is not None:
-                missing = hit & ~mask
-            tiles.append(imaging.Tile(_title(name), rec709(image), rec709(error), self._caption(name, passes), missing))
+                missing = hit & ~self._mask(result)
+            error = rec709(sum(self._error(name, part) for part in passes))
+            tiles.append(imaging.Tile(_title(name), rec709(image), error, self._caption(name, passes), missing))
         title = passes[0] if len(passes) == 1 else "combined"
         notes = [
             f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
@@ -500,7 +558,7 @@ class Comparison:
         if notice := self._subset_notice():
             notes.append(f"{notice}; elsewhere gray")
         title = f"{Path(self.options.scene).stem}: {title} radiance beside Cycles"
-        return imaging.comparison_sheet(title, ("Cycles", rec709(mean)), tiles, notes=notes)
+        return imaging.comparison_sheet(title, ("Cycles", rec709(mean + behind)), tiles, notes=notes)
 
     def _caption(self, name: str, passes: tuple[str, ...]) -> list[str]:
         """The errors of a technique in the sum of `passes`."""
@@ -514,6 +572,13 @@ class Comparison:
             truth = sum(self._radiance(reference, part).sum(axis=0) for part in passes)
             lines.append(f"against reference {percent(imaging.error_statistics(values, truth).relative_l2)}")
         return lines
+
+
+def most_accurate(names) -> str:
+    """Of the techniques that a picture was made with the one that shows it: the last but the reference, which may stand
+    for a part of the pixels only."""
+    names = list(names)
+    return next((name for name in reversed(names) if name != REFERENCE), names[-1])
 
 
 def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:

@@ -27,6 +27,7 @@ from .options import PictureOptions
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
 SAME_REST = "bounced light{}, and all else that Cycles has rendered, is as the lights were; there is no PNG"
 BUT_GROUPS = ", but for that of light groups {}"
+SAME_GLOW = "what glows, lights in sight and the background are seen as the lights were; there is no PNG"
 KEPT_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
     "render the picture again for the last digits there"
@@ -83,7 +84,8 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     name = place.as_posix().removesuffix(KEPT_SUFFIX)
     options = PictureOptions(output=output, name=name, **kept.options)
     tables = picture.prepare(options)
-    warnings = kept.extraction.warnings + ((NO_CYCLES,) if kept.had_cycles else ())
+    warnings = kept.extraction.warnings + ((SAME_GLOW,) if kept.extraction.rest is not None else ())
+    warnings += (NO_CYCLES,) if kept.had_cycles else ()
     if split := _split_at_horizons(kept.extraction.samples):
         warnings += (KEPT_WEIGHTS.format(split, len(kept.extraction.samples)),)
     extraction = replace(kept.extraction, lights=lights, warnings=warnings)

@@ -37,8 +37,7 @@ DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 # A pass of Cycles, followed by the name of a light group.
 OF_GROUP = "Combined_"
-COMBINED, REST = "combined", "rest"
-SHOWN = "shown.png"
+REST = "rest"
 # Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
 SUB_SAMPLES, LAST_SECONDS = 17, 6.0
 # Of a budget: what the points of pixels, and the shadows, may take; and what a shadow ray takes, of which some soft
@@ -82,9 +81,9 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> p
 
     with temporary_folder() as folder, kept_blender(folder):
         made = finish(options, progress)
-        save_array(folder / "combined.npy", made.combined.astype(np.float32))
-        client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
-        shown = (folder / SHOWN).read_bytes()
+        save_array(folder / client.PICTURE, made.combined.astype(np.float32))
+        client.show_finished(Path(options.scene), (None, options.frame), folder, picture.SHOWN, progress=progress)
+        shown = (folder / picture.SHOWN).read_bytes()
     if progress is not None and progress("write", 0.0) is False:
         raise Cancelled("stopped before the files were written")
     name = options.name or "render"
@@ -370,7 +369,7 @@ def _write_exr(path: Path, made: Finished, options: RenderOptions) -> None:
         "ltsh:color_space": extraction.color_space.name,
     }
     planes = {}
-    for name, pixels in {COMBINED: made.combined, **made.ours, REST: made.rest}.items():
+    for name, pixels in {picture.COMBINED: made.combined, **made.ours, REST: made.rest}.items():
         planes |= imaging.Layer(pixels).planes(name)
     planes |= made.channels
     write_channels(path, planes, metadata, imaging.chromaticities(extraction.color_space), extraction.pixel_aspect)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ltsh_addon import cli, shading
+from ltsh_addon import cli, imaging, shading
 from ltsh_addon.blender.process import client
+from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import Job
 from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
@@ -14,6 +15,8 @@ from ltsh_addon.visibility import OccluderMesh, Occluders
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
 # Of both halves of the Cycles image around the true one; the factor of A is 1 + NOISE, of B 1 - NOISE.
 NOISE = 0.03
+# What surfaces emit, and the background with its alpha.
+EMISSION, BACKGROUND = 0.25, np.array([0.1, 0.2, 0.3, 0.75])
 WARNING = "material 'Glass': transmission is not shaded"
 
 
@@ -85,7 +88,7 @@ def wall(height: float, left: float = -9.0) -> Occluders:
 
 
 class FakeChild:
-    """Stands in for `client.extract` and `client.build_demo`; `asked` and `built` tell how they were called."""
+    """Stands in for functions of `client`; `asked` and `built` tell how `extract` and `build_demo` were called."""
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None, wall=None, change=None):
         self.groups, self.empty, self.error = groups, empty, error
@@ -96,7 +99,12 @@ class FakeChild:
     def install(self, monkeypatch) -> FakeChild:
         monkeypatch.setattr(client, "extract", self.extract)
         monkeypatch.setattr(client, "build_demo", self.build_demo)
+        monkeypatch.setattr(client, "show_finished", self.show_finished)
         return self
+
+    def show_finished(self, scene, where, folder, name, *, progress=None):
+        pixels = np.load(folder / client.PICTURE)
+        imaging.write_png(folder / name, to_srgb8(pixels[..., :3]))
 
     def build_demo(self, path, *, progress=None):
         self.built.append(path)
@@ -123,6 +131,8 @@ class FakeChild:
             camera=options.camera or "Camera",
             seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
             occluders=self.wall if options.shadows == "on" else None,
+            emission=np.full((HEIGHT, WIDTH, 3), EMISSION) if options.rest else None,
+            background=np.full((HEIGHT, WIDTH, 4), BACKGROUND) if options.rest else None,
         )
 
 

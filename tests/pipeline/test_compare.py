@@ -39,7 +39,9 @@ def test_compare_leaves_its_five_files_and_the_layers_of_the_design(child, tmp_p
         for name in TECHNIQUES:
             expected |= {f"{name}.{pass_name}", f"error_{name}.{pass_name}"}
             expected |= {f"{name}.{pass_name}@{group}" for group in ("Key", "Fill_001", "ungrouped")}
-    assert set(layers) == expected
+    for name in TECHNIQUES:
+        expected |= {f"{name}.combined", f"error_{name}.combined"}
+    assert set(layers) == expected | {"cycles.combined"}
     channels = imaging.read_channels(folder / "compare.exr")
     assert {"ltsh4.specular.R", "error_ltsh4.specular.B", "samples.position.X", "coverage.hit.V"} <= set(channels)
     assert "ltsh4.specular@Key.R" in channels and "samples.roughness.V" in channels
@@ -48,6 +50,28 @@ def test_compare_leaves_its_five_files_and_the_layers_of_the_design(child, tmp_p
     assert names == {"compare.exr", "compare.png", "report.html", "report.json", "timing.json"}
     page = (folder / "report.html").read_text(encoding="utf-8")
     assert "ltsh4" in page and "&#x27;Glass&#x27;" in page
+
+
+def test_combined_is_all_that_the_picture_shows(child, tmp_path):
+    compare_scene(options(tmp_path, techniques=("ltsh2", "reference"), reference_samples=12))
+    layers, rest = written(tmp_path), fake_scene.BACKGROUND + np.array([fake_scene.EMISSION] * 3 + [0.0])
+    is_surface = layers["coverage.hit"] > 0.0
+    for name in ("ltsh2", "reference", "cycles"):
+        light, whole = layers[f"{name}.specular"] + layers[f"{name}.diffuse"], layers[f"{name}.combined"]
+        # The reference stands for some pixels only, the others are black.
+        there = light.any(axis=-1) | ~is_surface
+        assert there.all() == (name != "reference")
+        np.testing.assert_allclose(whole[there, :3], light[there] + rest[:3], rtol=FLOAT32)
+        np.testing.assert_array_equal(whole[there, 3], np.float32(rest[3]))
+        assert not whole[~there].any()
+    error = layers["ltsh2.combined"] - layers["cycles.combined"]
+    np.testing.assert_allclose(layers["error_ltsh2.combined"], error[..., :3], atol=FLOAT32)
+
+
+def test_one_pass_alone_is_not_combined(child, tmp_path):
+    shade_scene(options(tmp_path, passes=("diffuse",)))
+    assert not [name for name in written(tmp_path, "shade.exr") if name.endswith("combined")]
+    assert (tmp_path / "out" / "shade.png").is_file() and not child.asked[0].rest
 
 
 def test_layers_of_groups_have_names_of_their_own_without_dots():
@@ -261,8 +285,10 @@ def test_the_sheet_has_all_light_first_and_then_the_passes_that_were_shaded(chil
     for (_, (_, image), tiles), names in zip(
         sheets, (("specular", "diffuse"), ("specular",), ("diffuse",)), strict=True
     ):
-        assert np.allclose(image, sum(layers[f"cycles.{name}"] for name in names))
-        assert np.allclose(tiles[1].image, sum(layers[f"ltsh4.{name}"] for name in names))
+        shown = ["combined"] if len(names) == 2 else names
+        assert np.allclose(image, sum(layers[f"cycles.{name}"][..., :3] for name in shown))
+        assert np.allclose(tiles[1].image, sum(layers[f"ltsh4.{name}"][..., :3] for name in shown))
+        assert np.allclose(tiles[1].error, sum(layers[f"error_ltsh4.{name}"] for name in names))
         missing = (layers["coverage.hit"] > 0.0) & ~layers["reference.specular"].any(axis=2)
         assert np.array_equal(tiles[2].missing, missing) and missing.any() and tiles[0].missing is None
     compare_scene(options(tmp_path, passes=("diffuse",), techniques=("ltsh2",)))
@@ -281,13 +307,14 @@ def test_no_samples_at_all(monkeypatch, tmp_path):
     report = compare_scene(options(tmp_path))
     check_schema(json.loads((tmp_path / "out" / "report.json").read_text()), pixels=0, samples=0)
     assert report["surface_samples"] == 0 and "sees no surface" in report["warnings"][0]
-    assert not any(plane.any() for plane in written(tmp_path).values())
+    assert not any(plane.any() for name, plane in written(tmp_path).items() if not name.endswith(".combined"))
     assert report["passes"]["specular"]["techniques"]["ltc"]["against_cycles"]["relative_l2"] is None
 
 
 def test_shade_writes_its_layers_and_report_and_nothing_else(child, tmp_path):
     report = shade_scene(options(tmp_path))
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"shade.exr", "report.json", "timing.json"}
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"shade.exr", "shade.png", "report.json", "timing.json"}
     assert child.asked[0].cycles_samples == 0
     check_schema(report, pixels=18, samples=35)
     assert report["cycles_samples"] == 0 and "noise" not in report["passes"]["specular"]

@@ -216,7 +216,6 @@ def _job_of(engine, depsgraph) -> FinalJob:
         shadows="on" if scene.ltsh.shadows else "off",
         shadow_rays=scene.ltsh.shadow_rays,
         background=None if scene.render.film_transparent else world_radiance(scene.world)[0],
-        has_sky=not (scene.render.film_transparent or world_radiance(scene.world)[1]),
         cycles_samples=scene.ltsh.cycles_samples if settings.complete else 0,
         cycles_passes=tuple(one[:2] for one in _passes_of_cycles(scene, depsgraph.view_layer)),
         keeps_lights=scene.ltsh.keep_lights and not engine.is_animation,
@@ -240,8 +239,8 @@ class FinalJob:
     other_techniques: tuple[str, ...] = ()  # with passes of their own
     shadows: str = "off"
     shadow_rays: int = 256  # see `PictureOptions`
-    background: np.ndarray | None = None  # (3,) radiance behind the surfaces, None: transparent
-    has_sky: bool = False  # the background varies: Cycles renders it
+    # (3,) radiance behind the surfaces while Cycles has not rendered what is there; None: transparent
+    background: np.ndarray | None = None
     cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
     cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
     keeps_lights: bool = False  # for the light mixer
@@ -298,17 +297,16 @@ def final_picture(
         frame=job.frame,
         scene_name=job.scene,
         view_layer=job.view_layer,
-        emission=True,
-        background=job.has_sky,
+        rest=True,
         indices=job.indices,
         shadows=job.shadows,
     )
     extraction = client.extract(options, progress=progress)
     emission = extraction.exposure * extraction.emission
     shown = PASSES if job.shown == "combined" else (job.shown,)
-    glow = emission if job.shown == "combined" else np.zeros_like(emission)
-    behind = job.background if extraction.background is None else extraction.background
-    rest = _over_background(glow, extraction.film.coverage(), behind, extraction.exposure)
+    rest = extraction.rest
+    if job.shown != "combined":
+        rest[..., :3] = extraction.exposure * extraction.background[..., :3]
     passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
@@ -422,11 +420,10 @@ def _image(extraction, technique: str, part: str, shadows, progress: Progress) -
 
 
 def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:
-    """RGBA (H, W, 4) of `color` over what is behind the surfaces: radiance (3,), what of it is seen (H, W, 3), or None:
-    nothing."""
+    """RGBA (H, W, 4) of `color` over what is behind the surfaces: radiance (3,), or None: nothing."""
     if background is None:
         return np.concatenate([color, coverage[..., None]], axis=-1)
-    seen = background if background.ndim == 3 else background * (1.0 - coverage)[..., None]
+    seen = background * (1.0 - coverage)[..., None]
     return np.concatenate([color + exposure * seen, np.ones((*coverage.shape, 1))], axis=-1)
 
 

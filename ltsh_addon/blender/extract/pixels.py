@@ -68,8 +68,8 @@ def render_pixel_samples(
 
 # Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# What may be asked for -> the pass of Cycles that has it.
-EXTRA_PASSES = {"emission": "emit", "background": "environment"}
+# Passes of Cycles with what of the picture is no reflected light.
+REST_PASSES = ("emit", "environment")
 # File with what stands in the way of light.
 OCCLUDERS = "occluders.npz"
 SEEDS = {"A": 1, "B": 7919}
@@ -263,11 +263,12 @@ def extract(job: dict, folder: Path, progress) -> dict:
         inventory.occluders.save(folder / OCCLUDERS)
 
     started = time.monotonic()
-    extra_passes = tuple(one for key, one in EXTRA_PASSES.items() if job.get(key)) + tuple(job.get("indices", ()))
+    has_rest = job.get("rest", False)
     end = math.inf if job.get("seconds") is None else begun + job["seconds"]
     offsets = sub_pixel_offsets(scene, job["sub_samples"], for_finished)
-    with world_behind(scene, inventory.behind if job.get("background") else None):
-        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, extra_passes, end)
+    with world_behind(scene, inventory.behind if has_rest and not picture["film_transparent"] else None):
+        passes = (*(REST_PASSES if has_rest else ()), *job.get("indices", ()))
+        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes, end)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None
@@ -279,6 +280,8 @@ def extract(job: dict, folder: Path, progress) -> dict:
         scene.world = inventory.world
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
+    # The picture may be shown next, as the file says.
+    scene.render.film_transparent = picture["film_transparent"]
     return {
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
@@ -320,6 +323,7 @@ def _picture(scene, job: dict) -> dict:
         "border": None if border is None else vars(border),
         "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
         "pixel_filter": filter_name(scene),
+        "film_transparent": scene.render.film_transparent,
         "exposure": scene.cycles.film_exposure,
         "color_space": working_space(),
     }

@@ -6,6 +6,7 @@ import errno
 import importlib.metadata
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -48,8 +49,7 @@ class ExtractOptions:
     scene_name: str | None = None
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
-    emission: bool = False  # also what the surfaces themselves emit
-    background: bool = False  # and what of the world is seen behind them
+    rest: bool = False  # also what of the picture is no reflected light
     indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
@@ -84,11 +84,12 @@ class Extraction:
     sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
     `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
     `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those
-    of the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces emit, and `background` what
-    of the world is seen behind them, without the exposure; None where it was not asked for. `indices` (H, W) are
-    passes of what the first sub-samples see, by Cycles' names. `problems` say why most of the picture is not
-    shaded. `occluders` are what stands in the way of light, around `origin` (3,) in m; None without shadows.
-    `light_settings` are power, exposure, red, green and blue of light objects as Blender has them.
+    of the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces and lights in sight emit, and
+    `background` (H, W, 4) what of the world is seen behind them, with the alpha of the picture, both without the
+    exposure; None where they were not asked for. `indices` (H, W) are passes of what the first sub-samples see, by
+    Cycles' names. `problems` say why most of the picture is not shaded. `occluders` are what stands in the way of
+    light, around `origin` (3,) in m; None without shadows. `light_settings` are power, exposure, red, green and blue
+    of light objects as Blender has them.
     """
 
     lights: tuple[AreaLight, ...]
@@ -116,6 +117,17 @@ class Extraction:
     processor_seconds: float = 0.0  # of the child
     has_lens: bool = False  # depth of field: samples are seen through different points of the lens
 
+    @property
+    def rest(self) -> np.ndarray | None:
+        """What of the picture (H, W, 4) is no reflected light, times the exposure: emission, lights in sight, world.
+
+        With all reflected light it is the picture that Cycles makes of the file. None where it was not asked for.
+        """
+        if self.background is None:
+            return None
+        light = self.exposure * (self.emission + self.background[..., :3])
+        return np.concatenate([light, self.background[..., 3:]], axis=-1)
+
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
     """Lights, samples and (if asked for) the Cycles reference of a .blend.
@@ -131,10 +143,17 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
     check_readable(scene)
     with temporary_folder() as folder:
         manifest = run_child({"task": "extract", **asdict(options), "scene": str(scene)}, folder, progress)
-        bits: list[np.ndarray] = []
-        samples, film, warnings, problems = _read_samples(manifest, folder, bits)
+        bits, rest = [], _Mean()
+
+        def look(channels: dict[str, np.ndarray]) -> None:
+            if options.for_finished:
+                bits.append(gbuffer.kept_by_cycles(channels))
+            if options.rest:
+                rest.add(gbuffer.not_reflected(channels, manifest["passes"], manifest["film_transparent"]))
+
+        samples, film, warnings, problems = _read_samples(manifest, folder, look)
         lights = lights_of(manifest["lights"])
-        warnings += gbuffer.rounded_positions(samples.position, lights)
+        warnings += gbuffer.rounded_positions(samples.position[has_lobe(samples).any(axis=0)], lights)
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
@@ -155,8 +174,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             reference=read_reference(manifest, folder),
             border=None if manifest["border"] is None else Border(**manifest["border"]),
             color_space=identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"]),
-            emission=_read_pass("emission", manifest, folder) if options.emission else None,
-            background=_read_pass("background", manifest, folder) if options.background else None,
+            emission=rest.value[..., :3] if options.rest else None,
+            background=rest.value[..., 3:] if options.rest else None,
             indices=_read_indices(options.indices, manifest, folder),
             kept=kept,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
@@ -184,10 +203,10 @@ def _ended(samples, film, lights) -> tuple[SurfaceSamples, Film]:
 
 
 def _read_samples(
-    manifest: dict, folder: Path, bits: list[np.ndarray]
+    manifest: dict, folder: Path, look: Callable[[dict[str, np.ndarray]], None]
 ) -> tuple[SurfaceSamples, Film, list[str], list[str]]:
     """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded;
-    `bits` get what `gbuffer.kept_by_cycles` finds in each of a finished picture."""
+    `look` gets the channels of each render."""
     width, height = manifest["width"], manifest["height"]
     materials = manifest.get("unshaded", [])
     renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
@@ -199,8 +218,7 @@ def _read_samples(
         unusable += bad
         unnamed += gbuffer.surfaces_without_sample(channels)
         unshaded += gbuffer.unshaded_hits(channels, len(materials))
-        if manifest.get("kept"):
-            bits.append(gbuffer.kept_by_cycles(channels))
+        look(channels)
     samples, film = gbuffer.join(renders, width, height)
     warnings = []
     if unusable:
@@ -250,11 +268,18 @@ def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 
 
-def _read_pass(key: str, manifest: dict, folder: Path) -> np.ndarray:
-    """A pass of the sample renders (H, W, 3), the mean of all."""
-    name = manifest["passes"][key]
-    images = [lobes.read_layer(_rendered(folder / file), name, "RGB") for file in manifest["samples"]]
-    return np.mean(images, axis=0, dtype=np.float64)
+class _Mean:
+    """The mean of arrays of which one is there at a time."""
+
+    def __init__(self):
+        self._sum, self._count = 0.0, 0
+
+    def add(self, values: np.ndarray) -> None:
+        self._sum, self._count = self._sum + values.astype(np.float64), self._count + 1
+
+    @property
+    def value(self) -> np.ndarray:
+        return self._sum / self._count
 
 
 def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[str, np.ndarray]:
@@ -370,10 +395,13 @@ def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:
     return channels
 
 
+PICTURE = "picture.npy"
+
+
 def show_finished(scene: Path, where: tuple, folder: Path, name: str, *, progress: Progress | None = None) -> None:
-    """Write `combined.npy` of `folder` as the PNG `name` there, through the view transform of a scene of the file at a
-    frame, `where` (None: those of the file)."""
-    job = {"task": "show", "scene": str(Path(scene).absolute()), "pixels": str(folder / "combined.npy"), "name": name}
+    """Write `PICTURE` of `folder` (H, W, 4) as the PNG `name` there, through the view transform of a scene of the file
+    at a frame, `where` (None: those of the file)."""
+    job = {"task": "show", "scene": str(Path(scene).absolute()), "pixels": str(folder / PICTURE), "name": name}
     run_child({**job, "scene_name": where[0], "frame": where[1]}, folder, progress)
 
 

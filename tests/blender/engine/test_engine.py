@@ -316,8 +316,9 @@ def test_progress_follows_the_plan_to_its_end_and_can_stop(scene, tmp_path):
 
 
 def test_the_picture_is_shown_as_its_passes_come(scene, tmp_path):
+    parts.add_world(Color=(0.1, 0.2, 0.3, 1.0))
     path, shown = parts.save(tmp_path / "scene.blend"), []
-    job = final_job(scene, background=np.array([0.1, 0.2, 0.3]))
+    job = final_job(scene)
     whole = render_module.final_picture(job, path, lambda stage, fraction: True, shown.append)
     assert [len(picture.passes) for picture in shown] == [1, 2, 3]
     for earlier, name in zip(shown, ("LTSH Specular", "LTSH Diffuse"), strict=False):
@@ -338,9 +339,7 @@ def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
                        (plain.outputs[0], mix.inputs[2]), (mix.outputs[0], output.inputs["Surface"])):  # fmt: skip
         tree.links.new(start, end)
     path = parts.save(tmp_path / "scene.blend")
-    picture = render_module.final_picture(
-        final_job(scene, background=np.zeros(3), has_sky=True), path, lambda *now: True
-    )
+    picture = render_module.final_picture(final_job(scene), path, lambda *now: True)
     lit = picture.passes["LTSH Specular"] + picture.passes["LTSH Diffuse"] + picture.passes[render_module.EMISSION]
     behind = picture.combined[..., :3] - lit
     share = behind[..., 1] / seen[1]
@@ -351,7 +350,7 @@ def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
     scene.render.use_border, scene.render.use_crop_to_border = True, False
     scene.render.border_min_x, scene.render.border_max_x = 0.0, 0.5
     path = parts.save(tmp_path / "region.blend")
-    job = final_job(scene, background=np.zeros(3), has_sky=True, keeps_lights=True)
+    job = final_job(scene, keeps_lights=True)
     region = render_module.final_picture(job, path, lambda *now: True)
     width = region.combined.shape[1]
     assert 0 < width < picture.combined.shape[1]

@@ -135,9 +135,12 @@ def owner_of(instance):
     return instance.parent if instance.is_instance and instance.parent else instance.object
 
 
-def is_seen_by_cameras(instance) -> bool:
-    """False where the artist hides it from camera rays."""
-    return instance.object.visible_camera and owner_of(instance).visible_camera
+def is_seen_by_cameras(instance, view_layer) -> bool:
+    """False where the artist hides it from camera rays, or has it contribute indirectly alone."""
+    owner = owner_of(instance)
+    if not (instance.object.visible_camera and owner.visible_camera):
+        return False
+    return not owner.original.indirect_only_get(view_layer=view_layer)
 
 
 def data_pointer(ob) -> int:

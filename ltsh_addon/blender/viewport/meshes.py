@@ -212,7 +212,8 @@ def mesh_batches(ob) -> MeshBatches | None:
 
 
 def _arrays(ob) -> _Arrays | None:
-    mesh = ob.to_mesh()
+    # Asking hair and points for a mesh is an error.
+    mesh = None if ob.type in ("CURVES", "POINTCLOUD") else ob.to_mesh()
     if mesh is None:
         return None
     try:

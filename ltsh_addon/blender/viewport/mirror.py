@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...scene import AreaLight
+from ...scene import AreaLight, listed
 from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
@@ -129,6 +129,13 @@ def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str
     return [replace(light, falloff=0, smooth=0.0)]
 
 
+# Types of objects that views leave out, and what is said of them; so many names of each.
+NOT_SHOWN = {
+    "CURVES": "hair is not shown in views",
+    "POINTCLOUD": "point clouds are not shown in views",
+    "VOLUME": "volumes are not shown in views",
+}
+NAMED = 3
 # In place of a receiver's number: nothing is seen there, nor behind it.
 HOLDOUT = -1
 
@@ -218,6 +225,20 @@ def _note_object(changes: Changes, block, update) -> None:
         changes.geometry.add(block.session_uid)
 
 
+def object_notes(depsgraph) -> list[str]:
+    """What views do not show of the objects that renders of `depsgraph` show, kind by kind."""
+    found: dict[str, list[str]] = {}
+    for ob in depsgraph.objects:
+        kind = NOT_SHOWN.get(ob.type)
+        if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
+            kind = "shown as any surface, not as shadow catcher"
+        if kind is None and any(system.settings.type == "HAIR" for system in ob.particle_systems):
+            kind = NOT_SHOWN["CURVES"]
+        if kind is not None:
+            found.setdefault(kind, []).append(ob.name)
+    return [f"{listed(names, NAMED)}: {kind}" for kind, names in found.items()]
+
+
 class SceneMirror:
     """Meshes, looks, instances and lights of one view of a scene."""
 
@@ -231,6 +252,7 @@ class SceneMirror:
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
         self._looks: dict[str, ShownLook] = {}
+        self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
         self._light_textures = ShownTextures()
         self._world_note: tuple[str, ...] = ()
@@ -239,7 +261,8 @@ class SceneMirror:
     @property
     def notes(self) -> list[str]:
         """What is not shown as Cycles has it, each once."""
-        return list(dict.fromkeys([*self.material_notes, *self._light_notes, *self._world_note]))
+        notes = self.material_notes, self._object_notes, self._light_notes, self._world_note
+        return list(dict.fromkeys(note for kind in notes for note in kind))
 
     @property
     def material_notes(self) -> list[str]:
@@ -297,7 +320,7 @@ class SceneMirror:
                 continue
             data = data_pointer(ob)
             users[data] += 1
-            if not is_seen_by_cameras(instance) or not in_view(instance):
+            if not is_seen_by_cameras(instance, depsgraph.view_layer) or not in_view(instance):
                 continue
             key = mesh_key(instance)
             if key not in meshes:
@@ -322,6 +345,7 @@ class SceneMirror:
             found.append((data, (mesh, model, shown, receiver, side, center)))
         self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
         self._meshes, self._looks = meshes, looks
+        self._object_notes = tuple(object_notes(depsgraph))
 
     def _read_world(self, world) -> None:
         radiance, whole = world_radiance(world)

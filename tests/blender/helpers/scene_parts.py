@@ -113,6 +113,7 @@ def point_cloud(count):
         mesh = bpy.data.meshes.new("Seeds")
         mesh.from_pydata([(0.0, 0.0, 0.0)] * count, [], [])
         seeds = link(bpy.data.objects.new("Seeds", mesh))
+        bpy.ops.object.select_all(action="DESELECT")
         bpy.context.view_layer.objects.active = seeds
         seeds.select_set(True)
         bpy.ops.object.convert(target="POINTCLOUD")

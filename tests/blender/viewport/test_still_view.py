@@ -289,3 +289,37 @@ def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
     counts = [count for version, count in versions if version == 2]
     assert versions[-1][0] == 2 and counts == sorted(counts)
     assert relative(live, exact) < 0.02
+
+
+def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
+    """Hair, points, fur and a shadow catcher; and what only contributes indirectly, which nobody sees."""
+    with_graphics(lambda: None)
+    set_up_scene()
+    wall = parts.add_plane(None, 4.0, "Wall", location=(0.0, -1.0, 1.0), rotation=(1.4, 0.0, 0.0))
+    wall.visible_shadow = wall.visible_diffuse = wall.visible_glossy = False
+    hidden = bpy.data.collections.new("Indirect")
+    bpy.context.scene.collection.children.link(hidden)
+    hidden.objects.link(wall)
+    bpy.context.scene.collection.objects.unlink(wall)
+    bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
+    path = parts.save(tmp_path / "without.blend")
+    parts.link(bpy.data.objects.new("Hair", parts.hair_curves(3)))
+    parts.link(bpy.data.objects.new("Cloud", parts.point_cloud(3)))
+    bpy.data.objects["Sign"].modifiers.new("Fur", "PARTICLE_SYSTEM")
+    bpy.data.objects["Sign"].particle_systems[0].settings.type = "HAIR"
+    bpy.data.objects["Plane"].is_shadow_catcher = True
+    more = parts.save(tmp_path / "more.blend")
+    layers, warnings = [], []
+    for file in (path, more):
+        arguments = ("-o", tmp_path / file.stem, "--refine", 1, "--shadows", "off", "--json", "--quiet")
+        code, stdout, stderr = run(capsys, "view", file, *arguments)
+        assert (code, stderr) == (0, "")
+        warnings.append(json.loads(stdout)["warnings"])
+        layers.append(imaging.read_layers(tmp_path / file.stem / "view.exr"))
+    assert warnings[0] == []
+    for part in ("Hair", "Sign", "Cloud: point clouds", "Plane: shown as any surface"):
+        assert any(part in line for line in warnings[1]), (part, warnings[1])
+    np.testing.assert_array_equal(layers[0]["ltsh4.combined"], layers[1]["ltsh4.combined"])
+    assert run(capsys, "shade", path, "-o", tmp_path / "shade", "--techniques", "ltsh4", "--quiet")[0] == 0
+    seen = imaging.read_layers(tmp_path / "shade" / "shade.exr")["coverage.hit"]
+    assert np.abs(layers[0]["coverage.hit"] - seen).mean() < 0.01

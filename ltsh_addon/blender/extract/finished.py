@@ -65,7 +65,7 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
 
 def show_finished(job: dict, folder: Path, progress) -> dict:
     """Write a PNG of pixels (H, W, 4) through the view transform of the scene."""
-    progress("view transform", 0.0)
+    progress("write", 0.0)
     if Path(bpy.data.filepath) != Path(job["scene"]):
         open_scene(Path(job["scene"]), [], False)
     scene = scene_named(job["scene_name"])

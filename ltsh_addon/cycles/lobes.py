@@ -135,6 +135,19 @@ class Hits:
         return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
 
 
+# Those that may be anisotropic.
+BRUSHED_KINDS = ("glossy", "principled", "metal", "conductor", "conductor_4_5")
+
+
+def aspect_of(kind: str, anisotropy):
+    """By what alpha is divided along the tangent, and multiplied across it, in a lobe of one of BRUSHED_KINDS."""
+    if kind != "glossy":
+        return np.sqrt(1.0 - 0.9 * np.clip(anisotropy, 0.0, 1.0))
+    share = np.clip(anisotropy, -0.99, 0.99)
+    aspect = np.where(share < 0.0, 1.0 + share, 1.0 / (1.0 - share))
+    return np.where(np.abs(share) > 1e-4, aspect, 1.0)
+
+
 class LobeSlot:
     """The hits (Q,) that have a lobe in one slot, and its quantities there."""
 
@@ -152,13 +165,9 @@ class LobeSlot:
         alpha = self.roughness**2
         if not self._has_anisotropy():
             return np.stack([alpha, alpha])
-        anisotropy = self.value("anisotropy")
-        layered = np.sqrt(1.0 - 0.9 * np.clip(anisotropy, 0.0, 1.0))
-        share = np.clip(anisotropy, -0.99, 0.99)
-        glossy = np.where(share < 0.0, 1.0 + share, 1.0 / (1.0 - share))
-        aspect = np.where(self.of("glossy")[:, 0], np.where(np.abs(share) > 1e-4, glossy, 1.0), layered)
-        kinds = [self.of(kind)[:, 0] for kind in ("glossy", "principled", "metal", "conductor", "conductor_4_5")]
-        aspect = np.where(np.logical_or.reduce(kinds), aspect, 1.0)
+        anisotropy, aspect = self.value("anisotropy"), 1.0
+        for kind in BRUSHED_KINDS:
+            aspect = np.where(self.of(kind)[:, 0], aspect_of(kind, anisotropy), aspect)
         return np.minimum(np.stack([alpha / aspect, alpha * aspect]), 1.0)
 
     @cached_property

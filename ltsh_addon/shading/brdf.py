@@ -117,10 +117,15 @@ def dielectric_reflectance(cosine, ior):
     broadcasts."""
     cosine = np.asarray(cosine)
     g = np.sqrt(np.maximum(ior * ior - 1.0 + cosine * cosine, 0.0))
+    total, found = g + cosine, g - cosine
+    plus, minus = cosine * total - 1.0, cosine * found + 1.0
     # At cosine 0 without refraction (ior 1) the quotient is 0 / 0; its limit along cosine -> 0 is 0.
-    perpendicular = (g - cosine) / np.maximum(g + cosine, 1e-30)
-    plus, minus = cosine * (g + cosine) - 1.0, cosine * (g - cosine) + 1.0
-    return 0.5 * perpendicular * perpendicular * (1.0 + (plus / minus) ** 2)
+    found /= np.maximum(total, 1e-30)
+    plus /= minus
+    found *= found
+    plus *= plus
+    plus += 1.0
+    return 0.5 * found * plus
 
 
 def stretch(x, y, anisotropy):

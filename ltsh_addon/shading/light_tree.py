@@ -13,6 +13,7 @@ all lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -37,7 +38,9 @@ SHARP_TAIL = 0.05
 # Leaves whose error is larger are shaded as polygons.
 LEAF_ERROR = 1e-3
 # Samples of a tile, and pairs of a sample and a node that are shaded at a time.
-TILE, PAIRS = 96, 12288
+TILE, PAIRS = 96, 32768
+# Of nodes that swing by less of their light the lights are taken as parallel.
+TURNED = 1e-6
 # Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
 # the swing of its lights where some may face away.
 CROSSED, SWUNG = 0.1, 0.02
@@ -58,11 +61,11 @@ class LightTree:
     axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness, a standard deviation long; the first is the axis
     axis: np.ndarray  # (N, 3) mean direction to which the lights shine
     cone: np.ndarray  # (N,) rad: no direction is farther from that
-    vector: np.ndarray  # (3, N): mean radiance times area vectors
+    vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     color: np.ndarray  # (3, N) of the light, 1 on average
     power: np.ndarray  # (N,) mean radiance times area
-    diagonal: np.ndarray  # (N,) as of `SmallLight`, mean
+    diagonal: np.ndarray  # (N,) as of `SmallLight`, mean; in single precision, as are swing and color
     children: np.ndarray  # (N, 2) numbers of nodes
     number: np.ndarray  # (N,) numbers of the lights as given
 
@@ -89,16 +92,32 @@ class LightTree:
         axis = sums(power[:, None] * normal)
         length = np.linalg.norm(axis, axis=1, keepdims=True)
         axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
-        vector = sums(brightness[:, None] * area).T
-        color = sums(radiance * size[:, None]).T / total
+        vector = sums(brightness[:, None] * area)
+        color = (sums(radiance * size[:, None]).T / total).astype(np.float32)
         # The cosines of directions that differ by so much are taken as uniform, sqrt(3) standard deviations either way.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
-        swing = total * np.sqrt(1.5 * turned)
+        swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
         cone = cones(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
-        diagonal = sums(power * diagonal) / total
+        diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
         return cls(middle + origin, reach, axes, axis, cone, vector, swing, color, total, diagonal, children, number)
+
+    @cached_property
+    def is_turned(self) -> np.ndarray:
+        """Mask (N,) of the nodes whose lights face differently."""
+        return self.swing > 2.0 * TURNED * self.power
+
+    @cached_property
+    def places(self) -> list[np.ndarray]:
+        """Points (N W, 3), W of each node, for diffuse and for specular lobes."""
+        number, found = np.arange(len(self.center)), []
+        for corners in (CORNERS, PAIRS_OF_CORNERS):
+            # Each of the ways that there are for some of the nodes, so that what one does wrong others mend.
+            ways = corners[number % len(corners)]
+            points = np.stack([(ways * self.axes[:, axis].T[:, None]).sum(axis=2) for axis in range(3)], axis=2)
+            found.append((self.center[:, None] + points).reshape(-1, 3))
+        return found
 
 
 class _Sums:
@@ -260,6 +279,7 @@ class _Pairs:
     """Pairs (K,) of a tile and a node: how much light that is at most, and how much of it may be wrong."""
 
     def __init__(self, tree: LightTree, tiles: Tiles, tile, node):
+        self.tile, self.node, self.are_leaves = tile, node, tree.number[node] >= 0
         offset = tree.center[node] - tiles.center[tile]
         gap = np.maximum(np.abs(offset) - tiles.half[tile], 0.0)
         reach = tree.reach[node]
@@ -278,17 +298,19 @@ class _Pairs:
         plane = np.where(angle + cone + parallax > 0.5 * np.pi, np.minimum(SWUNG * swing + CROSSED * rim, 1.0), 0.0)
         crossed = np.minimum(plane / np.maximum(shining, 1e-30), 1.0)
         self.is_dark = angle - cone - parallax > 0.5 * np.pi
+        self.are_crossed = np.zeros(len(node), bool)
         for number, (axes, cones) in enumerate(tiles.horizons):
             angle = _angles(offset, distance, axes[tile])
             steepest = np.clip(angle - cones[tile] - parallax, 0.0, 0.5 * np.pi)
             self.is_dark |= angle - cones[tile] - parallax > 0.5 * np.pi
             is_crossed = angle + cones[tile] + parallax > 0.5 * np.pi
+            self.are_crossed |= is_crossed
             if tiles.mirrored is None and number == len(tiles.horizons) - 1:
                 self.light *= np.cos(steepest)
                 is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), 1e-30), 1.0)
             crossed += CROSSED * is_crossed
         self.are_in_tail = np.zeros(len(node), bool)
-        self.is_wrong = False
+        self.is_wrong = np.zeros(len(node), bool)
         if tiles.mirrored is not None:
             axes, cones = tiles.mirrored
             away = np.maximum(_angles(offset, distance, axes[tile]) - cones[tile] - parallax, 0.0)
@@ -311,93 +333,140 @@ class _Pairs:
     def are_fine(self, most) -> np.ndarray:
         """Mask (K,) of those whose error is at most so much (K,)."""
         small = (self.size < SMALL) & (self.crossed <= most)
-        return (small | (self.size < LARGEST) & (self.error <= most)) & ~np.asarray(self.is_wrong)
+        return (small | (self.size < LARGEST) & (self.error <= most)) & ~self.is_wrong
+
+    def take(self, index) -> _Pairs:
+        """Those at the index (Q,)."""
+        return self._of({name: values[index] for name, values in vars(self).items()})
+
+    @classmethod
+    def joined(cls, parts) -> _Pairs:
+        """All pairs of the `parts`."""
+        return cls._of({name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+
+    @classmethod
+    def _of(cls, values) -> _Pairs:
+        found = object.__new__(cls)
+        vars(found).update(values)
+        return found
 
 
-def _refined(tree, tiles, tile, node, is_fine):
-    """Pairs (tile, node), and `_Pairs` of them, of which is_fine(pairs, tile) holds or which are leaves, from those
-    given."""
-    fine = [(tile[:0], node[:0])]
-    while len(node):
+def _refined(tree, tiles, is_fine) -> _Pairs:
+    """The coarsest `_Pairs` of all tiles of which is_fine(pairs) holds, or which are leaves; none that is dark."""
+    fine, tile, node = [], np.arange(len(tiles.columns)), np.zeros(len(tiles.columns), int)
+    while len(node) or not fine:
         pairs = _Pairs(tree, tiles, tile, node)
-        leaf = tree.number[node] >= 0
-        done = leaf | is_fine(pairs, tile)
-        keep = done & ~pairs.is_dark
-        fine.append((tile[keep], node[keep]))
-        children = tree.children[node[~done]]
-        tile, node = np.repeat(tile[~done], 2), children.ravel()
-    return tuple(np.concatenate(parts) for parts in zip(*fine, strict=True))
+        done = pairs.are_leaves | is_fine(pairs)
+        fine.append(pairs.take(done & ~pairs.is_dark))
+        open_ones = ~(done | pairs.is_dark)
+        tile, node = np.repeat(tile[open_ones], 2), tree.children[node[open_ones]].ravel()
+    return _Pairs.joined(fine)
 
 
 def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int, np.ndarray]:
     """Add to total (F, 3, Q) what the columns `chosen` (Q',) of `lobes`, at x, y, z in `position` (3, Q), get of the
     lights of the tree; by number of the light the columns that need it whole."""
     tiles = Tiles.of(lobes, position, chosen)
-    count = len(tiles.columns)
-    roots = np.arange(count), np.zeros(count, int)
-    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.size < COARSE)
-    light = np.bincount(tile, _Pairs(tree, tiles, tile, node).light, count)
+    coarse = _refined(tree, tiles, lambda pairs: pairs.size < COARSE)
+    light = np.bincount(coarse.tile, coarse.light, len(tiles.columns))
     most = ERROR[lobes.sharpest is not None] * light
-    tile, node = _refined(tree, tiles, *roots, lambda pairs, tile: pairs.are_fine(most[tile]))
-    pairs = _Pairs(tree, tiles, tile, node)
-    near = (tree.number[node] >= 0) & ~pairs.are_fine(LEAF_ERROR * light[tile])
+    pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
+    near = pairs.are_leaves & ~pairs.are_fine(LEAF_ERROR * light[pairs.tile])
     left: dict[int, list] = {}
-    for own, number in zip(tile[near], tree.number[node[near]], strict=True):
+    for own, number in zip(pairs.tile[near], tree.number[pairs.node[near]], strict=True):
         left.setdefault(int(number), []).append(tiles.columns[own])
-    order = np.argsort(tile, kind="stable")
-    order = order[~near[order]]
-    bounds = np.searchsorted(tile[order], np.arange(count + 1))
-    for own, columns in enumerate(tiles.columns):
-        mine = order[bounds[own] : bounds[own + 1]]
-        _add_points(
-            tree, lobes, position, (columns, node[mine], pairs.are_points[mine], pairs.are_in_tail[mine]), total
-        )
+    pairs = pairs.take(~near)
+    pairs = pairs.take(np.argsort(pairs.tile, kind="stable"))
+    bounds = np.searchsorted(pairs.tile, np.arange(len(tiles.columns) + 1))
+    for columns, first, end in zip(tiles.columns, bounds, bounds[1:], strict=False):
+        _add_points(tree, lobes, position, (columns, pairs.take(slice(first, end))), total)
     return {number: np.sort(np.concatenate(parts)) for number, parts in left.items()}
 
 
-def _add_points(tree, lobes, position, pairs, total):
-    """Add the light of nodes to total (F, 3, Q); pairs: columns (Q',), nodes (M,), and masks (M,) of those that are
-    one point and of those that are in the tail of all lobes."""
-    columns, nodes, single, tail = pairs
+@dataclass(frozen=True)
+class _Fan:
+    """As `small_lights.Rays`, (K, Q), from the Q samples of a tile to K points."""
+
+    ends: np.ndarray  # (K, 4): offsets of the points from the middle of the tile, and 1
+    place: np.ndarray  # (4, Q): those of the samples, and 1
+    squares: np.ndarray
+    distance: np.ndarray
+    flux: np.ndarray
+    diagonal: np.ndarray  # (K, 1)
+    slack: None = None
+
+    def heights(self, vectors) -> np.ndarray:
+        """Products (K, Q) of the offsets with vectors (3, Q)."""
+        return self.ends @ np.concatenate([vectors, -dot(vectors, self.place)[None]])
+
+
+class _Points:
+    """What nodes of a tree are for a tile: K points."""
+
+    def __init__(self, tree, pairs: _Pairs, middle, is_specular):
+        nodes, single, crossed = pairs.node, pairs.are_points, pairs.are_crossed
+        places, turned = tree.places[is_specular], tree.is_turned[nodes]
+        # What takes longer comes last.
+        order = np.argsort(2 * turned + crossed, kind="stable")
+        most = len(places) // len(tree.center)
+        count = np.where(single, 1, most)[order]
+        node = np.repeat(nodes[order], count)
+        ends = np.cumsum(count)
+        points = places[most * node + np.arange(len(node)) - np.repeat(ends - count, count)]
+        alone = ends[count == 1] - 1
+        points[alone] = tree.center[node[alone]]
+        points -= middle
+        self.is_crossed, self.is_turned = np.repeat(crossed[order], count), np.repeat(turned[order], count)
+        self.colors = tree.color[:, node] / np.repeat(count, count).astype(np.float32)
+        self.squared, vector = (points * points).sum(axis=1), tree.vector[node]
+        self.ends, self.from_squares, self.from_plane = np.ones((3, len(node), 4), np.float32)
+        self.ends[:, :3] = points
+        self.from_squares[:, :3], self.from_squares[:, 3] = -2.0 * points, self.squared
+        self.from_plane[:, :3], self.from_plane[:, 3] = vector, -(vector * points).sum(axis=1)
+        self.swing, self.diagonal = tree.swing[node][:, None], tree.diagonal[node][:, None]
+
+    def fan(self, part, place) -> _Fan:
+        """Rays to the points `part`, a slice, from the places (4, Q)."""
+        ends, size = self.ends[part], dot(place, place)
+        # In products of matrices squares lose digits where points are near, by the size of the tile.
+        if self.squared[part].min() > 4.0 * size.max():
+            squares = self.from_squares[part] @ place
+            squares += size
+        else:
+            offset = ends[:, :3].T[:, :, None] - place[:3, None]
+            squares = dot(offset, offset)
+        distance = np.sqrt(squares)
+        flux = self.from_plane[part] @ place
+        if self.is_turned[part].any():
+            flux = _mean_above_zero(flux, self.swing[part] * distance)
+        else:
+            np.maximum(flux, np.float32(0.0), out=flux)
+        return _Fan(ends, place, squares, distance, flux, self.diagonal[part])
+
+
+def _add_points(tree, lobes, position, tile, total):
+    """Add the light of nodes to total (F, 3, Q); tile: its columns (Q',) and `_Pairs` with the nodes."""
+    columns, pairs = tile
     middle = position[:, columns].mean(axis=1)
-    place = (position[:, columns] - middle[:, None]).astype(np.float32)
+    place = np.ones((4, len(columns)), np.float32)
+    place[:3] = position[:, columns] - middle[:, None]
     clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
     horizons = [lobes.rows[row][:, columns] for row in clipped]
     sums = np.zeros((total.shape[0], 3, len(columns)), np.float32)
-    corners = CORNERS if lobes.sharpest is None else PAIRS_OF_CORNERS
+    step = max(PAIRS // len(columns), 1)
     for is_tail in (True, False):
         exact = is_tail and lobes.limits is not None
-        for is_single in (True, False):
-            chosen = nodes[(tail == is_tail) & (single == is_single)]
-            points = 1 if is_single else corners.shape[1]
-            step = max(PAIRS // (len(columns) * points), 1)
-            for first in range(0, len(chosen), step):
-                part = chosen[first : first + step]
-                center = tree.center[part].T[:, None]
-                if not is_single:
-                    # Each of the ways that there are for some of the nodes, so that what one does wrong others mend.
-                    ways = corners[part % len(corners)]
-                    center = center + np.einsum("npk,kcn->cpn", ways, tree.axes[:, :, part])
-                center = (center.reshape(3, -1) - middle[:, None]).astype(np.float32)
-                rays = _rays(tree, np.tile(part, points), center[..., None] - place[:, None, :], horizons)
-                values = lobes.limits.at_centers(columns, rays, len(sums)) if exact else lobes.at_point(columns, rays)
-                colors = (tree.color[:, part] / points).astype(np.float32)
-                for own, value in zip(sums, values, strict=True):
-                    value = value.reshape(points, len(part), -1)
-                    own += np.einsum("ck,kq->cq", colors, value[0] if points == 1 else value.sum(axis=0))
+        points = _Points(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
+        for first in range(0, len(points.ends), step):
+            part = slice(first, first + step)
+            fan = points.fan(part, place)
+            if points.is_crossed[part].any():
+                for normal in horizons:
+                    fan.flux[fan.heights(normal) <= 0.0] = 0.0
+            values = lobes.limits.at_centers(columns, fan, len(sums)) if exact else lobes.at_point(columns, fan)
+            for own, value in zip(sums, values, strict=True):
+                own += points.colors[:, part] @ value
     total[:, :, columns] += sums
-
-
-def _rays(tree, part, offset, horizons) -> small_lights.Rays:
-    """Rays (K, Q) to points of the nodes `part` (K,) at offset (3, K, Q), dark below `horizons` (3, Q)."""
-    squares = dot(offset, offset)
-    distance = np.sqrt(squares)
-    vector = tree.vector[:, part].astype(np.float32)[..., None]
-    swing = np.maximum(tree.swing[part], 1e-6 * tree.power[part]).astype(np.float32)[:, None] * distance
-    flux = _mean_above_zero(-dot(vector, offset), swing)
-    for normal in horizons:
-        flux *= dot(normal, offset) > 0.0
-    return small_lights.Rays(offset, squares, distance, flux, tree.diagonal[part].astype(np.float32)[:, None])
 
 
 def _mean_above_zero(mean, swing):

@@ -99,6 +99,10 @@ class Rays:
         flux = np.maximum(-dot(area_vector, offset), np.float32(0.0))
         return cls(offset, squares, np.sqrt(squares), flux, diagonal)
 
+    def heights(self, vectors) -> np.ndarray:
+        """Products (...) of the offsets with vectors (3, Q)."""
+        return dot(vectors, self.offset)
+
     def take(self, index) -> Rays:
         """The rays `index` (Q,) of the last axis."""
         chosen = (values[..., index] for values in (self.offset, self.squares, self.distance, self.flux))
@@ -150,7 +154,8 @@ class CosineAtPoint:
         self.normal = rows[2]
 
     def __call__(self, part, rays: Rays):
-        values = np.maximum(dot(self.normal[:, part], rays.offset), np.float32(0.0))
+        values = rays.heights(self.normal[:, part])
+        np.maximum(values, np.float32(0.0), out=values)
         values *= rays.flux
         values *= np.float32(1.0 / np.pi)
         values /= rays.squares * rays.squares
@@ -186,7 +191,7 @@ class ShadowedCosineAtPoint:
         self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
 
     def __call__(self, part, rays: Rays):
-        along = dot(self.smooth[:, part], rays.offset)
+        along = rays.heights(self.smooth[:, part])
         return self.plain(part, rays) * self._shadowing(part, along, rays.squares)
 
     def at_nodes(self, part, nodes, toward):
@@ -221,7 +226,7 @@ class LobeAtPoint:
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
 
     def __call__(self, part, rays: Rays):
-        x, y, z = (dot(row[:, part], rays.offset) for row in self.rows[:3])
+        x, y, z = (rays.heights(row[:, part]) for row in self.rows[:3])
         inverse = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
         angle = inverse * inverse * inverse
         angle *= self.determinant[part] * rays.flux
@@ -232,10 +237,14 @@ class LobeAtPoint:
             return np.stack([terms[part] * cosine for terms in self.terms[:, 0]])
         x *= inverse
         leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
-        values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in self.terms])
+        # Of points the others follow from the first.
+        needed = self.terms[:1] if rays.slack is None else self.terms
+        values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in needed])
         values *= angle
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
+        if rays.slack is None:
+            return self.limits.true_in_tails(values[0], part, rays, len(self.terms))
         self.limits.apply_at_centers(values, part, rays)
         return values
 

@@ -20,6 +20,7 @@ from .polygon import dot
 NEAR_RADII = 2.0
 # Of the turn toward one of a light's corners: what lies along a direction, on average over directions.
 ALONG = 0.9
+_TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -107,45 +108,75 @@ class TailLimits:
 
     def apply_at_centers(self, integrals, part, rays) -> None:
         """As `apply` for integrals (F, ...) over lights so small that their centers stand for all of them, at the ends
-        of `small_lights.Rays`; without their slack, those in the tail become true."""
+        of `small_lights.Rays`."""
         lobes = self.take(part)
-        heights, views = dot(lobes.normal, rays.offset), dot(lobes.view, rays.offset)
-        beyond = rays.squares - np.float32(NEAR_RADII**2) * rays.diagonal
-        mirrored = np.float32(2.0) * lobes.cosine * heights - views
-        tail = (mirrored * np.abs(mirrored) < beyond) & (beyond > 0.0)
-        value, cosine = lobes.true_values(heights, views, rays)
-        if rays.slack is None:
-            for integral, true in zip(integrals, lobes.curves(value, cosine, len(integrals)), strict=True):
-                np.copyto(integral, true, where=tail)
-        else:
-            margin = rays.slack * value
-            value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
-            np.copyto(integrals[0], value, where=tail & (integrals[0] > 0.0))
-            # Toward the corners half vectors turn by up to half their angle, which rarely lies along the turn.
-            sine = np.sqrt(np.maximum(np.float32(1.0) - cosine * cosine, np.float32(0.0)))
-            sine *= np.float32(0.5 * ALONG) * np.sqrt(rays.diagonal) / rays.distance
-            cosine = np.maximum(cosine - sine, np.float32(0.0))
+        tail, value, cosine = lobes.true_and_tail(rays)
+        margin = rays.slack * value
+        value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
+        np.copyto(integrals[0], value, where=tail & (integrals[0] > 0.0))
+        # Toward the corners half vectors turn by up to half their angle, which rarely lies along the turn.
+        sine = np.sqrt(np.maximum(np.float32(1.0) - cosine * cosine, np.float32(0.0)))
+        sine *= np.float32(0.5 * ALONG) * np.sqrt(rays.diagonal) / rays.distance
+        cosine = np.maximum(cosine - sine, np.float32(0.0))
         cosine *= tail
         lobes.limit_others(integrals, cosine)
+
+    def true_in_tails(self, plain, part, rays, count) -> list:
+        """`count` integrals (...) over points: the first, `plain`, becomes true in the tail, and the others are that
+        times their Fresnel curves."""
+        lobes = self.take(part)
+        tail, value, cosine = lobes.true_and_tail(rays)
+        np.copyto(plain, value, where=tail)
+        return lobes.curves(plain, cosine, count)
+
+    def true_and_tail(self, rays):
+        """Which lights are in the tail (...), and their `true_values`."""
+        heights, views = rays.heights(self.normal), rays.heights(self.view)
+        beyond = rays.squares - np.float32(NEAR_RADII**2) * rays.diagonal
+        mirrored = np.float32(2.0) * self.cosine * heights
+        mirrored -= views
+        mirrored *= np.abs(mirrored)
+        return (mirrored < beyond) & (beyond > 0.0), *self.true_values(heights, views, rays)
 
     def at_centers(self, part, rays, count) -> list:
         """True integrals, `count` arrays (...), over small lights that are all in the tail."""
         lobes = self.take(part)
-        value, cosine = lobes.true_values(dot(lobes.normal, rays.offset), dot(lobes.view, rays.offset), rays)
+        value, cosine = lobes.true_values(rays.heights(lobes.normal), rays.heights(lobes.view), rays)
         return lobes.curves(value, cosine, count)
 
     def true_values(self, heights, views, rays):
-        """GGX's integrals (...) over small lights, F = 1, and cosines (...) of the half angles; `heights` change."""
-        halves = views * rays.distance
-        halves += rays.squares
-        cosine = halves / rays.squares
-        cosine *= np.float32(0.5)
-        cosine = np.sqrt(np.minimum(np.maximum(cosine, np.float32(0.0)), np.float32(1.0)))
-        squares, distances = rays.squares.copy(), rays.distance.copy()
-        value = _integrands(self.cosine, self.alpha_squared, (heights, halves, squares, distances))
-        value *= self.alpha_squared * rays.flux
-        value *= np.float32(0.5 / np.pi)
-        return np.maximum(value, np.float32(0.0)), cosine
+        """GGX's integrals (...) over small lights, F = 1, and cosines (...) of the half angles; by heights over the
+        horizon and along the view, both of which change."""
+        inverse = np.float32(1.0) / rays.distance
+        cosines = np.multiply(heights, inverse, out=heights)
+        # Half the square of the half vector's length.
+        halves = np.multiply(views, inverse, out=views)
+        halves += np.float32(1.0)
+        np.minimum(np.maximum(halves, np.float32(_TINY), out=halves), np.float32(2.0), out=halves)
+        rest = np.float32(1.0) - self.alpha_squared
+        value = cosines + self.cosine
+        value *= value
+        value *= np.float32(-0.5) * rest
+        value += halves
+        np.divide(halves, value, out=value)
+        value *= value
+        masking = cosines * cosines
+        masking *= rest
+        masking += self.alpha_squared
+        np.sqrt(masking, out=masking)
+        masking *= self.cosine
+        np.maximum(cosines, np.float32(0.0), out=cosines)
+        value *= cosines
+        cosines *= np.sqrt(self.alpha_squared + rest * self.cosine * self.cosine)
+        masking += cosines
+        value /= masking
+        value *= rays.flux
+        np.multiply(inverse, inverse, out=masking)
+        masking *= inverse
+        masking *= np.float32(0.5 / np.pi) * self.alpha_squared
+        value *= masking
+        halves *= np.float32(0.5)
+        return value, np.sqrt(halves, out=halves)
 
     def curves(self, value, cosine, count) -> list:
         """The values (...) times the `count` Fresnel curves of the lobes at cosines (...) of the half angle."""

@@ -165,7 +165,7 @@ def test_nodes_have_the_power_and_the_moments_of_their_lights():
     power = radiance.mean(axis=1) * np.linalg.norm(area, axis=1)
     assert np.isclose(tree.power[0], power.sum()) and sorted(tree.number[tree.number >= 0]) == list(range(37))
     assert np.allclose(tree.center[0], power @ center / power.sum())
-    assert np.allclose(tree.vector[:, 0], radiance.mean(axis=1) @ area)
+    assert np.allclose(tree.vector[0], radiance.mean(axis=1) @ area)
     shift = center - tree.center[0]
     own = sum(
         share * (np.outer(light.half_u, light.half_u) + np.outer(light.half_v, light.half_v)) / (3 + light.is_round)

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ...cycles.closures import velvet_albedo
-from ...cycles.lobes import SMALLEST_WEIGHT
+from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
 from .graph import (
@@ -67,6 +67,16 @@ class ViewFactor:
 
 
 @dataclass(frozen=True)
+class Brush:
+    """How an anisotropic lobe lies."""
+
+    aspect: float  # see `cycles.lobes.aspect_of`
+    rotation: float  # of the tangent, in turns
+    direction: str  # X, Y or Z: around the object's axis; "": along u of a UV map
+    uv_map: str = ""
+
+
+@dataclass(frozen=True)
 class Look:
     """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
 
@@ -79,6 +89,7 @@ class Look:
     weight: float = 1.0
     view_factor: ViewFactor | None = None  # times the weight
     coat: Coat | None = None  # over it; of the kind COAT itself
+    brush: Brush | None = None  # None: isotropic
     sheen: tuple[float, float] | None = None  # over it and its coat: the largest weight of a color, and its roughness
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     notes: tuple[str, ...] = ()
@@ -111,8 +122,13 @@ class Look:
 
     @property
     def uv_map(self) -> str:
-        """The UV map of its images ("": the active one)."""
-        return next((use.uv_map for use in self.images.values()), "")
+        """The UV map of its images and its tangent ("": the active one)."""
+        return next((use.uv_map for use in self.images.values()), "" if self.brush is None else self.brush.uv_map)
+
+    @property
+    def has_uv_tangent(self) -> bool:
+        """Does it need tangents along its UV map?"""
+        return self.normal is not None or (self.brush is not None and not self.brush.direction)
 
 
 def is_missing(image) -> bool:
@@ -293,7 +309,7 @@ class _Reader:
         look = replace(look, coat=coat)
         values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior), "weight": look.value("weight")}
         # Its multiple scattering is always there.
-        shine = replace(look, kind=COAT, values=values, scattered=True)
+        shine = replace(look, kind=COAT, values=values, scattered=True, brush=None)
         return [look, shine if coat.follows_normal else replace(shine, normal=None), *fuzz]
 
     def _lobe(self, source: Source, bsdf: Bsdf, share: Share) -> Look:
@@ -303,9 +319,6 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
-        brushed = constant_inputs(source, names["anisotropy"]) if "anisotropy" in names else [[0.0]]
-        if brushed is None or brushed[0][0] != 0.0:
-            self.note("anisotropy is not shown")
         rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
         if rough is None or rough[0][0] > 0.0:
             self.note("rough diffuse reflection is shown as smooth")
@@ -314,6 +327,7 @@ class _Reader:
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
+        look = replace(look, brush=self._brush(source, bsdf, look))
         if bsdf.kind == "velvet":
             self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
             roughness = values["roughness"]
@@ -321,6 +335,22 @@ class _Reader:
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look
+
+    def _brush(self, source: Source, bsdf: Bsdf, look: Look) -> Brush | None:
+        """How the lobe of `look`, of the node at `source`, is stretched."""
+        if "anisotropy" not in bsdf.sockets or bsdf.kind not in BRUSHED_KINDS:
+            return None
+        anisotropy = constant_inputs(source, bsdf.sockets["anisotropy"])
+        aspect = 1.0 if anisotropy is None else float(aspect_of(bsdf.kind, anisotropy[0][0]))
+        if anisotropy is not None and aspect == 1.0:
+            return None
+        rotation, tangent = constant_inputs(source, bsdf.sockets["rotation"]), source.input("Tangent")
+        direction, uv_map = _direction_of(None if tangent is None else tangent.node)
+        other_maps = {use.uv_map for use in look.images.values()} - {"", uv_map}
+        if anisotropy is None or rotation is None or direction is None or (uv_map and not direction and other_maps):
+            self.note("its anisotropy is not resolved, it is shown without")
+            return None
+        return Brush(aspect, float(rotation[0][0]), direction, uv_map)
 
     def _sheen(self, source: Source, look: Look) -> list[Look]:
         """The lobe of the fuzz on a Principled BSDF, if there is any."""
@@ -332,7 +362,7 @@ class _Reader:
             return []
         values = {"color": constant(color), "roughness": constant(min(float(np.max(roughness)), 1.0))}
         values["weight"] = look.value("weight")
-        return [replace(look, kind="sheen", values=values, scattered=False)]
+        return [replace(look, kind="sheen", values=values, scattered=False, brush=None)]
 
     def _coat(self, source: Source, look: Look) -> Coat | None:
         """What covers a Principled BSDF, None where nothing does."""
@@ -398,6 +428,15 @@ class _Reader:
         if strength is None or not strength.is_constant or np.any(strength.offset):
             self.note("its emission varies and is not shown")
         return np.zeros(3)
+
+
+def _direction_of(node) -> tuple[str | None, str]:
+    """`direction` and `uv_map` of a Brush whose tangent comes from `node`, (None, "") where that cannot be said."""
+    if node is None or node.bl_idname == "ShaderNodeNewGeometry":
+        return "Z", ""
+    if node.bl_idname != "ShaderNodeTangent":
+        return None, ""
+    return (node.axis, "") if node.direction_type == "RADIAL" else ("", node.uv_map)
 
 
 def world_radiance(world) -> tuple[np.ndarray, bool]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 
 import gpu
 from mathutils import Matrix
@@ -176,30 +177,37 @@ class LightingPass:
             sky=self._sky is not None,
             sheen=passes != "specular" and gbuffer.has_sheen,
         )
-        if features not in self._shaders:
-            self._shaders[features] = lighting_shader(self.table, features)
-        shader, batch = self._shaders[features]
+        parts = [features]
+        if features.specular and gbuffer.tangent is not None:
+            parts = [replace(features, brushing=True, brushed=is_brushed) for is_brushed in (False, True)]
         with nullcontext() if target is None else target.bind():
             previous = gpu.state.viewport_get(), gpu.state.blend_get()
             gpu.state.viewport_set(x, y, width, height)
             gpu.state.blend_set(blend)
             try:
-                shader.bind()
-                for name in features.samplers:
-                    shader.uniform_sampler(name, self._texture(name, gbuffer))
-                if features.specular or features.sheen:
-                    shader.uniform_float("view", view)
-                if features.sky and features.specular:
-                    shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
-                if features.shadowed:
-                    shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
-                for first, end in self._shares:
-                    shader.uniform_int("place", (x, y, first, end))
-                    batch.draw(shader)
-                    gpu.state.blend_set("ADDITIVE")
+                for features in parts:
+                    self._draw(features, gbuffer, view, (x, y))
             finally:
                 gpu.state.viewport_set(*previous[0])
                 gpu.state.blend_set(previous[1])
+
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int]) -> None:
+        if features not in self._shaders:
+            self._shaders[features] = lighting_shader(self.table, features)
+        shader, batch = self._shaders[features]
+        shader.bind()
+        for name in features.samplers:
+            shader.uniform_sampler(name, self._texture(name, gbuffer))
+        if features.specular or features.sheen:
+            shader.uniform_float("view", view)
+        if features.sky and features.specular:
+            shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
+        if features.shadowed:
+            shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
+        for first, end in self._shares:
+            shader.uniform_int("place", (*place, first, end))
+            batch.draw(shader)
+            gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):
         own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}

@@ -141,6 +141,7 @@ class MeshBatches:
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _tangents: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
+    _around: gpu.types.GPUVertBuf | None = None
 
     def batch(self, slot: int, uv_map: str) -> gpu.types.GPUBatch:
         """What draws the faces of `slot` with a UV map; maps that the mesh lacks are zero, as in Cycles."""
@@ -150,8 +151,16 @@ class MeshBatches:
             batch.vertbuf_add(self._uv_buffer(uv_map))
             if uv_map in self._tangents:
                 batch.vertbuf_add(self._tangents[uv_map])
+            if self._around is not None:
+                batch.vertbuf_add(self._around)
             self._batches[key] = batch
         return self._batches[key]
+
+    def add_around(self, ob) -> None:
+        """Make sure that tangents around the axes of the object are there; `ob` is as for `add_tangents`."""
+        if self._around is None:
+            self._around = _vertex_buffer({"around": texture_space(ob, _arrays(ob).vertex)})
+            self._batches.clear()
 
     def add_tangents(self, ob, uv_map: str) -> None:
         """Make sure that normal maps on `uv_map` have tangents; `ob` is an evaluated object with this mesh."""
@@ -187,6 +196,7 @@ class _Arrays:
 
     triangles: np.ndarray  # (T, 3) of corners
     slots: np.ndarray  # (T,)
+    vertex: np.ndarray  # (C,)
     place: np.ndarray  # (C, 3)
     normal: np.ndarray  # (C, 3)
     uv: dict[str, np.ndarray]
@@ -234,11 +244,23 @@ def _arrays(ob) -> _Arrays | None:
             corners = triangles[chosen].ravel()
             triangles[chosen] = len(vertex) + np.arange(len(corners)).reshape(-1, 3)
             normal = np.concatenate([normal, own.repeat(3, axis=0)])
+            vertex = np.concatenate([vertex, vertex[corners]])
             place = np.concatenate([place, place.take(corners, axis=0)])
             uv = {name: np.concatenate([values, values.take(corners, axis=0)]) for name, values in uv.items()}
     finally:
         ob.to_mesh_clear()
-    return _Arrays(triangles, slots, place, normal, uv, middle, not flat.all())
+    return _Arrays(triangles, slots, vertex, place, normal, uv, middle, not flat.all())
+
+
+def texture_space(ob, vertex: np.ndarray) -> np.ndarray:
+    """Generated coordinates (C, 3), less 0.5, of the vertices `vertex` (C,) of the evaluated object `ob`."""
+    mesh = ob.to_mesh()
+    try:
+        place = read_values(mesh.vertices, "undeformed_co", (len(mesh.vertices), 3), np.float32)
+        middle, size = np.array(mesh.texspace_location), np.array(mesh.texspace_size)
+    finally:
+        ob.to_mesh_clear()
+    return ((place - middle) * np.divide(0.5, size, out=np.ones(3), where=size != 0.0)).astype(np.float32)[vertex]
 
 
 def _slots(mesh, count: int, slots: int) -> np.ndarray:

@@ -336,8 +336,10 @@ class SceneMirror:
                     looks[name] = self._looks.get(name) or _shown_look(material)
             shown = tuple(looks[_name(material)] for material in materials)
             for lobe in (lobe.look for look in shown for lobe in look.lobes):
-                if lobe.normal is not None:
+                if lobe.has_uv_tangent:
                     mesh.add_tangents(ob, lobe.uv_map)
+                if lobe.brush is not None and lobe.brush.direction:
+                    mesh.add_around(ob)
             receiver = _receiver(instance, receivers, depsgraph.view_layer)
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0

@@ -42,6 +42,9 @@ TINY_LIGHT = 0.2
 # The same for those of which four points, and of round ones the center, are all that counts: 5e-4 of the result.
 SMALL_LIGHT = 0.12
 POINT_LIGHT = 2e-4
+# Of anisotropic lobes: least alpha in single precision; radians by which an arc may turn; how many arcs an edge becomes
+# at most, and how often it is halved for each.
+LEAST_ALPHA, SHORT_ARC, MOST_ARCS, MOST_HALVINGS = 1e-4, 1.2, 16, 6
 # Nodes along disks over which a cone ends, see `shading.facing`.
 NODES_ALONG = 20
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
@@ -86,13 +89,19 @@ class Features:
     facing: bool = False  # lights that face every point
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
+    brushing: bool = False  # there are anisotropic lobes
+    brushed: bool = False  # of these the pixels; else the others
 
     @property
     def samplers(self) -> tuple[str, ...]:
         """The names of the textures that the shader reads."""
         names = ["positions", "normals", "bases", "lights"]
         if self.specular:
-            names += ["f0s", "f90s", "dielectric_weights", "table", "dielectrics"]
+            names += ["f0s", "f90s", "dielectric_weights"]
+        if self.specular and not self.brushed:
+            names += ["table", "dielectrics"]
+        if self.brushing:
+            names.append("tangents")
         if self.geometric:
             names.append("geometric_normals")
         if self.turned or self.bumped:
@@ -123,7 +132,7 @@ def _lighting_source(table, features) -> str:
         raise ValueError(
             f"table {table.name} has degree {table.degree}, the graphics card's path goes up to {moments32.MAX_DEGREE}"
         )
-    is_cosine = table.family == "ltc"
+    is_cosine = table.family == "ltc" and not features.brushed
     chosen = {"cosine": is_cosine, **asdict(features)}
     defined = {name.upper(): 1 for name, is_chosen in chosen.items() if is_chosen}
     parts = ["#define LTSH_GLSL 1", core_text(), definitions({**defined, **_lighting_constants(table)})]
@@ -132,7 +141,9 @@ def _lighting_source(table, features) -> str:
         parts.append(glsl("spread"))
     if features.facing:
         parts.append(glsl("facing"))
-    if features.specular:
+    if features.brushed and features.specular:
+        parts.append(_brushed_text(features))
+    elif features.specular:
         parts.append(_specular_text(table, is_cosine, features))
     if features.diffuse:
         parts.append(_diffuse_text(features))
@@ -160,6 +171,10 @@ def _lighting_constants(table) -> dict:
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "PI": float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
+        "LEAST_ALPHA": float_literal(LEAST_ALPHA),
+        "SHORT_ARC": float_literal(2.0 * np.cos(0.5 * SHORT_ARC)),
+        "MOST_ARCS": MOST_ARCS,
+        "MOST_HALVINGS": MOST_HALVINGS,
         "QUAD_FIRST": textures.QUAD_FIRST,
         "SKY_SIZE": sky.SIZE,
         "SKY_LEVELS": sky.LEVELS,
@@ -243,6 +258,8 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
 def _specular_loops(features) -> Iterator[str]:
     def light(integral):
         profile = "vec2(1.0)"
+        if features.brushed:
+            yield "ltsh_set_apex(shine, ltsh_with_corners(light, 1.0, false));"
         if integral:
             yield f"vec4 values = specular_values(weights, {integral});"
         else:
@@ -292,6 +309,21 @@ def _specular_text(table, is_cosine, features) -> str:
     return filled(glsl("specular"), values)
 
 
+# In units of the lobe's width, by its smaller alpha and by both.
+_BRUSHED_SIZES = "    view.size *= lobe.sharpness;\n    view.wide *= lobe.mean_sharpness;\n"
+
+
+def _brushed_text(features) -> str:
+    frame = "ltsh_toward_mirror(weights.width)"
+    values = {"INTEGRAL": _integral_text("specular", 1 + features.geometric, sizes=_BRUSHED_SIZES), "FOCUSED": ""}
+    if features.focused:
+        value = "specular_values(weights, sum)"
+        values["FOCUSED"] = _focused_text(
+            "specular", "specular_weights weights, ", value, frame, "LTSH_TINY / lobe.sharpness"
+        )
+    return filled(glsl("brushed"), values)
+
+
 def _bent_edge_lines(table):
     """Statements that add the edge from `start` to `end` to the moments of the table's bend."""
     bent = [f"ltsh_unit(ltsh_bent({end}, {bend_literals(table)}))" for end in ("start", "end")]
@@ -317,26 +349,28 @@ def _diffuse_text(features) -> str:
     return filled(glsl("diffuse"), values)
 
 
-def _focused_text(name, arguments, value, frame) -> str:
+def _focused_text(name, arguments, value, frame, tiny="LTSH_TINY") -> str:
     """GLSL of vec4 `name`_focused(`name`_lobe lobe, `arguments` ltsh_light light, int header, float width, bool used).
 
     Expects spread.glsl and what `_integral_text` expects. `value` is the vec4 that a `name`_sum `sum` stands for, and
     `frame` a matrix to the coordinates in which the lobe lies around e_z, of vectors that `name`_warped gives.
     """
-    return filled(glsl("focused"), {"name": name, "ARGUMENTS": arguments, "VALUE": value, "FRAME": frame})
+    return filled(glsl("focused"), {"name": name, "ARGUMENTS": arguments, "VALUE": value, "FRAME": frame, "TINY": tiny})
 
 
-def _integral_text(name: str, planes: int, seam: str | None = None) -> str:
+def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str = "") -> str:
     """GLSL of `name`_sum `name`_integral(`name`_lobe lobe, ltsh_light light) for 1 to 3 horizons.
 
     Expects, in GLSL, `name`_lobe with normals plane_0 .. of the horizons, `name`_sum, `name`_empty(),
     `name`_with_edge(sum, start, end), `name`_with_spot(sum, direction, solid angle), `name`_warped(lobe, v) and
     `name`_heights(lobe, v, warped v, rest), whose unused components are `rest`. `seam` is the direction in which the
-    first two horizons meet, if that is known.
+    first two horizons meet, if that is known; `sizes` are statements that put the sizes of a `name`_view in units of the
+    lobe's width.
     """
     values = {
         "name": name,
         "SLOTS": planes + 1,
+        "SIZES": sizes,
         "APICES": "\n".join(_apex_lines(name, planes, seam)),
         "INTERVAL": "\n".join(_interval_lines(planes)),
         "CLOSING": "\n".join(_closing_lines(planes)),

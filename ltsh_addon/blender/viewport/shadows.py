@@ -388,9 +388,9 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tupl
     )
     further = {
         name: None if getattr(gbuffer, name) is None else texels(getattr(gbuffer, name))[pixel]
-        for name in ("diffuse_normal", "smooth_normal", "geometric_normal")
+        for name in ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent")
     }
-    bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
+    bent, fuzzy, tangent = further["diffuse_normal"], base[:, 3] < 0.0, further["tangent"]
     return SurfaceSamples(
         position=position[:, :3],
         view=np.broadcast_to(view.eye, (len(pixel), 3)) if view.is_parallel else _unit(view.eye - position[:, :3]),
@@ -409,6 +409,8 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tupl
         bump_alpha2=None if bent is None else bent[:, 3],
         specular_dip=np.stack([f0[:, 3], f90[:, 3], dielectric[:, 3]], axis=1),
         receiver=np.rint(position[:, 3]).astype(np.int64) - 1,
+        anisotropy=None if tangent is None else tangent[:, 3],
+        tangent=None if tangent is None else tangent[:, :3],
     ), pixel
 
 

@@ -28,10 +28,12 @@ from .textures import (
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
-EMISSION, THROUGH = ("emission",), ("through",)
+TANGENTS, EMISSION, THROUGH = ("tangent",), ("emission",), ("through",)
 _ADDED = (EMISSION, THROUGH)
 # What a corner of a mesh has, and its type.
 _CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
+# The same for anisotropic lobes: generated coordinates around the middle.
+_AROUND = {"around": "VEC3"}
 # Before, Cycles left interpolated normals as long as they are.
 NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
 # That of images which are not found, as in Cycles.
@@ -169,6 +171,8 @@ class SurfacePass:
         textures = self._draw_into(SURFACES, instances, view, number)
         if has_normals(instances):
             textures = textures | self._draw_into(NORMALS, instances, view, number)
+        if any(_is_brushed(look, number) for instance in instances for look in instance.looks):
+            textures = textures | self._draw_into(TANGENTS, instances, view, number)
         lobes = (lobe.look for instance in instances for look in instance.looks for lobe in look.lobes[number:])
         return GBufferTextures(**textures, has_sheen=any(look.kind == "sheen" for look in lobes))
 
@@ -186,7 +190,7 @@ class SurfacePass:
         is_further = number > 0
         textures, buffer = self._target(outputs, is_further)
         if (outputs, is_further) not in self._shaders:
-            self._shaders[outputs, True] = _shader(outputs, is_further=True)
+            self._shaders[outputs, is_further] = _shader(outputs, is_further)
         with buffer.bind():
             gpu.state.viewport_set(0, 0, *self._size)
             # Only the position tells where there is a surface, but no number may be left that is not one.
@@ -254,6 +258,11 @@ def has_bent_lobes(instances: list[ShownInstance]) -> bool:
     return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
 
 
+def _is_brushed(shown: ShownLook, number: int) -> bool:
+    """True where the lobe `number` is anisotropic."""
+    return any(lobe.look.brush is not None for lobe in shown.lobes[number : number + 1])
+
+
 def _bends(shown: ShownLook) -> bool:
     """True where the diffuse lobe has a normal of its own."""
     return shown.look.normal is not None or shown.look.kind == "translucent"
@@ -266,7 +275,8 @@ def _shader(outputs, is_further: bool = False):
     )
     for name, value in DEFINES.items():
         info.define(name, value)
-    drawn = {SURFACES: "SURFACES", NORMALS: "NORMALS", EMISSION: "EMISSION", THROUGH: "THROUGH"}[outputs]
+    drawn = {SURFACES: "SURFACES", NORMALS: "NORMALS", TANGENTS: "TANGENTS", EMISSION: "EMISSION", THROUGH: "THROUGH"}
+    drawn = drawn[outputs]
     info.define(f"DRAWS_{drawn}")
     if is_further:
         info.define("IS_FURTHER")
@@ -286,10 +296,11 @@ def _shader(outputs, is_further: bool = False):
     for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D", name)
     # Meshes without normal maps have no tangent: they get (0, 0, 0, 1).
-    for slot, (name, kind) in enumerate(_CORNER.items()):
+    corner = {**_CORNER, **(_AROUND if outputs == TANGENTS else {})}
+    for slot, (name, kind) in enumerate(corner.items()):
         info.vertex_in(slot, kind, name)
     passed = gpu.types.GPUStageInterfaceInfo(f"ltsh_{outputs[0]}_{int(is_further)}")
-    for name, kind in {**_CORNER, "object_normal": "VEC3"}.items():
+    for name, kind in {**corner, "object_normal": "VEC3"}.items():
         passed.smooth(kind, f"v_{name}")
     info.vertex_out(passed)
     for slot, name in enumerate(outputs):

@@ -30,6 +30,7 @@ SAMPLERS = {
     "geometric_normals": "geometric_normal",
     "diffuse_normals": "diffuse_normal",
     "smooth_normals": "smooth_normal",
+    "tangents": "tangent",
 }
 # The same of `ShareGrid`.
 SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
@@ -67,6 +68,7 @@ class GBufferTextures:
     geometric_normal: gpu.types.GPUTexture | None = None  # `normal`; w is not read
     diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
     smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
+    tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy, None: 0 everywhere
     shares: ShareGrid | None = None  # all of each light is seen
     has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
 
@@ -124,6 +126,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
         else None,
         diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
         smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
+        tangent=texture(samples.tangent, samples.anisotropy) if samples.anisotropy.any() else None,
     )
 
 
@@ -355,7 +358,9 @@ def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
 FIRST_SLOT, SLOT_SIZE = 3, 6
 FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
 LAYERS = FIRST_TERM + 5
-LOOK_SIZE = LAYERS + 4
+LOOK_SIZE = LAYERS + 5
+# Where the tangents of anisotropic lobes run, by `Brush.direction`; 0: there are none.
+DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "": 4}
 VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
 DEFINES = {
@@ -399,6 +404,9 @@ def look_values(look: Look) -> np.ndarray:
         data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
     if look.sheen is not None:
         data[LAYERS + 3, :2] = look.sheen
+    if look.brush is not None:
+        brush = look.brush
+        data[LAYERS + 4, :3] = brush.aspect, 2.0 * np.pi * brush.rotation, DIRECTIONS[brush.direction]
     if look.coat is not None:
         data[LAYERS, 1:] = look.coat.weight, look.coat.roughness, look.coat.ior
         data[LAYERS + 1] = *look.coat.tint, look.coat.follows_normal

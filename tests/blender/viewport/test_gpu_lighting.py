@@ -117,6 +117,38 @@ def test_diffuse_light_of_balls_is_that_of_a_quadrature():
     assert excess(found, expected[:, None] * samples.diffuse_albedo, 3e-4).max() <= 1.0
 
 
+BRUSHED = {"plain": 4e-3, "near": 1e-2, "disk": 4e-3, "spread": 4e-3, "spot": 1e-2}
+
+
+@pytest.mark.parametrize(("surface", "kinds"), [("plain", BRUSHED), ("tilted", ("plain", "near"))])
+def test_anisotropic_lobes_are_those_of_the_reference_beside_isotropic_ones(surface, kinds):
+    """Fewer points than the reference takes, in single precision; edges of half a circle take most."""
+
+    def compare():
+        lighting, canvas = LightingPass("ltsh4"), Canvas(WIDTH, HEIGHT)
+        for kind in kinds:
+            random = np.random.default_rng([len(kind), *map(ord, kind + surface)])
+            samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
+            lights = [random_surfaces.light(kind, number, random) for number in range(2)]
+            brushed = np.arange(len(samples)) % 4 > 0
+            # That of a Principled BSDF with 0.8, or the other way round.
+            anisotropy = np.where(brushed, random.choice([0.47, -0.89], len(samples)), 0.0)
+            roughness = np.where(brushed, np.clip(samples.roughness, 0.1, 0.72), samples.roughness)
+            tangent = random.normal(size=(len(samples), 3))
+            samples = replace(samples, anisotropy=anisotropy, tangent=tangent, roughness=rounded(roughness))
+            lighting.set_lights(lights)
+            found = drawn(lighting, samples, canvas, "combined")
+            assert (canvas.read()[..., 3] == 1.0).all()
+            shaded = shading.shade(samples, lights, "reference", workers=1, dtype=np.float64).combined
+            distance = np.linalg.norm((found - shaded)[brushed]) / np.linalg.norm(shaded[brushed])
+            assert distance < BRUSHED[kind], f"{kind}: {distance:.5f}"
+            plain = replace(samples, anisotropy=None, tangent=None)
+            others = drawn(lighting, plain, canvas, "combined")[~brushed]
+            assert np.array_equal(found[~brushed], others), kind
+
+    with_graphics(compare)
+
+
 def test_no_input_gives_anything_but_finite_light():
     """Points on the light and in its plane, lobes without width, views along the surface and from behind it, vectors
     of no length, lights of all sizes: what a scene may hold for a moment while it is edited."""
@@ -140,6 +172,9 @@ def test_no_input_gives_anything_but_finite_light():
         roughness = samples.roughness.copy()
         roughness[::3] = 0.0
         samples = replace(samples, position=position, normal=normal, roughness=roughness)
+        tangent = normal.copy()
+        tangent[::5], tangent[1::5] = 0.0, random.normal(size=tangent[1::5].shape)
+        brushed = replace(samples, tangent=tangent, anisotropy=np.where(np.arange(len(samples)) % 2, 0.9, -5.0))
         canvas = Canvas(WIDTH, HEIGHT)
         for technique in TECHNIQUES:
             lighting = LightingPass(technique)
@@ -148,6 +183,9 @@ def test_no_input_gives_anything_but_finite_light():
                 for name in ("specular", "diffuse", "combined"):
                     found = drawn(lighting, samples, canvas, name)
                     assert np.isfinite(found).all() and (found >= 0.0).all(), (technique, name, light.name)
+                if technique == "ltsh4":
+                    found = drawn(lighting, brushed, canvas, "specular")
+                    assert np.isfinite(found).all() and (found >= 0.0).all(), ("brushed", light.name)
 
     with_graphics(draw_all)
 

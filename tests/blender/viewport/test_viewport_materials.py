@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from graphics_card import Canvas, edits_with_graphics, with_graphics
-from view_pictures import SIZE, image, normal_map, patches_too_far, textured, viewport_picture
+from view_pictures import (
+    SIZE,
+    image,
+    normal_map,
+    patches_too_far,
+    sampled_pictures,
+    textured,
+    times_too_far,
+    viewport_picture,
+)
 
 from ltsh_addon import shading
 from ltsh_addon.blender.engine import view
@@ -188,19 +197,64 @@ SCATTERED = (
 )
 
 
+def brushed_normal_map():
+    material = normal_map()
+    node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
+    fill(node, {"Anisotropic": 0.8, "Metallic": 1.0, "Tangent": ("Tangent", {"direction_type": "UV_MAP"})})
+    return material
+
+
+BRUSHED = (
+    bsdf("brushed", Base_Color=GOLD, Metallic=1.0, Anisotropic=0.7),
+    bsdf("brushed plastic", Base_Color=RED, Roughness=0.4, Anisotropic=1.0, Anisotropic_Rotation=0.15),
+    bsdf(
+        "along u", "BsdfAnisotropic", Anisotropy=0.6, Roughness=0.5, Tangent=("Tangent", {"direction_type": "UV_MAP"})
+    ),
+    bsdf("across", "BsdfAnisotropic", Anisotropy=-0.5, Roughness=0.9, Rotation=0.3),
+    bsdf("brushed node", "BsdfMetallic", Anisotropy=0.5, Tangent=("NewGeometry.Tangent", {})),
+    coated("brushed and coated", Anisotropic=0.9, Metallic=1.0, Coat_Roughness=0.2),
+    brushed_normal_map,
+    made(
+        "some brushed", "MixShader", {0: 0.4, 1: CHALK, 2: ("BsdfAnisotropic", {"Anisotropy": 0.6, "Roughness": 0.5})}
+    ),
+)
+
+
 @edits_with_graphics
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
 @pytest.mark.parametrize(
-    "materials", [MATERIALS, SCATTERED, LAYERED, MASKED], ids=["plain", "scattered", "layered", "masked"]
+    "materials",
+    [MATERIALS, SCATTERED, LAYERED, MASKED, BRUSHED],
+    ids=["plain", "scattered", "layered", "masked", "brushed"],
 )
 def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind):
     passes = shading.PASSES if kind == "PERSP" else ("specular",)
     assert not patches_too_far(tmp_path / "patches.blend", materials, kind, passes)
 
 
+@edits_with_graphics
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+def test_tangents_run_around_the_axes_of_turned_and_stretched_objects(tmp_path, axis):
+    parts.empty_scene(*SIZE)
+    material = bsdf("brushed", Metallic=1.0, Anisotropic=0.9, Roughness=0.4, Tangent=("Tangent", {"axis": axis}))()
+    for number in range(2):
+        ball = parts.add_sphere(material, smooth=False, segments=8, location=(1.4 * number - 0.7, 0.0, 0.0))
+        ball.rotation_euler, ball.scale = (0.4, 0.5 * number, 0.7), (0.7, 1.1, 0.8)
+    parts.add_area_light(location=(0.5, -1.0, 2.0), size=2.0, size_y=1.0)
+    camera = parts.add_camera((0.0, -2.6, 3.4), (0.6, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    seen, notes = with_graphics(lambda: viewport_picture(camera, "specular", False))
+    expected, square = sampled_pictures(tmp_path / "balls.blend", ("specular",), 1)
+    usable = (expected["specular"] > 0.0).all(axis=-1) & (seen > 0.0).all(axis=-1)
+    assert notes == [] and usable.sum() > 500
+    # Pixels at the edges of faces see another face in one of both.
+    assert (times_too_far(seen, expected["specular"])[usable].max(axis=-1) > 1.0).mean() < 0.08
+
+
 ONION = ("BsdfDiffuse", {})
 for number in range(looks.MOST_LOBES + 1):
     ONION = ("AddShader", {0: ONION, 1: gloss(0.1 * (number + 1))})
+NOT_BRUSHED = "its anisotropy is not resolved, it is shown without"
 TOO_MANY = f"of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are shown"
 
 
@@ -211,8 +265,10 @@ TOO_MANY = f"of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are sho
         (mixed(("TexNoise.Color", {})), {"glossy": 0.5, "diffuse": 0.5}, ["factor of 'Mix Shader' is not resolved"]),
         (("MixShader", {0: 0.2, 1: CLEAR, 2: CHALK}), {"diffuse": 1.0}, ["transparency is not shown"]),
         (ONION, {"glossy": looks.MOST_LOBES - 1, "diffuse": 1}, [TOO_MANY]),
+        (("BsdfAnisotropic", {"Anisotropy": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
+        (("BsdfAnisotropic", {"Anisotropy": 0.5, "Tangent": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
     ],
-    ids=["mixed", "factor that depends on more", "transparent part", "too many"],
+    ids=["mixed", "factor that depends on more", "transparent part", "too many", "varying anisotropy", "any tangent"],
 )
 def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, notes):
     parts.empty_scene()

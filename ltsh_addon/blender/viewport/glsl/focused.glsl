@@ -91,7 +91,7 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
         highest = part.encloses ? 4.0 : max(lowest, highest);
 
         vec3 reaching = sqrt(max(radius * radius - part.least * part.least, 0.0)) * (abs(warped_u) + abs(warped_v));
-        bool tiny = dot(reaching, reaching) < LTSH_TINY * dot(pivot_warped, pivot_warped);
+        bool tiny = dot(reaching, reaching) < @TINY@ * dot(pivot_warped, pivot_warped);
         @name@_sum sum = @name@_empty();
         vec3 before = vec3(0.0);
         int per_edge = 2 * effort.chords + 1;

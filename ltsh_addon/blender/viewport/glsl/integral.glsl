@@ -40,7 +40,7 @@ struct @name@_view {
     float near = max(abs(inverse * dot(normal, view.center)), 1.0 - reach_of_all);
     view.size = reach_of_all * reach_of_all;
     view.wide = view.size / max(near * near, 1e-20);
-    return view;
+@SIZES@    return view;
 }
 
 /* The integral over a light that is so small that its center stands for all of it. */

@@ -86,7 +86,7 @@ float ltsh_factor(int number, ltsh_todo todo)
 #ifdef LTSH_SPECULAR
 vec4 ltsh_limited(vec4 values, ltsh_point point, ltsh_light light, int header, vec2 profile)
 {
-#ifndef LTSH_COSINE
+#if !defined(LTSH_COSINE) && !defined(LTSH_BRUSHED)
     values = specular_limited(values, point, light, ltsh_area(header, light), profile);
 #endif
     return values;
@@ -111,6 +111,14 @@ void main()
     point.geometric = point.normal;
 #endif
     bool here = position.w > 0.0;
+#ifdef LTSH_BRUSHING
+    vec4 tangent = texelFetch(tangents, texel, 0);
+#ifdef LTSH_BRUSHED
+    here = here && tangent.w != 0.0;
+#else
+    here = here && tangent.w == 0.0;
+#endif
+#endif
     vec3 radiance = vec3(0.0);
 #if defined(LTSH_SPECULAR) || defined(LTSH_SHEEN)
     point.view = view.w > 0.0 ? ltsh_unit(view.xyz - position.xyz) : view.xyz;
@@ -119,9 +127,14 @@ void main()
     point.f0 = texelFetch(f0s, texel, 0);
     point.f90 = texelFetch(f90s, texel, 0);
     point.dielectric = texelFetch(dielectric_weights, texel, 0);
+#ifdef LTSH_BRUSHED
+    specular_lobe shine = specular_along(point, tangent);
+    specular_weights weights = specular_width(point);
+#else
     ltsh_cell cell = specular_cell(point);
     specular_lobe shine = specular_at(point, cell);
     specular_weights weights = ltsh_weights(cell, point);
+#endif
     bool glossy = dot(point.normal, point.view) > 0.0;
 #endif
 #ifdef LTSH_DIFFUSE
@@ -147,7 +160,7 @@ void main()
         is_point = is_point && all(greaterThan(sight.height, 1e3 * (abs(sight.height_u) + abs(sight.height_v))));
         todo = ltsh_todo_with(todo, number, used && !is_point, light, sight.whole, sight.size);
         vec4 values = specular_values(weights, specular_at_center(sight, LTSH_PI));
-#ifndef LTSH_COSINE
+#if !defined(LTSH_COSINE) && !defined(LTSH_BRUSHED)
         values = specular_true_in_tails(values, point, light, ltsh_area(header, light));
 #endif
         float factor = 1.0;
@@ -251,5 +264,5 @@ void main()
 #endif
     }
 #endif
-    color = vec4(radiance, here ? 1.0 : 0.0);
+    color = vec4(radiance, position.w > 0.0 ? 1.0 : 0.0);
 }

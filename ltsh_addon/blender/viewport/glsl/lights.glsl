@@ -49,3 +49,12 @@ bool ltsh_receives(int header, ltsh_light light, ltsh_point point)
     }
     return facing && received;
 }
+
+/* Radiance from integrals of the plain, the Schlick, the dip and the dielectric term. */
+vec3 ltsh_reflected(ltsh_point point, vec4 values)
+{
+    vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;
+    reflected -= vec3(point.f0.w, point.f90.w, point.dielectric.w) * values.z;
+    reflected += point.dielectric.xyz * values.w;
+    return max(reflected, vec3(0.0));
+}

@@ -44,3 +44,22 @@ float bump_alpha2(vec3 normal, vec3 smooth_normal)
   float cosine2 = cosine * cosine;
   return cosine2 > 0.0 ? clamp((1.0 - cosine2) / cosine2 / 8.0, 0.0, 1.0) : 1.0;
 }
+
+#ifdef DRAWS_TANGENTS
+/* The tangent of the anisotropic lobe as Cycles has it, turned around an axis. */
+vec3 turned_tangent(vec3 smooth_normal, vec3 axis)
+{
+  vec4 brush = look.data[LAYERS + 4];
+  int direction = int(brush.z + 0.5);
+  vec3 a = v_around;
+  vec3 tangent = v_tangent.xyz;
+  tangent = direction == 1 ? vec3(0.0, -a.z, a.y) : tangent;
+  tangent = direction == 2 ? vec3(-a.z, 0.0, a.x) : tangent;
+  tangent = direction == 3 ? vec3(-a.y, a.x, 0.0) : tangent;
+  tangent = cross(transpose(inverse(mat3(model))) * tangent, smooth_normal);
+  float size = length(tangent);
+  tangent = size > 0.0 ? cross(smooth_normal, tangent / size) : vec3(0.0);
+  vec3 beside = dot(axis, tangent) * axis;
+  return beside + cos(brush.y) * (tangent - beside) + sin(brush.y) * cross(axis, tangent);
+}
+#endif

@@ -105,6 +105,14 @@ vec3 left_under_coat(float cosine)
   return left * (1.0 + weight * (tint - 1.0));
 }
 
+/* Both alphas of a lobe. */
+vec2 brushed_alphas(float roughness)
+{
+  vec4 brush = look.data[LAYERS + 4];
+  float alpha = roughness * roughness;
+  return brush.z < 0.5 ? vec2(alpha) : min(vec2(alpha / brush.x, alpha * brush.x), vec2(1.0));
+}
+
 struct Lobe {
   vec3 f0;
   vec3 f90;

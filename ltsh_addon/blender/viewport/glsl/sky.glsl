@@ -35,23 +35,36 @@ ltsh_light ltsh_whole_sky(vec3 normal)
 vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights weights, vec4 mean)
 {
     ltsh_light whole = ltsh_whole_sky(point.normal);
-    specular_sum all_of_it = specular_of_part(lobe, specular_viewed(lobe, whole), whole, false);
-    vec3 radiance = mean.rgb * ltsh_reflected(point, specular_values(weights, all_of_it));
+#ifdef LTSH_BRUSHED
+    ltsh_set_apex(lobe, whole);
+#else
     mat3 back = inverse(transpose(mat3(lobe.row_x, lobe.row_y, lobe.row_z)));
     float stretch = abs(determinant(back));
+#endif
+    specular_sum all_of_it = specular_of_part(lobe, specular_viewed(lobe, whole), whole, false);
+    vec3 radiance = mean.rgb * ltsh_reflected(point, specular_values(weights, all_of_it));
     int count = mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
     for (int k = 0; k < count; ++k) {
         float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
         float angle = 2.3999632 * float(k) + jitter.y;
         float height = sqrt(1.0 - squared);
         vec3 warped = vec3(sqrt(squared) * vec2(cos(angle), sin(angle)), height);
+        float of_lobe = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
+#ifdef LTSH_BRUSHED
+        vec4 values = of_lobe * ltsh_lobe_at(warped);
+        vec3 h = ltsh_unit(ltsh_alphas * warped);
+        float cosine = max(dot(h, ltsh_own_view), 0.0);
+        float solid_angle = of_lobe / ltsh_stretching(h, cosine);
+        warped = 2.0 * cosine * h - ltsh_own_view;
+        vec3 direction = mat3(lobe.row_x, lobe.row_y, lobe.row_z) * warped;
+#else
         vec3 direction = back * warped;
         float inverse_length = inversesqrt(max(dot(direction, direction), 1e-37));
         direction *= inverse_length;
-        float of_lobe = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
         float solid_angle = of_lobe * stretch * inverse_length * inverse_length * inverse_length;
-        bool above = all(greaterThan(specular_heights(lobe, direction, warped, 1.0), vec3(0.0)));
         vec4 values = specular_values(weights, specular_with_spot(specular_empty(), warped, -of_lobe));
+#endif
+        bool above = all(greaterThan(specular_heights(lobe, direction, warped, 1.0), vec3(0.0)));
         vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
         radiance += above ? ltsh_reflected(point, values) * (picture - mean.rgb) : vec3(0.0);
     }

@@ -217,11 +217,4 @@ vec4 specular_true_in_tails(vec4 values, ltsh_point point, ltsh_light light, flo
 }
 #endif
 
-vec3 ltsh_reflected(ltsh_point point, vec4 values)
-{
-    vec3 reflected = point.f0.xyz * values.x + (point.f90.xyz - point.f0.xyz) * values.y;
-    reflected -= vec3(point.f0.w, point.f90.w, point.dielectric.w) * values.z;
-    reflected += point.dielectric.xyz * values.w;
-    return max(reflected, vec3(0.0));
-}
 @FOCUSED@

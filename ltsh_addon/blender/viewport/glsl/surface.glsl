@@ -45,7 +45,8 @@ void main()
 
 #if defined(DRAWS_SURFACES) || defined(DRAWS_THROUGH)
   vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
-  float roughness = clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0);
+  vec2 alphas = brushed_alphas(clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0));
+  float roughness = sqrt(sqrt(alphas.x * alphas.y));
   float metallic = clamp(slot_value(metallic_image, METALLIC_SLOT, v_uv).x, 0.0, 1.0);
   float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1.0);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
@@ -72,6 +73,11 @@ void main()
   out_f0 = vec4(weight * lobe.f0, weight.r * lobe.dip.r);
   out_f90 = vec4(weight * lobe.f90, weight.g * lobe.dip.g);
   out_dielectric = vec4(weight * lobe.dielectric, weight.b * lobe.dip.b);
+#elif defined(DRAWS_TANGENTS)
+  vec2 alphas = brushed_alphas(clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0));
+  float ratio = alphas.x > 0.0 ? sqrt(alphas.y / alphas.x) : 1.0;
+  vec3 axis = int(look.data[0].x + 0.5) == GLOSSY ? specular_normal : diffuse_normal;
+  out_tangent = vec4(turned_tangent(smooth_normal, axis), 1.0 - ratio);
 #else
   out_geometric_normal = vec4(true_normal, 0.0);
   if (int(look.data[0].x + 0.5) == TRANSLUCENT) {

@@ -8,5 +8,8 @@ void main()
   v_object_normal = normal;
   v_uv = uv;
   v_tangent = tangent;
+#ifdef DRAWS_TANGENTS
+  v_around = around;
+#endif
   gl_Position = view.projection * world;
 }

@@ -32,6 +32,8 @@ from . import lighting
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
+# Pairs of a sample and a light that the reference takes, some 30 us each, and samples that it takes at least.
+MOST_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
 # Lights up to which the picture has a layer for the visibility of each.
 MOST_VISIBILITY_LAYERS = 64
 # Follows the name of a technique in layers without shadows beside those with.
@@ -229,8 +231,9 @@ def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Resul
 def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
     """Shade all samples, or for the reference those of randomly chosen pixels where the image is large."""
     samples, subset = extraction.samples, None
-    if name == REFERENCE and len(samples) > options.reference_samples:
-        subset = _samples_of_random_pixels(extraction.film, options.reference_samples)
+    limit = min(options.reference_samples, max(FEWEST_SAMPLES, MOST_PAIRS // max(len(extraction.lights), 1)))
+    if name == REFERENCE and len(samples) > limit:
+        subset = _samples_of_random_pixels(extraction.film, limit)
         samples = samples.take(subset)
     wanted = (None,) if shadows is None else (shadows if subset is None else shadows.take(subset), None)
     lit, seconds = [{} for _ in wanted], {}

@@ -275,6 +275,14 @@ def test_a_reference_on_a_subset_is_stated_and_zero_elsewhere(child, tmp_path):
     assert stated.encode() in (tmp_path / "out" / "compare.exr").read_bytes()
 
 
+def test_a_reference_of_many_lights_takes_fewer_samples(child, tmp_path, monkeypatch):
+    """Their number times that of the lights stays bounded: 100,000 lights would take days."""
+    monkeypatch.setattr(picture, "FEWEST_SAMPLES", 1)
+    monkeypatch.setattr(picture, "MOST_PAIRS", 20 * len(fake_scene.lights()))
+    facts = compare_scene(options(tmp_path))["reference"]
+    assert facts["of"] == 35 and 0 < facts["samples"] <= 20
+
+
 def test_the_sheet_has_all_light_first_and_then_the_passes_that_were_shaded(child, tmp_path, monkeypatch):
     sheets = []
     make_sheet = imaging.comparison_sheet

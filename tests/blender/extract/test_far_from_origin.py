@@ -187,6 +187,15 @@ def test_positions_that_stay_far_are_named_with_their_effect():
     assert gbuffer.rounded_positions(position, [square]) == []
 
 
+def test_a_lamp_is_not_too_close_to_itself(tmp_path):
+    build()
+    material, _ = scene_parts.bsdf_material("ShaderNodeEmission", "Glow")
+    scene_parts.add_sphere(material, 1.0, "Lamp", segments=128, location=(0.0, -0.5, 0.5))
+    path = scene_parts.save(tmp_path / "lamp.blend")
+    extraction = client.extract(client.ExtractOptions(scene=path))
+    assert len(extraction.lights) > 20 and not [line for line in extraction.warnings if "rounded" in line]
+
+
 def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):
     build()
     move()

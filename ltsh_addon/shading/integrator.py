@@ -323,9 +323,9 @@ def _check_passes(passes) -> None:
 
 
 def _parts(light) -> tuple[AreaLight, ...]:
-    """The patches of a small distant light, each of which gets its own integral; others are whole. Ellipses with a
-    profile stand upright."""
-    if light.is_round and light.is_profiled and not light.detail and light_cone.has_shear(light):
+    """The patches of a small distant light, each of which gets its own integral; others are whole. Sheared ones with
+    a profile stand upright."""
+    if light.is_profiled and not light.detail and light_cone.has_shear(light):
         return (light_cone.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
     return tuple(replace(patch, group=light.group) for patch in light.patches) if is_spot else (light,)

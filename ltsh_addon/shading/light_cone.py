@@ -112,8 +112,11 @@ def has_shear(light) -> bool:
 
 
 def upright(light):
-    """The same round light by its principal axes, which are at right angles: transforms may shear it."""
+    """The same light as `ConeRegions` wants it, for transforms may shear it: an ellipse by its principal axes, at right
+    angles; of a parallelogram half_u is the shorter side."""
     u, v = light.half_u, light.half_v
+    if not light.is_round:
+        return light if u @ u <= v @ v else light.altered(half_u=v, half_v=u)
     turn = 0.5 * np.arctan2(2.0 * (u @ v), u @ u - v @ v)
     cosine, sine = np.cos(turn), np.sin(turn)
     return light.altered(half_u=cosine * u + sine * v, half_v=cosine * v - sine * u)
@@ -380,37 +383,43 @@ class ConeRegions:
     """What points see of a light: the part in their cones and above their horizons, where its profile is not 0.
 
     A point of the light's plane is at s `along_s` + t `along_t` from the foot. Chords t of s in the span [low, high]
-    fill the region. The light is a rectangle or an ellipse.
+    fill the region. The light is a parallelogram or an ellipse, both as `upright` has them.
     """
 
     def __init__(self, light, view: LightView, horizons):
         """horizons: the coordinates that are positive above them."""
         self.view, self.profile, self.is_round, self.horizons = view, Profile.of(light), light.is_round, horizons
-        self.is_long = max(view.extent) > LONG * min(view.extent)
+        self.is_sheared = not light.is_round and has_shear(light)
         dtype = view.distance.dtype.type
+        # Half extents along the axes in the plane; by how much chords shift per step from one to the next.
+        u, v, self.skew = *view.extent, dtype(0.0)
+        if self.is_sheared:
+            along, v = (float(axis @ light.half_v) for axis in plane_axes(light))
+            self.skew = dtype(-along / v)
+            u, v = u + abs(along), abs(v)
+        self.is_long = max(u, v) > LONG * min(u, v)
+        self.extent = dtype(u), dtype(v)
         self.reach = np.minimum(dtype(self.profile.tangent) * view.distance, dtype(_WIDE_OPEN))
         e, f = self.turn = self._turns(dtype)
         self.along_s = e * view.axis_u + f * view.axis_v
         self.along_t = e * view.axis_v - f * view.axis_u
         self.center = np.stack([_dot(self.turn, view.center), _cross(self.turn, view.center)])
-        self._bound(*(dtype(extent) for extent in view.extent))
+        self._bound(*self.extent)
 
     @staticmethod
     def suit(light) -> bool:
-        """Whether the light is a rectangle, or an ellipse that is not long, in a place."""
-        u, v = light.half_u, light.half_v
-        is_sheared = has_shear(light)
-        is_long = (np.linalg.norm(u) / np.linalg.norm(v) - LONG) * (np.linalg.norm(v) / np.linalg.norm(u) - LONG) < 0.0
-        is_fit = not (is_sheared or light.is_distant or (is_long and light.is_round))
-        return is_fit and light.shape in AREA_LIGHT_SHAPES
+        """Whether the light is a parallelogram or an ellipse in a place, as `upright` has them."""
+        is_upright = not (light.is_round and has_shear(light))
+        return is_upright and not light.is_distant and light.shape in AREA_LIGHT_SHAPES
 
     def _turns(self, dtype):
         """Unit vectors (2, P) along s: along the longer side, or where there is none of a round light away from the
         foot, so that the cone's chords are symmetric, of others along the side that horizons cut less."""
         view = self.view
-        u, v = view.extent
-        if self.is_long:
-            across = np.full(len(view.distance), v > u)
+        u, v = self.extent
+        if self.is_long or self.is_sheared:
+            # Chords of a parallelogram are along half_u.
+            across = np.full(len(view.distance), v > u or self.is_sheared)
             return np.stack([~across, across]).astype(dtype)
         if self.is_round:
             length = np.sqrt(_dot(view.center, view.center))
@@ -436,6 +445,10 @@ class ConeRegions:
         self.lowest, self.highest = np.maximum(t - half_t, -reach_t), np.minimum(t + half_t, reach_t)
         if self.is_round:
             self.is_whole_cone = np.sqrt(s * s + t * t) + reach < min(u, v)
+        elif self.is_sheared:
+            self.chord = self.view.distance.dtype.type(self.view.extent[0])
+            beside = np.abs(t - self.skew * s) + reach * np.sqrt(1.0 + self.skew * self.skew)
+            self.is_whole_cone = (np.abs(s) + reach < half_s) & (beside < self.chord)
         else:
             self.is_whole_cone = (np.abs(s) + reach < half_s) & (np.abs(t) + reach < half_t)
         for row in self.horizons:
@@ -541,12 +554,15 @@ class ConeRegions:
         reach = self.reach[index]
         half = np.sqrt(np.maximum((reach - s) * (reach + s), 0.0))
         low, high = np.maximum(self.lowest[index], -half), np.minimum(self.highest[index], half)
+        off = s - self.center[0, index]
         if self.is_round:
-            off = s - self.center[0, index]
             middle = self.center[1, index] + self.shear[index] * off
             off = off / self.half[index]
             half = self.chord[index] * np.sqrt(np.maximum(1.0 - off * off, 0.0))
             low, high = np.maximum(low, middle - half), np.minimum(high, middle + half)
+        elif self.is_sheared:
+            middle = self.center[1, index] + self.skew * off
+            low, high = np.maximum(low, middle - self.chord), np.minimum(high, middle + self.chord)
         for row in self.horizons:
             across = self.along_t[row, index]
             height = self.view.foot[row, index] + self.along_s[row, index] * s

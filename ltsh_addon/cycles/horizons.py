@@ -168,24 +168,30 @@ def _excess(samples, shapes, chances, choose):
     by_lobe[index] = 0.0
     samples, chances = samples.take(index), chances[:, index]
     directions = _Directions.of(samples)
-    hits = [
-        shape.hits(number, np.searchsorted(index, sample), samples.position, directions)
-        for shape, (number, sample) in zip(shapes, crossings, strict=True)
-    ]
-    number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
-    met, row = np.unique(row, return_inverse=True)
-    samples, chances, towards = samples.take(met), chances[:, met], directions.towards[met]
-    chance = choose(samples.position, samples.smooth_normal)
-    lobe = _lobe_density(samples, towards)
-    half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, samples.view), 0.0))
-    reflected = lobe * _seen_by_light(samples, towards) * _reflectance(samples, half) * directions.width[met]
-    diffuse = np.maximum(np.einsum("pni,pi->pn", towards, samples.diffuse_normal), 0.0) / np.pi
-    chosen2 = np.square(chances[0][:, None] * lobe + chances[1][:, None] * diffuse)
-    excess = brightness * reflected[row, ray]
-    light2 = np.square(chance[number, row].astype(float) / np.maximum(solid_angle, 1e-12))
-    weight = light2 / np.maximum(light2 + chosen2[row, ray], 1e-30)
-    by_light[index[met]] = np.bincount(row, excess * weight, len(met))
-    by_lobe[index[met]] = np.bincount(row, excess * (1.0 - weight), len(met))
+    # A few tell enough of a light as large as a side of the sky.
+    for own, is_side in ((directions, False), (directions.few(), True)):
+        hits = [
+            shape.hits(number, np.searchsorted(index, sample), samples.position, own)
+            for shape, (number, sample) in zip(shapes, crossings, strict=True)
+            if shape.is_side == is_side and len(number)
+        ]
+        if not hits:
+            continue
+        number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
+        met, row = _numbered(row, len(index))
+        some, towards = samples.take(met), own.towards[met]
+        chance = choose(some.position, some.smooth_normal)
+        lobe = _lobe_density(some, towards)
+        half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, some.view), 0.0))
+        reflected = lobe * _seen_by_light(some, towards) * _reflectance(some, half) * own.width[met]
+        diffuse = np.maximum(np.einsum("pni,pi->pn", towards, some.diffuse_normal), 0.0) / np.pi
+        chosen2 = np.square(chances[0, met, None] * lobe + chances[1, met, None] * diffuse)
+        place = row * towards.shape[1] + ray
+        excess = brightness * reflected.ravel()[place]
+        light2 = np.square(chance[number, row].astype(float) / np.maximum(solid_angle, 1e-12))
+        weight = light2 / np.maximum(light2 + chosen2.ravel()[place], 1e-30)
+        by_light[index[met]] += np.bincount(row, excess * weight, len(met))
+        by_lobe[index[met]] += np.bincount(row, excess * (1.0 - weight), len(met))
     return by_lobe, by_light
 
 
@@ -207,12 +213,28 @@ def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
     return tuple(others), np.concatenate(shares)
 
 
+def _numbered(values, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers below `count` that are among the `values`, sorted, and the place there of each value."""
+    there = np.zeros(count, bool)
+    there[values] = True
+    return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
+
+
 def _alike(lights) -> list[np.ndarray]:
     """The numbers of the lights that have as many corners, and are near or distant, face points or not."""
     kinds = {}
     for number, light in enumerate(lights):
-        kinds.setdefault((light.is_distant, light.is_facing and light.shape, len(light.polygon())), []).append(number)
+        kind = light.is_distant, light.is_facing and light.shape, len(light.polygon()), _is_side(light)
+        kinds.setdefault(kind, []).append(number)
     return [np.array(numbers) for numbers in kinds.values()]
+
+
+def _is_side(light) -> bool:
+    """True for a side of the cube that the light of a world makes (`environment.CUBE`)."""
+    if not light.is_distant or light.is_facing:
+        return False
+    axes = np.abs([light.center, light.half_u, light.half_v])
+    return bool(np.array_equal(np.sort(axes.max(axis=1)), np.ones(3)) and np.array_equal(axes.sum(axis=0), np.ones(3)))
 
 
 @dataclass(frozen=True)
@@ -228,6 +250,7 @@ class _Shapes:
     radius: np.ndarray  # (L,) of a ball that they are in
     axes: np.ndarray  # (L, 3, 3) two in the plane, and back from where they shine
     share: np.ndarray  # (L,) of them that shines
+    is_side: bool  # of the cube around the world, of which a direction meets one
 
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
@@ -239,7 +262,8 @@ class _Shapes:
             radius = np.array([light.radius for light in own])
         axes = np.array([[*_plane_axes(light), -light.direction] for light in own])
         brightness = np.array([np.abs(light.radiance).sum() for light in own])
-        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, radius, axes, share)
+        rest = radius, axes, share, _is_side(own[0])
+        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, *rest)
 
     @property
     def is_facing(self) -> bool:
@@ -277,6 +301,8 @@ class _Shapes:
     def hits(self, light, sample, position, directions) -> tuple[np.ndarray, ...]:
         """Of the pairs (R,) of lights and samples that cross: number of the light, sample, number of the direction,
         brightness and solid angle of the whole light, for each direction that meets a light."""
+        if self.is_side:
+            return self._side_hits(np.unique(sample), directions)
         found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
         for start in range(0, len(light), PAIRS):
             own, point = light[start : start + PAIRS], sample[start : start + PAIRS]
@@ -289,6 +315,21 @@ class _Shapes:
             angle = (self.share[own[met]] * self._solid_angle(own[met], offset[met]))[of_met]
             found.append((self.number[own[pair]], point[pair], ray, self.brightness[own[pair]], angle))
         return tuple(np.concatenate(values) for values in zip(*found, strict=True))
+
+    def _side_hits(self, sample, directions) -> tuple[np.ndarray, ...]:
+        """As `hits`, for all directions of samples (R,): each meets the side along its longest component."""
+        towards = directions.towards[sample]
+        size = np.abs(towards)
+        longest = np.where(size[..., 0] >= np.maximum(size[..., 1], size[..., 2]), 0, 1 + (size[..., 2] > size[..., 1]))
+        ahead = np.take_along_axis(towards, longest[..., None], axis=2)[..., 0] > 0.0
+        place, side = np.full(6, -1), self.axes[:, 2]
+        axis = np.abs(side).argmax(axis=1)
+        place[2 * axis + (side[np.arange(len(axis)), axis] < 0.0)] = np.arange(len(axis))
+        met = place[2 * longest + ~ahead]
+        row, ray = np.nonzero(met >= 0)
+        own = met[row, ray]
+        angle = self._solid_angle(np.arange(len(self.number)), self.center)
+        return self.number[own], sample[row], ray, self.brightness[own], angle[own]
 
     def _cosine(self, light, distance) -> np.ndarray:
         """Cosine (R,) of half the width of lights that face every point."""
@@ -384,6 +425,12 @@ class _Directions:
         width = rise[:, None] * span * np.cos(elevation) / len(HEIGHTS)
         count = len(samples)
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
+
+    def few(self) -> _Directions:
+        """A third of them, at heights that take turns, each for three; without angles."""
+        around = np.arange(AROUND)
+        chosen = (around % len(HEIGHTS)) * AROUND + around
+        return _Directions(self.towards[:, chosen], len(HEIGHTS) * self.width[:, chosen], self.flat, self.angle[:0])
 
     def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (K,) of pairs and of the directions that may meet a ball of the `radius` (R,), `offset` (R, 3) away

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.cycles import horizons
+from ltsh_addon.cycles.environment import CUBE
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.cycles.light_tree import light_chances, light_rows, own_bounds
@@ -124,7 +125,16 @@ def samples_around(generator, count):
     return replace(samples, position=0.3 * generator.normal(size=(count, 3)), view=view, **fields)
 
 
-@pytest.mark.parametrize("kind", ["square", "distant", "ball", "disk"])
+def sides_of_the_sky(brightness=range(1, 7)):
+    """The cube that the light of a world makes."""
+    like = replace(light_at(1.0, 1.0), is_distant=True)
+    return tuple(
+        replace(like, center=ahead, half_u=right, half_v=up, direction=-ahead, radiance=(b, b, b))
+        for (ahead, right, up), b in zip(CUBE, brightness, strict=True)
+    )
+
+
+@pytest.mark.parametrize("kind", ["square", "distant", "ball", "disk", "sky"])
 def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
     """As a test of each direction with each light finds, one by one."""
     generator = np.random.default_rng(3)
@@ -133,9 +143,13 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
         lights = tuple(replace(light, is_distant=True) for light in lights)
     if kind in ("ball", "disk"):
         lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
-    shape = horizons._Shapes.of(lights, np.arange(200), np.ones(200))
+    if kind == "sky":
+        lights = sides_of_the_sky()[:5]
+    shape = horizons._Shapes.of(lights, np.arange(len(lights)), np.ones(len(lights)))
+    assert shape.is_side == (kind == "sky")
     directions = horizons._Directions.of(samples)
-    number, sample, ray, *_ = shape.hits(*shape.crossings(samples), samples.position, directions)
+    number, sample, ray, brightness, _ = shape.hits(*shape.crossings(samples), samples.position, directions)
+    assert np.array_equal(brightness, np.array([light.radiance.sum() for light in lights])[number])
     found = set(zip(number.tolist(), sample.tolist(), ray.tolist(), strict=True))
     expected = set()
     for index, light in enumerate(lights):
@@ -173,6 +187,16 @@ def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
     weight = found[1].sum(axis=0)
     few, all_of_them = (horizons.smooth_share(*own) for own in found)
     assert (weight * np.abs(few - all_of_them)).sum() < 0.05 * weight.sum() and np.ptp(all_of_them) > 0.9
+
+
+def test_a_few_directions_tell_where_lobes_end_under_a_sky(monkeypatch):
+    samples, lights = samples_around(np.random.default_rng(7), 300), sides_of_the_sky()
+    chances = horizons.lobe_chances(samples, np.arange(300), is_baked=False)
+    few = horizons.smooth_share(*horizons.horizon_excess(samples, lights, chances))
+    monkeypatch.setattr(horizons._Directions, "few", lambda directions: directions)
+    apart = few - horizons.smooth_share(*horizons.horizon_excess(samples, lights, chances))
+    # Of what comes from between the horizons, itself a few percent of the light.
+    assert np.sqrt(np.square(apart).mean()) < 0.05 and abs(apart.mean()) < 0.01
 
 
 def test_bounds_of_thousands_of_lights_are_those_of_a_few():

@@ -20,7 +20,7 @@ from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
 from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
 from ltsh_addon.shading.parallel import cores  # noqa: E402
 
-SCENES = ("demo", "artist", "studio", "lamp", "closed")
+SCENES = ("demo", "artist", "studio", "lamp", "closed", "window")
 SIZE, BUDGETS, TRUE_SAMPLES = (240, 135), (2.0, 8.0, 30.0), 4096
 OTHER_SEED = 7919  # of the truth, so that no noise is shared
 

@@ -1,4 +1,4 @@
-"""Four scenes with bounces, glass, lamps and a sky; needs bpy.
+"""Five scenes with bounces, glass, lamps, a sun and a sky; needs bpy.
 
 python tests/benchmarks/finished_scenes.py NAME FILE.blend
 """
@@ -79,7 +79,33 @@ def studio():
         shared._light(f"Box {number}", place, (0.0, 0.0, 0.4), 150.0, size=1.6, size_y=1.0)
 
 
-SCENES = {scene.__name__: scene for scene in (artist, studio, lamp, closed)}
+def window():
+    """A room with a box and balls, lit by the sun and the sky through an opening in its left wall."""
+    white, gray = shared._matt(WHITE, 0.6), shared._matt((0.45, 0.42, 0.4), 0.35)
+    shared._box("Floor", (-2.0, -2.5, -0.1), (2.0, 2.5, 0.0), shared._matt((0.35, 0.2, 0.1), 0.3))
+    shared._box("Ceiling", (-2.1, -2.6, 2.6), (2.1, 2.6, 2.7), white)
+    shared._box("Back", (-2.1, 2.5, 0.0), (2.1, 2.6, 2.6), white)
+    shared._box("Front", (-2.1, -2.6, 0.0), (2.1, -2.5, 2.6), white)
+    shared._box("Right", (2.0, -2.5, 0.0), (2.1, 2.5, 2.6), white)
+    for name, low, high in (("Sill", (-2.5, 0.0), (2.5, 0.9)), ("Lintel", (-2.5, 2.2), (2.5, 2.6)),
+                            ("Near", (-2.5, 0.9), (-0.6, 2.2)), ("Far", (1.2, 0.9), (2.5, 2.2)),
+                            ("Bar", (0.25, 0.9), (0.32, 2.2))):  # fmt: skip
+        shared._box(name, (-2.1, *low), (-2.0, *high), white)
+    shared._camera((1.4, -2.3, 1.5), (-0.5, 1.2, 0.9))
+    shared._box("Table", (-0.9, 0.4, 0.6), (0.6, 1.4, 0.68), gray)
+    for x, y in ((-0.85, 0.45), (0.5, 0.45), (-0.85, 1.3), (0.5, 1.3)):
+        shared._box(f"Leg {x} {y}", (x, y, 0.0), (x + 0.06, y + 0.06, 0.6), gray)
+    for number, (x, y) in enumerate(((-0.5, 0.8), (0.0, 1.1), (0.3, 0.7))):
+        make = shared._metal if number == 1 else shared._matt
+        scene_parts.add_sphere(make((0.7, 0.3 + 0.2 * number, 0.2), 0.25), 0.16, f"Ball {number}",
+                               location=(x, y, 0.84))  # fmt: skip
+    sun = bpy.data.lights.new("Sun", "SUN")
+    sun.energy, sun.angle = 6.0, 0.02
+    scene_parts.link(bpy.data.objects.new("Sun", sun), (0.0, 0.0, 0.0), (0.0, -0.9, -0.15))
+    scene_parts.add_world(Color=(0.55, 0.7, 1.0, 1.0), Strength=1.5)
+
+
+SCENES = {scene.__name__: scene for scene in (artist, studio, lamp, closed, window)}
 
 
 def main():

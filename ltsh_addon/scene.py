@@ -454,7 +454,8 @@ class Film:
     """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
     `sub_samples` samples, of which those that hit nothing are absent. Where a surface has several lobes, `first` (P,)
     is true for one sample of each hit; left out: for all. Where samples stand for several, `count` (P,) says for how
-    many; left out: one each."""
+    many; left out: one each. Where pixels share their samples, `spread` (P, D, D) are the weights of each in the pixels
+    around its own, rows from top to bottom, and `whole` (H, W) their sums, with those of samples that are absent."""
 
     width: int
     height: int
@@ -462,11 +463,18 @@ class Film:
     sub_samples: int = 1
     first: np.ndarray | None = None  # (P,) bool
     count: np.ndarray | None = None  # (P,) integers
+    spread: np.ndarray | None = None
+    whole: np.ndarray | None = None
 
     def take(self, index) -> Film:
         """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        first, count = (None if values is None else values[index] for values in (self.first, self.count))
-        return replace(self, pixel=self.pixel[index], first=first, count=count)
+        own = {name: getattr(self, name) for name in ("first", "count", "spread")}
+        own = {name: None if values is None else values[index] for name, values in own.items()}
+        return replace(self, pixel=self.pixel[index], **own)
+
+    def unspread(self) -> Film:
+        """The same samples, each in its own pixel alone."""
+        return replace(self, spread=None, whole=None)
 
     @property
     def points(self) -> int:
@@ -479,10 +487,48 @@ class Film:
         """Image (H, W) or (H, W, C), row 0 on top, of per-sample `values` (P,) or (P, C)."""
         values = np.asarray(values, dtype=np.float64)
         columns = values.reshape(values.shape[0], int(np.prod(values.shape[1:])))
+        if self.spread is not None:
+            image = self._sums(columns, self.spread) / self.whole[..., None]
+            return image.reshape(self.height, self.width, *values.shape[1:])
         columns = columns if self.count is None else columns * self.count[:, None]
         count = self.width * self.height
         image = np.stack([np.bincount(self.pixel, weights=column, minlength=count) for column in columns.T], axis=-1)
         return (image / self.sub_samples).reshape(self.height, self.width, *values.shape[1:])
+
+    def _sums(self, columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Sums (H, W, C) of the columns (P, C) with weights (P, D, D)."""
+        size, around = weights.shape[1], weights.shape[1] // 2
+        shape = self.height + 2 * around, self.width + 2 * around
+        sums = np.zeros((columns.shape[1], shape[0] * shape[1]))
+        place = self.pixel // self.width * shape[1] + self.pixel % self.width
+        for row, column in np.ndindex(size, size):
+            weight, target = weights[:, row, column], place + row * shape[1] + column
+            for own, values in zip(sums, columns.T, strict=True):
+                own += np.bincount(target, weights=values * weight, minlength=len(own))
+        inside = slice(around, around + self.height), slice(around, around + self.width)
+        return np.moveaxis(sums.reshape(-1, *shape), 0, -1)[inside]
+
+    def shared(self, weights: np.ndarray, sub_sample: np.ndarray, seen: np.ndarray) -> Film:
+        """The film whose pixels share their samples, by weights (N, D, D) of those with the number `sub_sample` (P,);
+        rendered were the pixels `seen` (H, W)."""
+        every = replace(self, pixel=np.flatnonzero(seen))
+        total = np.broadcast_to(weights.sum(axis=0), (len(every.pixel), *weights.shape[1:]))
+        whole = every._sums(np.ones((len(every.pixel), 1)), total)[..., 0]
+        spread = weights.astype(np.float32)[sub_sample]
+        return replace(self, spread=spread, whole=np.where(seen, whole, np.inf))
+
+    def reached(self, mask: np.ndarray) -> np.ndarray:
+        """The pixels (H, W) that have samples of those of the `mask` (H, W)."""
+        around = 0 if self.spread is None else self.spread.shape[1] // 2
+        grid = np.pad(mask, around)
+        steps = itertools.product(range(2 * around + 1), repeat=2)
+        return np.any([grid[y : y + self.height, x : x + self.width] for y, x in steps], axis=0)
+
+    def variance(self, values: np.ndarray) -> np.ndarray:
+        """Image (H, W) of the variance of `image` by those (P,) of the samples, of which each is independent."""
+        if self.spread is not None:
+            return self._sums(np.asarray(values)[:, None], np.square(self.spread))[..., 0] / np.square(self.whole)
+        return self.image(values if self.count is None else values * self.count) / self.sub_samples
 
     def coverage(self) -> np.ndarray:
         """Share (H, W) of each pixel's sub-samples that hit a surface."""

@@ -184,7 +184,12 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
     count = np.bincount(place, minlength=len(kept))
     found = samples.take(kept)
     means = {name: _means(getattr(samples, name), place, count) for name in COLORS}
-    return replace(found, **means), replace(film.take(kept), count=count)
+    own = film.take(kept)
+    if own.spread is not None:
+        columns = film.spread.reshape(len(samples), -1).T
+        sums = [np.bincount(place, weights=column, minlength=len(kept)) for column in columns]
+        own = replace(own, spread=np.stack(sums, axis=1).astype(np.float32).reshape(own.spread.shape))
+    return replace(found, **means), replace(own, count=count)
 
 
 def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray) -> np.ndarray:

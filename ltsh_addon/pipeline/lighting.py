@@ -25,6 +25,7 @@ from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSample
 from ..shading.light_tree import FEWEST
 
 # Of the files of `keep_picture`: all that shading needs, and what shadow rays meet.
+FILM_ARRAYS = ("first", "count", "spread", "whole")  # that a film may have
 KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # Pairs of a sample and a light whose radiance is kept at a time.
 MOST_PAIRS = 1 << 25
@@ -239,8 +240,7 @@ class KeptPicture:
             ),
             film=Film(
                 pixel=arrays["film.pixel"],
-                first=arrays.get("film.first"),
-                count=arrays.get("film.count"),
+                **{name: arrays.get(f"film.{name}") for name in FILM_ARRAYS},
                 **found["film"],
             ),
             warnings=tuple(found["warnings"]),
@@ -301,7 +301,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
     arrays["film.pixel"] = film.pixel
-    arrays |= {f"film.{name}": getattr(film, name) for name in ("first", "count") if getattr(film, name) is not None}
+    arrays |= {f"film.{name}": getattr(film, name) for name in FILM_ARRAYS if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
     seen = {name: getattr(extraction, name) for name in NOT_REFLECTED}

@@ -107,7 +107,7 @@ class Visibility:
         light, variance = self.radiance[name], np.square(self.deviation[name])
         if film is not None:
             # The errors of the samples of a pixel do not depend on each other.
-            light, variance = film.image(light), film.image(variance) / film.sub_samples
+            light, variance = film.image(light), film.variance(variance)
         power = np.square(light, dtype=np.float64).sum()
         return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
 
@@ -137,6 +137,7 @@ def visible_shares(
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
     (emitters, numbers), passes = emitters_of(lights, tracer), tuple(passes)
+    film = None if film is None else film.unspread()
     typical = dict.fromkeys(passes, 1.0)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical, is_baked)
     start = time.thread_time()

@@ -30,6 +30,7 @@ from ..render_settings import (
     filter_name,
     pinned_pixel_filter,
     render_exr,
+    shared_points,
     shifted_pixels,
     sub_pixel_offsets,
     without_scripts,
@@ -265,7 +266,9 @@ def extract(job: dict, folder: Path, progress) -> dict:
     started = time.monotonic()
     has_rest = job.get("rest", False)
     end = math.inf if job.get("seconds") is None else begun + job["seconds"]
-    offsets = sub_pixel_offsets(scene, job["sub_samples"], for_finished)
+    offsets, weights = sub_pixel_offsets(scene, job["sub_samples"]), None
+    if for_finished:
+        offsets, weights = sub_pixel_offsets(scene, job["sub_samples"], shared_points)
     with world_behind(scene, inventory.behind if has_rest and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if has_rest else ()), *job.get("indices", ()))
         samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes, end)
@@ -296,6 +299,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "kept": {**vars(inventory.kept), "warnings": inventory.warnings} if for_finished else None,
         "samples": samples,
         "has_lens": has_lens,
+        "weights": None if weights is None else weights[: len(samples)].tolist(),
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,

@@ -220,6 +220,9 @@ def _read_samples(
         unshaded += gbuffer.unshaded_hits(channels, len(materials))
         look(channels)
     samples, film = gbuffer.join(renders, width, height)
+    if manifest.get("weights"):
+        numbers = np.repeat(np.arange(len(renders)), [len(pixel) for _, pixel in renders])
+        film = film.shared(np.array(manifest["weights"]), numbers, _rendered_pixels(manifest))
     warnings = []
     if unusable:
         what = "transparent surfaces in front of others, or not finite, or too far away"
@@ -237,6 +240,16 @@ def _read_samples(
     if len(samples) == 0:
         warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
     return samples, film, warnings, []
+
+
+def _rendered_pixels(manifest: dict) -> np.ndarray:
+    """Mask (H, W)."""
+    seen, border = np.ones((manifest["height"], manifest["width"]), bool), manifest["border"]
+    if border is not None and not border["cropped"]:
+        rows, columns = (slice(border[a], border[a] + border[b]) for a, b in (("top", "height"), ("left", "width")))
+        seen[:] = False
+        seen[rows, columns] = True
+    return seen
 
 
 def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -> list[str]:
@@ -294,7 +307,10 @@ def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[s
 def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> KeptByCycles:
     """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
     found = manifest["kept"]
-    by_pass = {name: np.any([(number & bit) > 0 for number in bits], axis=0) for name, bit in lobes.KEPT_BITS.items()}
+    by_pass = {
+        name: film.reached(np.any([(number & bit) > 0 for number in bits], axis=0))
+        for name, bit in lobes.KEPT_BITS.items()
+    }
     by_pass["specular"] |= film.image(is_faceted) > 0.0
     materials = found["materials"] + ["sharp reflections of the world (specular)"] * bool(is_faceted.any())
     return KeptByCycles(by_pass, *map(tuple, (materials, found["everything"], found["warnings"])))

@@ -145,8 +145,9 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
 
 # Hits of a pixel whose normals are closer than this share of the width of their lobes (alpha), and at most so many
 # radians apart, and whose points lie this close to the same plane, get one shading. Sharper lobes than so never do.
-LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.2, 0.1, 0.2, 0.01
+LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.02, 0.01, 0.2, 0.01
 MERGED_ROUNDS = 3  # surfaces of a pixel
+SHADOW_LOOSENESS = 40.0  # so many times farther apart normals may be to get one shadow
 COLORS = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound")
 SAME = ("roughness", "ior", "diffuse_roughness", "sheen_a", "sheen_b", "receiver", "anisotropy")
 
@@ -158,6 +159,32 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
     first of the hits, which is the center of the pixel where that shows the surface. On the example scene with 8 points
     half of the samples remain, and without shadows specular light is 1 % off, diffuse 0.5 %.
     """
+    kept, place = _groups(samples, film, 1.0)
+    found, own = samples.take(kept), _together(film, kept, place)
+    means = {name: _means(getattr(samples, name), place, own.count) for name in COLORS}
+    return replace(found, **means), own
+
+
+def with_one_shadow(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film, np.ndarray]:
+    """The samples (Q) of which one stands for all of a pixel that see about the same part of lights, their film, and of
+    which of them each of the `samples` is (P,)."""
+    kept, place = _groups(samples, film, SHADOW_LOOSENESS)
+    return samples.take(kept), _together(film, kept, place), place
+
+
+def _together(film: Film, kept: np.ndarray, place: np.ndarray) -> Film:
+    """The film of the samples `kept` (Q,), each of which stands for those with its `place` (P,)."""
+    count = np.bincount(place, weights=film.count, minlength=len(kept)).astype(int)
+    own = replace(film.take(kept), count=count)
+    if film.spread is None:
+        return own
+    columns = film.spread.reshape(len(place), -1).T
+    sums = [np.bincount(place, weights=column, minlength=len(kept)) for column in columns]
+    return replace(own, spread=np.stack(sums, axis=1).astype(np.float32).reshape(own.spread.shape))
+
+
+def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.ndarray, np.ndarray]:
+    """The samples (Q,) that stand for others of their pixel, and the place there of each sample's own, (P,)."""
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))
     pixel, target = film.pixel[starts], np.arange(len(starts))
@@ -173,27 +200,19 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
         same = lengths[others] == lengths[leader]
         for lobe in range(int(lengths.max(initial=0))):
             there = np.flatnonzero(same & (lengths[others] > lobe))
-            same[there] = _one_shading(samples, starts[others[there]] + lobe, starts[leader[there]] + lobe)
+            pairs = starts[others[there]] + lobe, starts[leader[there]] + lobe
+            same[there] = _one_shading(samples, *pairs, looseness)
         target[others[same]] = leader[same]
         free[others[same]] = False
     # From hits to their samples.
     lobe = np.arange(len(samples)) - np.repeat(starts, lengths)
     of_sample = np.repeat(starts[target], lengths) + lobe
     kept = np.flatnonzero(of_sample == np.arange(len(samples)))
-    place = np.searchsorted(kept, of_sample)
-    count = np.bincount(place, minlength=len(kept))
-    found = samples.take(kept)
-    means = {name: _means(getattr(samples, name), place, count) for name in COLORS}
-    own = film.take(kept)
-    if own.spread is not None:
-        columns = film.spread.reshape(len(samples), -1).T
-        sums = [np.bincount(place, weights=column, minlength=len(kept)) for column in columns]
-        own = replace(own, spread=np.stack(sums, axis=1).astype(np.float32).reshape(own.spread.shape))
-    return replace(found, **means), replace(own, count=count)
+    return kept, np.searchsorted(kept, of_sample)
 
 
-def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Mask of pairs of samples that get one shading."""
+def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray, looseness: float) -> np.ndarray:
+    """Mask of pairs of samples that get one shading, or with a `looseness` above 1 one shadow."""
     same = np.ones(len(one), bool)
     for name in SAME:
         values = getattr(samples, name)
@@ -201,7 +220,7 @@ def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray) ->
     shines = has_lobe(samples.take(other))[1]
     alpha = np.where(shines, samples.roughness[other] ** 2, 1.0)
     same &= alpha >= LEAST_ALPHA
-    angle = np.minimum(MOST_ANGLE, LOBE_SHARE * alpha)
+    angle = looseness * np.minimum(MOST_ANGLE, LOBE_SHARE * alpha)
     turned = np.linalg.norm(samples.tangent[one] - samples.tangent[other], axis=1)
     same &= (turned <= angle) | (samples.anisotropy[other] == 0.0)
     limit = np.cos(angle)

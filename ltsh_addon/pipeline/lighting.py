@@ -126,10 +126,12 @@ class ShadowTracer:
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
-    """The shares of the lights of an `Extraction` that its samples see."""
+    """The shares of the lights of an `Extraction` that its samples see, of which those that stand for few points of
+    their pixel get few of the `rays`."""
+    samples, film = extraction.samples, extraction.film
+    rays = rays if film.count is not None else rays_of_point(rays, film.sub_samples)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        rays = rays_of_point(rays, extraction.film.points)
-        return tracer.trace(extraction.samples, passes, rays, film=extraction.film, progress=progress)
+        return tracer.trace(samples, passes, rays, film=film, progress=progress)
 
 
 def shade_lights(

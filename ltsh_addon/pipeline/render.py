@@ -16,13 +16,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .. import imaging
+from ..cycles.gbuffer import with_one_shadow
 from ..cycles.lobes import read_layer
 from ..files import save_array, temporary_folder, write_bytes
 from ..imaging.denoise import NoDenoiser, open_denoiser
@@ -38,11 +39,11 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 # A pass of Cycles, followed by the name of a light group.
 OF_GROUP = "Combined_"
 REST = "rest"
-# Points of a pixel where nothing is said, and processor seconds that denoising and writing take for a million pixels.
-SUB_SAMPLES, LAST_SECONDS = 17, 6.0
-# Of a budget: what the points of pixels, and the shadows, may take; and what a shadow ray takes, of which some soft
-# shadows take all.
-POINTS_SHARE, SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.2, 0.3, 1e-6, 0.6
+# Points of a pixel where nothing is said, at most those of a budget, and processor seconds that denoising and writing
+# take for a million pixels.
+SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS = 9, 17, 12.0
+# Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
+SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.1, 6e-7, 0.1
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -183,18 +184,20 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
 
     tables = picture.load_tables(options.techniques)
     width, height = options.resolution or (None, None)
+    most = SUB_SAMPLES if options.budget is None else MOST_SUB_SAMPLES
     own = child_job(
-        *(PictureOptions, options), passes=PASSES, sub_samples=options.sub_samples or SUB_SAMPLES, shadows="on",
+        *(PictureOptions, options), passes=PASSES, sub_samples=options.sub_samples or most, shadows="on",
         cycles_samples=2,
     )  # fmt: skip
-    seconds = None if options.budget is None else POINTS_SHARE * options.budget
-    size = {"width": width, "height": height, "seconds": seconds}
+    size = {"width": width, "height": height, "seconds": options.budget}
     job = child_job(client.ExtractOptions, own, **where, **size, cycles_samples=0, for_finished=True)
     extraction = client.extract(job, progress=progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
         return picture.Comparison(own, extraction, {}, None)
-    shadows = lighting.trace_shadows(extraction, PASSES, _rays(options, extraction), progress)
+    samples, film, place = with_one_shadow(extraction.samples, extraction.film)
+    seen = replace(extraction, samples=samples, film=film)
+    shadows = lighting.trace_shadows(seen, PASSES, _rays(options, seen), progress).take(place)
     clock.end("shadows")
     results = picture.evaluated(tables, extraction, shadows, own, progress)
     clock.end("shading")
@@ -205,7 +208,7 @@ def _rays(options: RenderOptions, extraction) -> int:
     """At most so many shadow rays for a light and a pixel, as the options and the budget allow."""
     if options.budget is None:
         return options.shadow_rays
-    pairs = len(extraction.samples) / extraction.film.points * len(extraction.lights)
+    pairs = extraction.film.count.sum() / extraction.film.sub_samples * len({light.name for light in extraction.lights})
     affordable = SHADOWS_SHARE * options.budget / max(SOFT_SHARE * RAY_SECONDS * pairs, 1e-9)
     return int(np.clip(affordable, SHADOW_RAYS[0], options.shadow_rays))
 

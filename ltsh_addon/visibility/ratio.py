@@ -178,11 +178,15 @@ class ShadowTask:
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer, starts), Neighbors.of(film, shape[1])
+        # Of samples for their pixels.
+        importance = np.ones(shape[1], np.float32)
+        if film is not None and film.count is not None:
+            importance = (film.count / film.sub_samples).astype(np.float32)
         choices, first = Choices(samples, [one for each in self.emitters for one in each.chosen_as], self.is_baked), 0
         for number, emitter in enumerate(self.emitters):
             pairs = Pairs(surface, emitter, first, choices)
             first += len(emitter.chosen_as)
-            pairs.trace(self.rays, neighbors, self.typical)
+            pairs.trace(self.rays, neighbors, self.typical, importance)
             traced += pairs.traced
             index = pairs.index
             mixed[number, index] = pairs.visible & pairs.blocked
@@ -341,13 +345,14 @@ class Pairs:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
 
-    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float]) -> None:
-        """Probes for all pairs, and up to `rays` for those that need them; `typical` as from `typical_radiance`."""
+    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float], importance: np.ndarray) -> None:
+        """Probes for all pairs, and up to `rays` for those that need them, by their light times their `importance`
+        (P,); `typical` as from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
         self._leave_out_unlit()
-        number, choice = self._plan(rays, typical)
+        number, choice = self._plan(rays, typical, importance[self.index])
         for _ in range(ROUNDS):
             chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
             chosen |= self._unmet()
@@ -360,10 +365,11 @@ class Pairs:
                     self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
 
-    def _plan(self, rays, typical):
-        """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed."""
+    def _plan(self, rays, typical, importance):
+        """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed and
+        by their `importance` (Q,)."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
-        most = np.maximum(worth["specular"], worth["diffuse"])
+        most = importance * np.maximum(worth["specular"], worth["diffuse"])
         # They are there for all that they are made of.
         share = 1.0 if isinstance(self.emitter, Sky | Cluster) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
@@ -372,7 +378,7 @@ class Pairs:
             limit = min(BRIGHTEST * rays, MOST_RAYS)
         if isinstance(self.emitter, Sky):
             # What only the sky lights is dark beside what a sun in it does.
-            wanted = np.maximum(wanted, 0.25 * rays)
+            wanted = np.maximum(wanted, 0.25 * rays * importance)
         levels = [level for level in LEVELS if level < limit] + [limit]
         number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from pathlib import Path
 
@@ -41,10 +40,10 @@ from .origin import move_to_origin
 
 
 def render_pixel_samples(
-    scene, view_layer, folder: Path, offsets: np.ndarray, progress, extra_passes: tuple[str, ...] = (), end=math.inf
+    scene, view_layer, folder: Path, offsets: np.ndarray, progress, extra_passes: tuple[str, ...] = ()
 ) -> list[str]:
     """Names of the files in `folder`, one for each of the `offsets` (N, 2) from the pixel centers; with depth of field
-    each has other points of the lens. At the processor time `end` those that are left are not rendered."""
+    each has other points of the lens."""
     declare_aovs(view_layer)
     enable_passes(view_layer, ("combined", "diffuse_color", "normal", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
@@ -55,8 +54,6 @@ def render_pixel_samples(
     scene.render.use_persistent_data = sub_samples > 1
     with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
-            if files and time.process_time() > end:
-                break
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             cycles.sample_offset = index  # of a subset
@@ -69,6 +66,19 @@ def render_pixel_samples(
 
 # Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
 FINISHED_LENS = 32
+TOO_SMALL = "the budget is too small for it"
+# Processor seconds that direct light takes: in all, and for a point of a pixel; the latter grows by so much with each
+# light, up to so many. Of a budget, shares that points may take, and all of direct light.
+START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.5, 6e-6, 0.125
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.6, 100
+
+
+def affordable_points(seconds: float, pixels: int, lights: int) -> int:
+    """How many points of each pixel a budget allows; 0: it leaves too little for Cycles."""
+    each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
+    return max(int(POINTS_SHARE * seconds / each), 1) if DIRECT_SHARE * seconds > START_SECONDS + each else 0
+
+
 # Passes of Cycles with what of the picture is no reflected light.
 REST_PASSES = ("emit", "environment")
 # File with what stands in the way of light.
@@ -237,7 +247,7 @@ def no_light(scene, reasons: list[str]) -> SceneError:
 
 def extract(job: dict, folder: Path, progress) -> dict:
     """Do the `job` (see `client.extract`), write EXRs into `folder`; the manifest as a dictionary."""
-    started, begun, warnings, seconds = time.monotonic(), time.process_time(), [], {}
+    started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job.get("scripts", False))
     scene = scene_named(job.get("scene_name"))
@@ -265,13 +275,18 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started = time.monotonic()
     has_rest = job.get("rest", False)
-    end = math.inf if job.get("seconds") is None else begun + job["seconds"]
-    offsets, weights = sub_pixel_offsets(scene, job["sub_samples"]), None
+    count = job["sub_samples"]
+    if job.get("seconds") is not None and not has_lens:
+        points = affordable_points(job["seconds"], picture["width"] * picture["height"], len(inventory.lights))
+        if points == 0:
+            inventory.kept.everything.append(f"{TOO_SMALL}, {job['seconds']:g} s")
+        count = min(max(points, 1), count)
+    offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
-        offsets, weights = sub_pixel_offsets(scene, job["sub_samples"], shared_points)
+        offsets, weights = sub_pixel_offsets(scene, count, shared_points)
     with world_behind(scene, inventory.behind if has_rest and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if has_rest else ()), *job.get("indices", ()))
-        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes, end)
+        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None

@@ -53,7 +53,7 @@ class ExtractOptions:
     indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
-    seconds: float | None = None  # of processor time, after which no further sub-sample is begun
+    seconds: float | None = None  # of processor time for the whole picture, which limits its sub-samples
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,8 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
-        samples, film = _ended(samples, film, lights)
+        if kept is None or not kept.everything:
+            samples, film = _ended(samples, film, lights)
         return Extraction(
             lights=lights,
             samples=samples,

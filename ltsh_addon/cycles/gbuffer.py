@@ -7,11 +7,11 @@ per pixel and file, so nothing is averaged across an edge.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
-from ..scene import FARTHEST, Film, SurfaceSamples
+from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples
 from ..shading.light_polygons import has_lobe
 from .horizons import unit
 from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
@@ -135,6 +135,10 @@ def kept_by_cycles(channels: dict[str, np.ndarray]) -> np.ndarray:
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:
     """All samples of `renders` (samples, pixel), one per sub-sample, and the film they lie on."""
+    if not renders:
+        shapes = {item.name: (0,) if item.name in SCALAR_FIELDS else (0, 3) for item in fields(SurfaceSamples)}
+        nothing = SurfaceSamples(**{name: np.zeros(shape) for name, shape in shapes.items()})
+        return nothing, Film(width, height, np.zeros(0, int))
     pixel = np.concatenate([pixel for _, pixel in renders])
     # A render has one hit per pixel, whose samples follow one another.
     of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]

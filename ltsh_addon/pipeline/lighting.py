@@ -66,6 +66,12 @@ def rays_of_point(rays: int, points: int) -> int:
     return max(min(FEWEST_RAYS, rays), rays // points)
 
 
+def rays_of_samples(rays: int, film: Film) -> int:
+    """Of `rays` for a pixel the most that one of its samples may take; where these stand for several, they get theirs
+    by how many."""
+    return rays if film.count is not None else rays_of_point(rays, film.sub_samples)
+
+
 class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
@@ -129,9 +135,8 @@ def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progre
     """The shares of the lights of an `Extraction` that its samples see, of which those that stand for few points of
     their pixel get few of the `rays`."""
     samples, film = extraction.samples, extraction.film
-    rays = rays if film.count is not None else rays_of_point(rays, film.sub_samples)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        return tracer.trace(samples, passes, rays, film=film, progress=progress)
+        return tracer.trace(samples, passes, rays_of_samples(rays, film), film=film, progress=progress)
 
 
 def shade_lights(

@@ -21,7 +21,7 @@ from ..files import replacing, temporary_folder
 from ..scene import REFERENCE, AreaLight, Film, Progress, SurfaceSamples, error_line, listed
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
 from . import picture
-from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_of_point, shade_lights
+from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_of_samples, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -519,7 +519,7 @@ class MovedLights:
         kept, film, task = self._kept, self._kept.extraction.film, None
         light = light.moved(-kept.extraction.origin)
         if self._tracer is not None:
-            rays = rays_of_point(kept.options["shadow_rays"], film.sub_samples)
+            rays = rays_of_samples(kept.options["shadow_rays"], film)
             task = task_of_light(self._samples, light, self._tracer, kept.options["passes"], rays)
         found = self._company.lit(light, task)
         image = np.zeros((film.height, film.width, 3), np.float32)

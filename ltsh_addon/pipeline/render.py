@@ -43,7 +43,7 @@ REST = "rest"
 # take for a million pixels.
 SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS = 9, 17, 12.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
-SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.1, 6e-7, 0.1
+SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -195,20 +195,28 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
         return picture.Comparison(own, extraction, {}, None)
-    samples, film, place = with_one_shadow(extraction.samples, extraction.film)
-    seen = replace(extraction, samples=samples, film=film)
-    shadows = lighting.trace_shadows(seen, PASSES, _rays(options, seen), progress).take(place)
+    shadows = _shadows(options, extraction, progress)
     clock.end("shadows")
     results = picture.evaluated(tables, extraction, shadows, own, progress)
     clock.end("shading")
     return picture.Comparison(own, extraction, results, shadows)
 
 
+def _shadows(options: RenderOptions, extraction, progress) -> lighting.Shadows:
+    """The shares of the lights that the samples see: points of a pixel that see about the same share their rays."""
+    if extraction.has_lens:
+        return lighting.trace_shadows(extraction, PASSES, _rays(options, extraction), progress)
+    samples, film, place = with_one_shadow(extraction.samples, extraction.film)
+    seen = replace(extraction, samples=samples, film=film)
+    return lighting.trace_shadows(seen, PASSES, _rays(options, seen), progress).take(place)
+
+
 def _rays(options: RenderOptions, extraction) -> int:
     """At most so many shadow rays for a light and a pixel, as the options and the budget allow."""
     if options.budget is None:
         return options.shadow_rays
-    pairs = extraction.film.count.sum() / extraction.film.sub_samples * len({light.name for light in extraction.lights})
+    # Lights of one name, such as the sides of a sky, share their rays.
+    pairs = extraction.film.coverage().sum() * len({light.name for light in extraction.lights})
     affordable = SHADOWS_SHARE * options.budget / max(SOFT_SHARE * RAY_SECONDS * pairs, 1e-9)
     return int(np.clip(affordable, SHADOW_RAYS[0], options.shadow_rays))
 

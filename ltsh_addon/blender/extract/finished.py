@@ -17,8 +17,8 @@ from .pixels import open_scene, scene_named
 # Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
 # the others.
 FIRST, PROBE, CHUNK_SECONDS, MOST_CHUNKS = 16, 2, 6.0, 6
-# Of a budget: so much of it is left for what comes after the last sample.
-SPENT = 0.97
+# Of a budget: so much of it is left for what comes after the last sample. A last file takes what others have left.
+SPENT, MOST_FILES = 0.97, 4
 # Passes that a finished picture takes its parts from, those that artists put together, and what the denoiser wants.
 LIGHT_PASSES = tuple(
     f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")
@@ -129,7 +129,7 @@ def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list
     end = None if seconds is None else time.process_time() + SPENT * seconds
     chunk = min(FIRST, samples) if end is None else PROBE
     while samples is None or done < samples:
-        progress("Cycles", done / samples if samples else len(files) / 3)
+        progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
         clock = time.process_time if end is not None else time.monotonic
         started = clock()
         cycles.samples = done + chunk if samples is None else samples
@@ -142,7 +142,7 @@ def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list
             # The first time holds the look at the scene, so the next one tells better what a sample takes.
             left = int((end - time.process_time()) / each)
             chunk = left if len(files) > 1 else min(left, 4 * PROBE)
-            if chunk < 1 or len(files) == 3:
+            if chunk < 1 + done // 10 or len(files) == MOST_FILES:
                 break
         else:
             chunks = min(MOST_CHUNKS, max(1, round(each * (samples - done) / CHUNK_SECONDS)))

@@ -69,8 +69,8 @@ FINISHED_LENS = 32
 TOO_SMALL = "the budget is too small for it"
 # Processor seconds that direct light takes: in all, and for a point of a pixel; the latter grows by so much with each
 # light, up to so many. Of a budget, shares that points may take, and all of direct light.
-START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.5, 6e-6, 0.125
-POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.6, 100
+START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.2, 6e-6, 0.125
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.72, 100
 
 
 def affordable_points(seconds: float, pixels: int, lights: int) -> int:
@@ -261,9 +261,14 @@ def extract(job: dict, folder: Path, progress) -> dict:
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
     has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
-    inventory = prepare_scene(
-        scene, view_layer, camera, warnings, with_occluders=has_shadows, for_finished=for_finished
-    )
+    count, budget, pixels = job["sub_samples"], job.get("seconds"), picture["width"] * picture["height"]
+    if budget is not None and not affordable_points(budget, pixels, 1):
+        # Nothing is looked at in vain.
+        count, has_shadows, inventory = 0, False, LightInventory()
+    else:
+        inventory = prepare_scene(
+            scene, view_layer, camera, warnings, with_occluders=has_shadows, for_finished=for_finished
+        )
     lens.use_dof = has_lens
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
@@ -275,12 +280,10 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
     started = time.monotonic()
     has_rest = job.get("rest", False)
-    count = job["sub_samples"]
-    if job.get("seconds") is not None and not has_lens:
-        points = affordable_points(job["seconds"], picture["width"] * picture["height"], len(inventory.lights))
-        if points == 0:
-            inventory.kept.everything.append(f"{TOO_SMALL}, {job['seconds']:g} s")
-        count = min(max(points, 1), count)
+    if budget is not None and not has_lens:
+        count = min(affordable_points(budget, pixels, len(inventory.lights)), count)
+    if count == 0:
+        inventory.kept.everything.append(f"{TOO_SMALL}, {budget:g} s")
     offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)

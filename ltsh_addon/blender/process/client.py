@@ -159,7 +159,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             warnings += faceted(samples, lights)
         kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
         # Points of a blurred pixel may be far from each other.
-        if options.for_finished and not manifest["has_lens"]:
+        if options.for_finished and not manifest["has_lens"] and len(samples):
             samples, film = gbuffer.merged(samples, film)
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
@@ -224,6 +224,8 @@ def _read_samples(
     if manifest.get("weights"):
         numbers = np.repeat(np.arange(len(renders)), [len(pixel) for _, pixel in renders])
         film = film.shared(np.array(manifest["weights"]), numbers, _rendered_pixels(manifest))
+    if not renders:
+        return samples, film, [], []
     warnings = []
     if unusable:
         what = "transparent surfaces in front of others, or not finite, or too far away"
@@ -309,7 +311,7 @@ def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.nda
     """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
     found = manifest["kept"]
     by_pass = {
-        name: film.reached(np.any([(number & bit) > 0 for number in bits], axis=0))
+        name: film.reached(sum((number & bit for number in bits), np.zeros((film.height, film.width), int)) > 0)
         for name, bit in lobes.KEPT_BITS.items()
     }
     by_pass["specular"] |= film.image(is_faceted) > 0.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import imaging
 from ..files import replacing, temporary_folder
-from ..scene import REFERENCE, AreaLight, Film, Progress, SurfaceSamples, error_line, listed
+from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
 from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, Shadows, rays_of_samples, shade_lights
@@ -544,7 +544,7 @@ class MovedLights:
         starts = range(0, max(len(samples), 1), BLOCK_SAMPLES)
         blocks = [slice(start, start + BLOCK_SAMPLES) for start in starts]
         # Which samples are neighbors is all that rays ask of their film.
-        film = Film(film.width, film.height, film.pixel)
+        film = film.unspread()
         blocks = tuple((self._samples.take(block), film.take(block)) for block in blocks)
         (table,) = picture.load_tables((technique_of(kept),)).values()
         with ExitStack() as stack:

@@ -115,6 +115,10 @@ void main()
     vec4 tangent = texelFetch(tangents, texel, 0);
 #ifdef LTSH_BRUSHED
     here = here && tangent.w != 0.0;
+    /* The others have been drawn. */
+    if (!here) {
+        discard;
+    }
 #else
     here = here && tangent.w == 0.0;
 #endif

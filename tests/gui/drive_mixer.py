@@ -1,4 +1,4 @@
-"""The light mixer: a light brighter, solo, in another color; applied; moved; the lights of an F12 picture."""
+"""The light mixer: a light brighter, solo, in another color; applied; moved; the same with an F12 picture."""
 
 import statistics
 import time
@@ -63,10 +63,11 @@ def applied(rig):
     rig.shot("5_applied.png")
 
 
-def moved(rig):
+def moved(rig, picture="6_moved.png"):
     name = hands.settings().mixed[0].name
     bpy.data.objects[name].location.x += 1.0
-    yield 1
+    # Meanwhile a thread gets ready what shades it.
+    yield 5
     start = time.perf_counter()
     hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
     rig.fact("a moved light, the first time, s", round(time.perf_counter() - start, 2))
@@ -76,7 +77,7 @@ def moved(rig):
     hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
     rig.fact("a moved light, once more, s", round(time.perf_counter() - start, 2))
     yield 1
-    rig.shot("6_moved.png")
+    rig.shot(picture)
 
 
 def rendered(rig):
@@ -92,3 +93,6 @@ def rendered(rig):
     hands.settings().mixed[1].muted = True
     yield 2
     rig.shot("8_render_mixed.png")
+    before = results.mixed_pixels(bpy.context.scene).copy()
+    yield from moved(rig, "9_render_moved.png")
+    rig.check((results.mixed_pixels(bpy.context.scene) != before).mean() > 0.05, "a light of the render was moved")

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
+from ..cycles.gbuffer import with_one_shadow
 from ..files import replacing, temporary_folder
 from ..scene import REFERENCE, AreaLight, Progress, SurfaceSamples, error_line, listed
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
@@ -520,12 +521,15 @@ class MovedLights:
         light = light.moved(-kept.extraction.origin)
         if self._tracer is not None:
             rays = rays_of_samples(kept.options["shadow_rays"], film)
-            task = task_of_light(self._samples, light, self._tracer, kept.options["passes"], rays)
+            task = task_of_light(self._starting, light, self._tracer, kept.options["passes"], rays)
         found = self._company.lit(light, task)
         image = np.zeros((film.height, film.width, 3), np.float32)
         for name in kept.options["passes"]:
-            own = kept.extraction.exposure * np.concatenate([radiance[name] for radiance in found])
-            image += film.image(own) * (kept.taken[name][..., None] if name in kept.taken else 1.0)
+            own = np.zeros((len(film.pixel), 3), np.float32)
+            own[self._order] = np.concatenate([radiance[name] for radiance in found])
+            image += film.image(kept.extraction.exposure * own) * (
+                kept.taken[name][..., None] if name in kept.taken else 1.0
+            )
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:
@@ -539,19 +543,25 @@ class MovedLights:
 
         if self._kept is None:
             self._kept, self._occluders = self._read()
-        kept, samples, film = self._kept, self._kept.extraction.samples, self._kept.extraction.film
-        self._samples = replace(samples, position=samples.position - kept.extraction.origin)
-        starts = range(0, max(len(samples), 1), BLOCK_SAMPLES)
-        blocks = [slice(start, start + BLOCK_SAMPLES) for start in starts]
+        kept, film = self._kept, self._kept.extraction.film
+        samples = kept.extraction.samples
+        samples = replace(samples, position=samples.position - kept.extraction.origin)
+        starting, place = samples, np.arange(len(samples))
+        if film.count is not None:
+            starting, film, place = with_one_shadow(samples, film)
+        self._starting, self._order = starting, np.argsort(place, kind="stable")
         # Which samples are neighbors is all that rays ask of their film.
-        film = film.unspread()
-        blocks = tuple((self._samples.take(block), film.take(block)) for block in blocks)
+        film, blocks = film.unspread(), []
+        for first in range(0, max(len(starting), 1), BLOCK_SAMPLES):
+            begin, end = np.searchsorted(place[self._order], (first, first + BLOCK_SAMPLES))
+            own, part = self._order[begin:end], slice(first, first + BLOCK_SAMPLES)
+            blocks.append((samples.take(own), starting.take(part), film.take(part), place[own] - first))
         (table,) = picture.load_tables((technique_of(kept),)).values()
         with ExitStack() as stack:
             self._tracer = None
             if self._occluders is not None:
                 folder = stack.enter_context(temporary_folder())
                 self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
-            self._company = Company(Setting(blocks, table, tuple(kept.options["passes"])), self._tracer)
+            self._company = Company(Setting(tuple(blocks), table, tuple(kept.options["passes"])), self._tracer)
             stack.callback(self._company.close)
             self._ending = stack.pop_all()

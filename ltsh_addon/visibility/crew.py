@@ -139,9 +139,13 @@ SAMPLES_WORTH_A_CHILD = 1 << 16
 
 @dataclass(frozen=True)
 class Setting:
-    """Blocks of samples that one light after another lights, and how."""
+    """Blocks of samples that one light after another lights, and how.
 
-    blocks: tuple[tuple[SurfaceSamples, Film], ...]  # around the origin of the occluders
+    A block has samples (B), around the origin of the occluders, those (Q) that rays start from, their film, and of
+    which of them each of the former takes its shares, (B,).
+    """
+
+    blocks: tuple[tuple[SurfaceSamples, SurfaceSamples, Film, np.ndarray], ...]
     table: LookupTable
     passes: tuple[str, ...]
 
@@ -164,14 +168,14 @@ class LitBlocks:
         return [self._lit(number, *message) for number in range(len(self._setting.blocks))]
 
     def _lit(self, number: int, light: AreaLight, task) -> dict[str, np.ndarray]:
-        own, (samples, film) = self._setting, self._setting.blocks[number]
+        own, (samples, starting, film, place) = self._setting, self._setting.blocks[number]
         radiance = {name: np.zeros((len(samples), 3), np.float32) for name in own.passes}
         shares = dict.fromkeys(own.passes, np.float32(1.0))
         if task is not None:
             if self._starts[number] is None:
-                self._starts[number] = self._tracer.starts(samples)
-            found = task.shares(samples, film, self._starts[number], self._tracer)
-            shares = {name: getattr(found, name)[0][:, None] for name in own.passes}
+                self._starts[number] = self._tracer.starts(starting)
+            found = task.shares(starting, film, self._starts[number], self._tracer)
+            shares = {name: getattr(found, name)[0][place, None] for name in own.passes}
         if any(share.any() for share in shares.values()):
             lit = shade(samples, [light], own.table, passes=own.passes, workers=1)
             radiance = {name: shares[name] * getattr(lit, name)[0] for name in own.passes}
@@ -189,7 +193,7 @@ class Company:
         occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
         count = min(parallel.cores(), len(setting.blocks))
         cannot_help = parallel.interpreter() is None or (tracer is not None and library is None)
-        if cannot_help or sum(len(samples) for samples, _ in setting.blocks) < SAMPLES_WORTH_A_CHILD:
+        if cannot_help or sum(len(block[0]) for block in setting.blocks) < SAMPLES_WORTH_A_CHILD:
             count = 1
         self._parts = [replace(setting, blocks=setting.blocks[first::count]) for first in range(count)]
         self._own = LitBlocks((self._parts[0], occluders, library), tracer)

@@ -15,8 +15,8 @@ from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, render, shade_scene
 from ltsh_addon.pipeline.lighting import KeptPicture
-from ltsh_addon.pipeline.relight import LightChange, light_pictures, relight
-from ltsh_addon.scene import PASSES
+from ltsh_addon.pipeline.relight import LightChange, MovedLights, light_pictures, relight
+from ltsh_addon.scene import PASSES, AreaLight
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -214,6 +214,11 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     mixed = light_pictures(KeptPicture.load(out / "render.samples.npz"))
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
+    # Its light alone, where it was: rays of its own, as many as of all lights together.
+    lights = MovedLights.load(out / "render.samples.npz")
+    alone = lights.picture(AreaLight(**mixed.rows[0].light))
+    lights.close()
+    assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 
 
 def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):

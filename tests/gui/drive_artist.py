@@ -98,12 +98,10 @@ def moved(rig, **axes):
 
 
 def field(rig, place, text, kind="VIEW_3D", which="UI"):
-    """Double-click a field and type."""
+    """Edit a field by Return, as a double click does, which a busy machine may take for two, and type."""
     rig.xdo("mousemove", *hands.to_window(rig, kind, which, *place))
     yield hands.CLICK_SECONDS
-    rig.xdo("click", "--repeat", 2, "--delay", 80, 1)
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "ctrl+a")
+    yield from hands.keys(rig, "Return", "ctrl+a")
     rig.xdo("type", text)
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Return")
@@ -115,9 +113,7 @@ def color(rig, place, code, kind="VIEW_3D", which="UI"):
     yield from hands.click(rig, x, y)
     rig.xdo("mousemove", x + HEX[0], y + HEX[1])
     yield hands.CLICK_SECONDS
-    rig.xdo("click", "--repeat", 2, "--delay", 80, 1)
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "ctrl+a")
+    yield from hands.keys(rig, "Return", "ctrl+a")
     rig.xdo("type", code)
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Return", "Return")

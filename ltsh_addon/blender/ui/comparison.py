@@ -538,13 +538,15 @@ def _mix_again(*_):
 
 
 @bpy.app.handlers.persistent
-def _forget_renders(*_):
-    """Before loading."""
+def _forget_file(*_):
+    """Before loading: the next file may have scenes of the same names."""
     results.forget_renders()
+    _state["settling"].clear()
+    _state.update(dragged=None, probing=False)
 
 
 HANDLERS = (
-    ("load_pre", _forget_renders),
+    ("load_pre", _forget_file),
     ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),
     ("undo_post", _mix_again), ("redo_post", _mix_again),
 )  # fmt: skip

@@ -135,6 +135,16 @@ def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path
     np.testing.assert_array_equal(seen(), before)
 
 
+def test_another_file_gets_nothing_of_what_was_shown_before(addon, tmp_path, show_results):
+    """Its scene has the same name, and the picture had changed just before."""
+    parts.save(tmp_path / "room.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"), copy=True)
+    show_results(addon, tmp_path)
+    addon.ltsh.split = 0.25
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "other.blend"))
+    assert not [image.name for image in bpy.data.images if comparison.is_viewer(image)]
+
+
 def test_new_results_replace_the_old_pictures(scene, tmp_path, show_results):
     pictures = show_results(scene, tmp_path, seed=2)
     scene.ltsh.mode = "A"

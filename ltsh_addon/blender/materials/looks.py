@@ -92,6 +92,7 @@ class Look:
     brush: Brush | None = None  # None: isotropic
     sheen: tuple[float, float] | None = None  # over it and its coat: the largest weight of a color, and its roughness
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    glow: float = 0.0  # of what shines with the image of its color, and has no lobe: by so much
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
@@ -272,6 +273,9 @@ class _Reader:
 
     def look(self) -> Look:
         """The heaviest lobe with the others behind it."""
+        glow = self._glow()
+        if glow is not None:
+            return glow
         emission = np.zeros(3)
         for source, share in self.emitters:
             emission = emission + self._shining(share, self._emission(source))
@@ -285,6 +289,20 @@ class _Reader:
             self.note(f"of its {len(lobes)} lobes only {MOST_LOBES} are shown")
         first, *further = lobes[:MOST_LOBES]
         return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
+
+    def _glow(self) -> Look | None:
+        """What shows an image by its emission alone, as baked textures do; None where it is something else."""
+        if self.leaves or len(self.emitters) != 1:
+            return None
+        source, share = self.emitters[0]
+        color, strength = (value_at(socket, source.groups) for socket in emission_sockets(source.node))
+        if color is None or color.image is None or strength is None or not strength.is_constant:
+            return None
+        if share.image is not None or share.curve is not None:
+            return None
+        self.note("its emission varies: it is seen, and lights nothing")
+        glow = share.shining * float(strength.offset[0])
+        return Look("diffuse", {"color": color}, weight=0.0, glow=glow, notes=tuple(dict.fromkeys(self.notes)))
 
     def _shining(self, share: Share, emission: np.ndarray) -> np.ndarray:
         if emission.any() and (share.image is not None or share.curve is not None):

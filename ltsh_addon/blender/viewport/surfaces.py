@@ -133,7 +133,7 @@ class SurfacePass:
 
     def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
         """Add what the surfaces drawn last emit to `frame_buffer`."""
-        shining = [instance for instance in instances if any(np.any(look.look.emission) for look in instance.looks)]
+        shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
@@ -231,21 +231,24 @@ class SurfacePass:
             for slot, look in looks:
                 for lobe in look.lobes[number : number + 1]:
                     shader.uniform_block("look", lobe.uniforms)
-                    if not is_emission:
-                        self._bind_images(shader, lobe)
+                    self._bind_images(shader, lobe, ("color",) if is_emission else IMAGE_SLOTS)
                     instance.mesh.batch(slot, lobe.look.uv_map).draw(shader)
 
     def _draws(self, look: ShownLook) -> bool:
         return look.is_glass == self._is_glass
 
-    def _bind_images(self, shader, shown: ShownLook) -> None:
+    def _bind_images(self, shader, shown: ShownLook, slots: tuple[str, ...]) -> None:
         if shown.textures is None:
             shown.textures = {
                 name: self._missing if is_missing(use.image) else gpu.texture.from_image(use.image)
                 for name, use in shown.look.images.items()
             }
-        for name in IMAGE_SLOTS:
+        for name in slots:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
+
+
+def _shines(shown: ShownLook) -> bool:
+    return bool(np.any(shown.look.emission)) or shown.look.glow > 0.0
 
 
 def has_normals(instances: list[ShownInstance]) -> bool:
@@ -288,9 +291,9 @@ def _shader(outputs, is_further: bool = False):
         info.push_constant("VEC4", "placement")
     info.define("UNIT_NORMALS", "true" if NORMAL_MAPS_BEND_UNIT_NORMALS else "false")
     info.define("ONLY_USER", "false" if outputs == EMISSION else "(placement.w > 0.0)")
-    samplers = []
+    samplers = ["color_image"]
     if outputs != EMISSION:
-        samplers += [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table", "sheen_table"]
+        samplers = [*(f"{name}_image" for name in IMAGE_SLOTS), "albedo_table", "blend_table", "sheen_table"]
     if is_further or outputs in _ADDED:
         samplers.append("positions")
     for slot, name in enumerate(samplers):
@@ -306,6 +309,6 @@ def _shader(outputs, is_further: bool = False):
     for slot, name in enumerate(outputs):
         info.fragment_out(slot, "VEC4", f"out_{name}")
     info.vertex_source(glsl("surface_vertex"))
-    functions = "" if outputs == EMISSION else glsl("images") + glsl("reflectance") + glsl("normals")
+    functions = glsl("images") + ("" if outputs == EMISSION else glsl("reflectance") + glsl("normals"))
     info.fragment_source(filled(glsl("surface"), {"FUNCTIONS": functions}))
     return gpu.shader.create_from_info(info)

@@ -402,6 +402,7 @@ def look_values(look: Look) -> np.ndarray:
     if look.view_factor is not None:
         factor = look.view_factor
         data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
+    data[LAYERS + 2, 3] = look.glow
     if look.sheen is not None:
         data[LAYERS + 3, :2] = look.sheen
     if look.brush is not None:

@@ -372,6 +372,44 @@ def test_missing_images_are_pink_and_named():
     assert notes == ["Lost: image 'lost.png' is missing, it is pink"]
 
 
+@edits_with_graphics
+def test_an_image_that_shines_is_seen_and_lights_nothing():
+    """As a baked texture does; seen from above, by an orthographic camera."""
+    parts.empty_scene(*SIZE)
+    colors = np.array([[[0.2, 0.4, 0.6, 1.0], [0.8, 0.1, 0.0, 1.0]], [[0.0, 0.5, 0.1, 1.0], [0.3, 0.3, 0.9, 1.0]]])
+    texture = bpy.data.images.new("baked", 2, 2, float_buffer=True, is_data=True)
+    texture.pixels.foreach_set(colors.astype(np.float32).ravel())
+    material = made("Baked", "Emission", {"Color": ("TexImage", {"interpolation": "Closest"}), "Strength": 2.0})()
+    (found,) = [one for one in material.node_tree.nodes if one.bl_idname == "ShaderNodeTexImage"]
+    found.image = texture
+    parts.add_plane(material, size=2.0)
+    camera = parts.add_top_camera(4.0)
+    bpy.context.view_layer.update()
+
+    def draw():
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
+        try:
+            mirror.sync(depsgraph)
+            projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
+            shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+            view = View.of(camera.matrix_world.inverted(), projection, True)
+            for _ in range(2):
+                renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
+            return canvas.read()[..., :3], mirror.lights, mirror.notes
+        finally:
+            renderer.free()
+
+    picture, lights, notes = with_graphics(draw)
+    height, width = picture.shape[:2]
+    for row, column in np.ndindex(2, 2):
+        x, y = column - 0.5, row - 0.5
+        seen = picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
+        # Pictures of views are half floats.
+        np.testing.assert_allclose(seen, 2.0 * colors[row, column, :3], rtol=2.0**-11, atol=1e-6)
+    assert not lights and list(notes) == ["Baked: its emission varies: it is seen, and lights nothing"]
+
+
 def test_nothing_of_the_file_is_changed():
     parts.empty_scene()
     materials = [make() for make in MATERIALS]

@@ -11,16 +11,18 @@ bool is_seen()
 }
 #endif
 
+@FUNCTIONS@
 #ifdef DRAWS_EMISSION
 void main()
 {
   if (!is_seen()) {
     discard;
   }
-  out_emission = vec4(look.data[1].xyz, 0.0);
+  float glow = look.data[LAYERS + 2].w;
+  vec3 shown = glow > 0.0 ? glow * max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0)) : vec3(0.0);
+  out_emission = vec4(look.data[1].xyz + shown, 0.0);
 }
 #else
-@FUNCTIONS@
 void main()
 {
   bool backfacing = gl_FrontFacing == (placement.y < 0.0);

@@ -31,6 +31,7 @@ SOLID_SECONDS = 3.0
 
 
 def main(rig):
+    hands.patient(rig)
     yield from new_scene(rig)
     yield from previewed(rig)
     yield from lights_added(rig)

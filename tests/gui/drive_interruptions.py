@@ -13,6 +13,7 @@ ENDING_SECONDS = 20.0
 
 
 def main(rig):
+    hands.patient(rig)
     other = str(Path(bpy.data.filepath).with_name("other.blend"))
     bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
     yield from hands.open_panel(rig)

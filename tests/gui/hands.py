@@ -1,6 +1,7 @@
 """What the drivers share: where things are in the window, clicking them by the mouse, waiting for a job."""
 
 import importlib
+import subprocess
 import time
 
 import bpy
@@ -19,6 +20,11 @@ def module(name):
 def job():
     """The job that runs, or None."""
     return module("ui.operators").running_job()
+
+
+def patient(rig):
+    """Let `rig.xdo` wait until the display has it: a busy machine takes its time to start programs."""
+    rig.xdo = lambda *words: subprocess.run(["xdotool", *map(str, words)], check=False, timeout=60)
 
 
 def settings():

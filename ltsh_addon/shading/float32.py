@@ -16,12 +16,20 @@ import numpy as np
 
 from . import float64, light_cone, moments32, small_lights
 from .facing import FacingDisk, Lobe, mean_emission
-from .light_polygons import MOSTLY_WHOLE, integrate_visible, light_levels, local_corners, may_reach, off_plane
+from .light_polygons import (
+    MOSTLY_WHOLE,
+    integrate_visible,
+    interpolated,
+    light_levels,
+    local_corners,
+    may_reach,
+    off_plane,
+)
 from .light_tree import FEWEST, LightTree, add_far_lights
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from .lookup_table import MIN_ALPHA
-from .patch_tree import SkyMap, interpolated
 from .polygon import convex_pieces, dot
+from .sky_map import SkyMap
 from .tails import SeenLight, TailLimits
 
 # With more different indices of refraction in a block the dielectric's weights are summed up per sample.

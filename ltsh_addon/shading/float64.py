@@ -22,10 +22,9 @@ from .brdf import (
 )
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
-from .light_polygons import has_lobe, light_view, local_frames, seen_parts, to_local
+from .light_polygons import PatchTree, has_lobe, light_view, local_frames, seen_parts, to_local
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import MIN_ALPHA, Lobe, LookupTable
-from .patch_tree import PatchTree
 from .polygon import dot
 from .reference import anisotropic_integrals, reference_integrals
 from .spherical_harmonics import coefficient_index

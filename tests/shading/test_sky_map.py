@@ -30,7 +30,7 @@ def pictures(count=32, seed=1):
 
 @pytest.mark.parametrize(("technique", "dtype"), [("ltsh4", np.float32), ("ltc", np.float64)])
 def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
-    """In single precision by a map, in double by patches; 0.5 % are what `patch_tree.PATCH_PRODUCT` allows."""
+    """In single precision by a map, in double by patches; 0.5 % are what `light_polygons.SKY_PRODUCT` allows."""
     samples = random_samples(150, seed=2, lowest_roughness=0.25)
     lights, error = sky_lights(LIKE, pictures())
     assert len(lights) == 6 and error < 0.03

@@ -474,14 +474,14 @@ class PatchTree:
 def fitting_patches(light: AreaLight, samples: SurfaceSamples, specular: bool) -> Iterator[tuple]:
     """Yield (index (Q,), lights): the coarsest patches of a near `light` that the lobes of the samples `index` cannot
     resolve. Each sample gets all of the light."""
+    if len(samples) == 0:
+        return
     tree = PatchTree.of(light)
     pairs = tree.pairs(samples, (), np.arange(len(samples)), specular)
     index, patch = (np.concatenate(values) for values in zip(*pairs, strict=True))
-    # The smallest patches of one patch go together: the same samples take them.
-    owner = np.repeat(np.arange(len(tree.count)), tree.count)
-    key = np.where(
-        (tree.count == 0) & (np.arange(len(tree.count)) > 0), -1 - np.append(0, owner), np.arange(len(tree.count))
-    )
+    # The smallest parts of a patch go together: the same samples take them.
+    key, owner = np.arange(len(tree.count)), np.repeat(np.arange(len(tree.count)), tree.count)
+    key[1:] = np.where(tree.count[1:] == 0, -1 - owner, key[1:])
     order = np.argsort(key[patch], kind="stable")
     for own in np.split(order, np.flatnonzero(np.diff(key[patch[order]])) + 1):
         members = np.unique(patch[own])

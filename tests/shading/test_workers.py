@@ -97,8 +97,8 @@ def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started
     lights = [area_light(center=center, **narrow) for center in centers]
     lights[1] = replace(lights[1], receivers=(1,), group="Key")
     lights[2] = replace(lights[2], shape="DISK")
-    # Sheared, for of a rectangle with a spread single precision takes points.
-    lights[3] = replace(lights[3], half_u=np.array([0.5, 1e-6, 0.0]), spread=1.0)
+    # A polygon, for of a rectangle with a falloff single precision takes points.
+    lights[3] = replace(lights[3], shape="POLYGON", corners=lights[3].polygon(), falloff=1)
     asked = []
     original = integrator.Task.shade_pairs
 

@@ -60,6 +60,11 @@ def _parser():
     bounding.add_argument(
         "--grazing", action="store_true", help="beside the shipped tables at n.v 0.04 to 0.2, per roughness and n.v"
     )
+    bounding.add_argument(
+        "--all",
+        action="store_true",
+        help="those of the picture, 6 points per axis, into tables/optimum.json: 6 minutes",
+    )
     bounding.set_defaults(run=_optimum)
     plotting = actions.add_parser("plot", help="draw the figures of tables/README.md")
     plotting.add_argument("-o", dest="output", type=Path, default=FOLDER.parent / "docs", metavar="OUT")
@@ -179,8 +184,24 @@ def _validate(options) -> int:
         basis = validate.fresnel_basis_error(table, max(options.count // 4, 2))
         results[name]["layouts"] = validate.layout_errors(table, options.count)
         results[name]["fresnel_basis"] = {str(ior): error for ior, error in basis.items()}
-    print(json.dumps(results, indent=2) if options.json else _as_text(results))
+    # No table knows of them: all techniques that have one shade them alike.
+    brushed = {} if options.names else validate.validate_anisotropic(max(options.count // 9, 2))
+    if options.json:
+        print(json.dumps({**results, "anisotropic": brushed} if brushed else results, indent=2))
+    else:
+        print(_as_text(results))
+        print(_anisotropic_text(brushed) if brushed else "", end="")
     return 0
+
+
+def _anisotropic_text(brushed):
+    lines = ["", "| node | anisotropy | techniques | largest | `reference` | largest |", "|---" * 6 + "|"]
+    for kind, rows in brushed.items():
+        for anisotropy, found in rows.items():
+            keys = ("technique", "technique_maximum", "reference", "reference_maximum")
+            cells = " | ".join(f"{100.0 * found[key]:.2f} %" for key in keys)
+            lines.append(f"| {kind} | {anisotropy} | {cells} |")
+    return "\n".join([*lines, ""])
 
 
 def _as_text(results):
@@ -210,10 +231,15 @@ def _as_text(results):
 def _optimum(options) -> int:
     if options.grazing:
         return _grazing(options)
+    if options.all:
+        options.names, options.count = optimum.all_families(), optimum.COUNT_OF_ALL
     print("| family | coefficients | moments | mean | median | 90 % | max | shipped table: mean | median |")
     print("|---" * 9 + "|")
     for name in options.names or SHIPPED_TABLES:
-        found = optimum.optimum(name, options.count).errors
+        best = optimum.optimum(name, options.count)
+        if options.all:
+            optimum.keep_optimum(best)
+        found = best.errors
         cells = [found.mean(), np.median(found), np.quantile(found, 0.9), found.max()]
         if name in SHIPPED_TABLES:
             errors = validate.error_map(load_table(name), options.count)

@@ -11,10 +11,13 @@ nothing of lights and the fit of the tables does, so ratios below 1 are possible
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from ltsh_addon.files import write_bytes
 from ltsh_addon.shading import brdf, evaluate_lobe
 from ltsh_addon.shading.edge_integrals import ridge_matrix
 from ltsh_addon.shading.lookup_table import LookupTable
@@ -25,6 +28,8 @@ from .validate import disks, grid, hemisphere_samples
 from .walk import bounds, minimize, warp_of
 
 COUNT = 12
+# What `tables optimum --all` found for every family of CURVES at COUNT_OF_ALL x COUNT_OF_ALL points: {family: errors}.
+ALL, COUNT_OF_ALL = Path(__file__).with_name("optimum.json"), 6
 # Start of a search: beta as a share of -theta_o, and the logarithms of a cos^2(beta) / (2 alpha) and c / (2 alpha).
 STARTS = ((1.0, 0.0), (0.8, -0.3), (0.5, -0.6), (0.2, -1.0))
 # Of the warp of a second lobe, beside the best one of the first lobe alone.
@@ -63,6 +68,25 @@ def optimum(name: str, count: int = COUNT) -> Optimum:
     cosine, roughness = np.array(grid(count)).T
     errors, _ = best_lobes(family_named(name), cosine, roughness, (count, count))
     return Optimum(name, errors, edge_terms(name))
+
+
+def all_families() -> list[str]:
+    """Those of CURVES."""
+    return list(dict.fromkeys(name for names in CURVES.values() for name in names))
+
+
+def known_optima() -> dict[str, Optimum]:
+    """Those that stand in ALL, by family."""
+    found = json.loads(ALL.read_text(encoding="utf-8"))
+    return {name: Optimum(name, np.array(errors), edge_terms(name)) for name, errors in found.items()}
+
+
+def keep_optimum(found: Optimum) -> None:
+    """Write one found at COUNT_OF_ALL into ALL."""
+    kept = json.loads(ALL.read_text(encoding="utf-8")) if ALL.exists() else {}
+    kept[found.name] = [float(f"{error:.4g}") for error in found.errors]
+    lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(kept[name])}" for name in sorted(kept))
+    write_bytes(ALL, f"{{\n{lines}\n}}\n".encode())
 
 
 def best_lobes(family, cosine, roughness, shape, starts=()):

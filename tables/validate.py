@@ -12,7 +12,8 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ltsh_addon.shading import brdf, evaluate_lobe, header
+from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.shading import brdf, evaluate_lobe, header, shade
 from ltsh_addon.shading.lookup_table import LookupTable
 
 from .families import gauss_legendre
@@ -148,13 +149,19 @@ def _basis_at(table, mu, roughness, directions):
 
 def disks(directions):
     """(D, S) share of a pair of mirror-symmetric disk-shaped lights that covers each direction, spread evenly."""
+    centers, radii = _centers_of_disks()
+    reach = np.cos(radii)[:, None]
+    mirrored = directions * np.array([1.0, -1.0, 1.0])
+    return 0.5 * (centers @ directions.T > reach) + 0.5 * (centers @ mirrored.T > reach)
+
+
+def _centers_of_disks():
+    """Directions (D, 3) and radii (D,) in radians."""
     k = np.arange(LIGHTS) + 0.5
     z, azimuth = 1.0 - k / LIGHTS, np.pi * (1.0 + np.sqrt(5.0)) * k
     radius = np.sqrt(1.0 - z * z)
     centers = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], axis=-1)
-    reach = np.cos(np.radians(np.resize(LIGHT_RADII, LIGHTS)))[:, None]
-    mirrored = directions * np.array([1.0, -1.0, 1.0])
-    return 0.5 * (centers @ directions.T > reach) + 0.5 * (centers @ mirrored.T > reach)
+    return centers, np.radians(np.resize(LIGHT_RADII, LIGHTS))
 
 
 @dataclass(frozen=True)
@@ -266,3 +273,92 @@ def _horizon_density(directions):
     # azimuth = pi/2 (1 - cos(pi s)), s uniform; half of the density for either sign of y
     crowding = np.maximum(2.0 / np.pi * np.sqrt(np.maximum(azimuth * (np.pi - azimuth), 0.0)), 1e-9)
     return 0.5 / (2.0 * np.sqrt(z)) / (0.5 * np.pi**2 * crowding)
+
+
+# Settings of the nodes, and how many azimuths of the view from the tangent each point of a sweep has.
+ANISOTROPIES, AZIMUTHS = (0.2, 0.5, 0.75, 0.95), 4
+# Points of the quadrature beside which they are set: rings of visible normals, and points of each.
+RINGS = (160, 320)
+
+
+def validate_anisotropic(count: int = 3, anisotropies=ANISOTROPIES) -> dict[str, dict[float, dict[str, float]]]:
+    """Errors of integrals of anisotropic lobes over disks, by kind of node and anisotropy: root mean square over all
+    points of `grid` (count x count) and AZIMUTHS, relative to their root mean square, and the largest of a point.
+
+    *technique*: of shading with a table (the same with every one), *reference*: of the technique `reference`, both
+    against a quadrature of the textbook's formulas over visible normals. Roughness is that of the node; both alphas are
+    as Cycles has them.
+    """
+    found = {}
+    for kind in ("principled", "glossy"):
+        for anisotropy in anisotropies:
+            samples, alphas = _brushed(kind, anisotropy, count)
+            points = zip(samples.view, samples.tangent, alphas, strict=True)
+            exact = np.stack([_integrals_over_disks(*point) for point in points])
+            figures = {}
+            for name, technique in (("technique", "ltsh4"), ("reference", "reference")):
+                shaded = shade(samples, _disk_lights(), technique, passes=("specular",), workers=1)
+                errors = np.linalg.norm(shaded.specular[:, :, 0].T - exact, axis=1)
+                figures[name] = float(np.linalg.norm(errors) / np.linalg.norm(exact))
+                figures[f"{name}_maximum"] = float((errors / np.linalg.norm(exact, axis=1)).max())
+            found.setdefault(kind, {})[anisotropy] = figures
+    return found
+
+
+def _brushed(kind, anisotropy, count):
+    """Samples (P) of lobes with F = 1, and both alphas (P, 2)."""
+    mu, roughness = np.repeat(np.array(grid(count)), AZIMUTHS, axis=0).T
+    number = np.arange(len(mu))
+    azimuth = 0.5 * np.pi * (number % AZIMUTHS + (0.618034 * (number // AZIMUTHS)) % 1.0)
+    aspect = 1.0 / (1.0 - anisotropy) if kind == "glossy" else np.sqrt(1.0 - 0.9 * anisotropy)
+    alphas = np.minimum(roughness[:, None] ** 2 * np.array([1.0 / aspect, aspect]), 1.0)
+    zero, one = np.zeros(len(mu)), np.ones((len(mu), 3))
+    up = np.stack([zero, zero, zero + 1.0], axis=1)
+    return SurfaceSamples(
+        position=np.zeros((len(mu), 3)),
+        view=np.stack([np.sqrt(1.0 - mu * mu), zero, mu], axis=1),
+        normal=up,
+        diffuse_normal=up,
+        roughness=np.sqrt(np.sqrt(alphas[:, 0] * alphas[:, 1])),
+        specular_f0=one,
+        specular_f90=one,
+        dielectric=zero,
+        ior=zero + 1.5,
+        diffuse_albedo=0.0 * one,
+        anisotropy=1.0 - np.sqrt(alphas[:, 1] / alphas[:, 0]),
+        tangent=np.stack([np.cos(azimuth), np.sin(azimuth), zero], axis=1),
+    ), alphas
+
+
+def _disk_lights():
+    for number, (center, radius) in enumerate(zip(*_centers_of_disks(), strict=True)):
+        across = np.cross(center, [1.0, 0.0, 0.0])
+        across *= np.tan(radius) / np.linalg.norm(across)
+        own = {"group": str(number)}
+        yield AreaLight(str(number), "DISK", center, across, np.cross(center, across), -center, np.ones(3), **own)
+
+
+def _integrals_over_disks(view, tangent, alphas):
+    """Integrals (D,) of one anisotropic lobe: visible normals of GGX (Dupuy and Benyoub 2023), of which each stands for
+    as much, times what of them is masked."""
+    frame = np.stack([tangent, np.cross([0.0, 0.0, 1.0], tangent), [0.0, 0.0, 1.0]])
+    own, stretch = frame @ view, np.array([*alphas, 1.0])
+    axis = own * stretch / np.linalg.norm(own * stretch)
+    z, turn = np.meshgrid((np.arange(RINGS[0]) + 0.5) / RINGS[0], (np.arange(RINGS[1]) + 0.5) / RINGS[1], indexing="ij")
+    z, turn = (
+        (1.0 - z.ravel()) * (1.0 + axis[2]) - axis[2],
+        2.0 * np.pi * (turn + 0.618034 * np.arange(RINGS[0])[:, None]),
+    )
+    radius = np.sqrt(np.maximum(1.0 - z * z, 0.0))
+    cap = np.stack([radius * np.cos(turn.ravel()), radius * np.sin(turn.ravel()), z], axis=1)
+    half = (cap + axis) * stretch
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    light = 2.0 * (half @ own)[:, None] * half - own
+    light = light[light[:, 2] > 0.0]
+    lambda_i, lambda_o = (
+        0.5 * (np.sqrt(1.0 + ((vector[..., :2] * alphas) ** 2).sum(axis=-1) / vector[..., 2] ** 2) - 1.0)
+        for vector in (light, own)
+    )
+    weight = (1.0 + lambda_o) / (1.0 + lambda_i + lambda_o) / len(z)
+    centers, radii = _centers_of_disks()
+    return (centers @ frame.T @ light.T > np.cos(radii)[:, None]) @ weight

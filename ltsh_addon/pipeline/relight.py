@@ -474,6 +474,10 @@ class Mixer:
 # -- lights that have moved -------------------------------------------------------------------------------------------
 
 
+# So many, that all processes take about as long; with fewer samples a block costs more than they do.
+BLOCKS, FEWEST_OF_BLOCK = 16, 1 << 11
+
+
 class MovedLights:
     """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
 
@@ -552,9 +556,10 @@ class MovedLights:
         self._starting, self._order = starting, np.argsort(place, kind="stable")
         # Which samples are neighbors is all that rays ask of their film.
         film, blocks = film.unspread(), []
-        for first in range(0, max(len(starting), 1), BLOCK_SAMPLES):
-            begin, end = np.searchsorted(place[self._order], (first, first + BLOCK_SAMPLES))
-            own, part = self._order[begin:end], slice(first, first + BLOCK_SAMPLES)
+        size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))
+        for first in range(0, max(len(starting), 1), size):
+            begin, end = np.searchsorted(place[self._order], (first, first + size))
+            own, part = self._order[begin:end], slice(first, first + size)
             blocks.append((samples.take(own), starting.take(part), film.take(part), place[own] - first))
         (table,) = picture.load_tables((technique_of(kept),)).values()
         with ExitStack() as stack:

@@ -40,8 +40,8 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 OF_GROUP = "Combined_"
 REST = "rest"
 # Points of a pixel where nothing is said, at most those of a budget, and processor seconds that denoising and writing
-# take for a million pixels.
-SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS = 9, 17, 12.0
+# take for a million pixels, and that a light group takes beside.
+SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, GROUP_SECONDS = 9, 17, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
 MOST_OVER = 1.1  # of a budget, before a warning
@@ -121,7 +121,8 @@ def finish(
         shaded(comparison)
         spent = clock.seconds()
         film = comparison.film
-        reserve = LAST_SECONDS * film.width * film.height / 1e6
+        groups = {light.group for light in comparison.extraction.lights if light.group}
+        reserve = (LAST_SECONDS + GROUP_SECONDS * len(groups)) * film.width * film.height / 1e6
         seconds = None if options.budget is None else max(options.budget - spent - reserve, 0.0)
         width, height = options.resolution or (None, None)
         job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)

@@ -134,7 +134,7 @@ class _Tracing(parallel.Child):
 # -- processes that stay ----------------------------------------------------------------------------------------------
 
 # With fewer samples a process takes longer to start than to help.
-SAMPLES_WORTH_A_CHILD = 1 << 16
+SAMPLES_WORTH_A_CHILD = 1 << 13
 
 
 @dataclass(frozen=True)

@@ -185,7 +185,7 @@ def _normals(light, offset, directions):
     across = directions - along * axis
     sine = np.sqrt(dot(across, across))
     # By the law of sines: seen from the center, the place is so far from the point.
-    ratio = np.clip(sine * distance / light.radius, 0.0, 1.0)
+    ratio = np.clip(sine * distance / np.maximum(light.radius, LEAST_SIZE * distance), 0.0, 1.0)
     root = np.sqrt(1.0 - ratio * ratio) * np.where(distance > light.radius, 1.0, -1.0)
     cosine, beside = root * along + ratio * sine, ratio * along - root * sine
     return across * (beside / np.maximum(sine, 1e-20)) - cosine * axis

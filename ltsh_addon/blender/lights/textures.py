@@ -42,7 +42,9 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
         source = unseen[position]
         own = seen.setdefault(source.data.name_full, [])
         if not own or (source.varies and len(own) < MOST_LOOKS):
-            own.append(point_factor(light, source, studio) if source.is_point else _factor(light, source, studio))
+            own.append(
+                point_factor(light.is_distant, source, studio) if source.is_point else _factor(light, source, studio)
+            )
             factor, covered = own[-1]
         else:
             factor, covered = own[0]
@@ -97,12 +99,12 @@ PATTERN_ROWS, VIEW_PIXELS = 64, 192
 PATTERN_COLORS = 0.05
 
 
-def point_factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
+def point_factor(is_distant: bool, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
     """What the node tree multiplies the radiance of a point, spot or sun by: (1, 1, 3), or where it varies (H, W, 3) by
     direction in the frame of the light, as of a `Pattern`; all are covered."""
     data = source.data.copy()
     try:
-        if light.is_distant or not source.varies:
+        if is_distant or not source.varies:
             data = _white(data, "AREA", {"shape": "SQUARE", "size": 1.0, "spread": np.pi})
             with _in_the_middle(data, studio):
                 image = studio.look(np.zeros(3), 0.5 * _AXES[0], 0.5 * _AXES[1], -_AXES[2], 8)[0]

@@ -140,6 +140,7 @@ class LightingPass:
         self._shares = shares([_loops(light) for light in uploaded.lights])
         self._has_focused = any(light.is_profiled for light in uploaded.lights)
         self._has_facing = any(light.is_facing for light in uploaded.lights)
+        self._has_patterns = any(light.pattern is not None for light in uploaded.lights)
 
     def draw(
         self,
@@ -174,6 +175,7 @@ class LightingPass:
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
             shadowed=gbuffer.shares is not None,
             facing=self._has_facing,
+            patterned=self._has_patterns,
             sky=self._sky is not None,
             sheen=passes != "specular" and gbuffer.has_sheen,
         )

@@ -26,11 +26,11 @@ from ..evaluated import (
     owner_of,
     visibility,
 )
-from ..lights.area import area_light, note_unsupported, reason_to_leave_out
-from ..lights.emission import emission_of, factors_of
+from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
+from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import ShownTextures
+from ..lights.textures import MOST_LOOKS, ShownTextures, point_factor, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
@@ -45,10 +45,12 @@ FAR_AWAY = np.full(3, 1e6)
 MOST_LIGHTS = 2048
 
 
-def view_lights(depsgraph, in_view: Callable, textures: ShownTextures) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
+def view_lights(
+    depsgraph, in_view: Callable, textures: ShownTextures, patterns: dict[str, np.ndarray] | None = None
+) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` says yes to, and what is not shown as Cycles has it.
 
-    `textures` are those of the last time.
+    `textures` are those of the last time, `patterns` what `patterns_of` found.
     """
     notes: list[str] = []
     receivers = Receivers([ob.original for ob in depsgraph.objects])
@@ -66,7 +68,11 @@ def view_lights(depsgraph, in_view: Callable, textures: ShownTextures) -> tuple[
             notes.append(f"{ob.original.name}: {problem}")
             continue
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-        shown = [light for light in _with_nodes(plain, ob.data, textures, notes) if np.any(light.radiance != 0.0)]
+        shown = [
+            light
+            for light in _with_nodes(plain, (ob, matrix), (textures, patterns or {}), notes)
+            if np.any(light.radiance != 0.0)
+        ]
         if shown:
             lights.extend(shown)
             note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
@@ -105,8 +111,25 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
     return constant_mesh_lights(found, _emission, eye, notes.append)
 
 
-def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str]) -> list[AreaLight]:
-    """`light` with what constants and images in its node tree make of it."""
+def patterns_of(scene, depsgraph) -> dict[str, np.ndarray]:
+    """What Cycles makes of the node trees of point, spot and sun lights, as of `point_factor`, by the name of their
+    data; afterwards `scene` is as it was."""
+    wanted, silent = {}, SimpleNamespace(warn=lambda text: None)
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if ob.type == "LIGHT" and ob.data.type != "AREA" and len(wanted) < MOST_LOOKS:
+            source = unseen_light(ob, np.array(instance.matrix_world, dtype=np.float64), silent)
+            if source is not None:
+                wanted[source.data.name_full] = source
+    if not wanted:
+        return {}
+    with open_studio(scene) as studio:
+        return {name: point_factor(source.data.type == "SUN", source, studio)[0] for name, source in wanted.items()}
+
+
+def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) -> list[AreaLight]:
+    """`light` with what its node tree makes of it: constants, images and, of an object and matrix, patterns."""
+    (ob, matrix), (textures, patterns), data = of, looked, of[0].data
     emission = None if tree_in_use(data) is None else emission_of(data)
     if emission is None or emission.plain:
         return [light]
@@ -125,6 +148,11 @@ def _with_nodes(light: AreaLight, data, textures: ShownTextures, notes: list[str
         patches = textures.split(light, factor, notes) if factor is not None and is_area else None
         if patches is not None:
             return patches
+    if data.original.name_full in patterns:
+        unseen = unseen_light(ob, matrix, SimpleNamespace(warn=notes.append))
+        if not light.is_distant:
+            light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
+        return with_pattern(light, patterns[data.original.name_full], unseen, notes.append)
     notes.append(f"{light.name}: its nodes are not resolved, it shines as without them")
     return [replace(light, falloff=0, smooth=0.0)]
 
@@ -242,8 +270,10 @@ def object_notes(depsgraph) -> list[str]:
 class SceneMirror:
     """Meshes, looks, instances and lights of one view of a scene."""
 
-    def __init__(self, look: Callable = lambda world: None):
-        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known."""
+    def __init__(self, look: Callable = lambda world: None, patterns: dict[str, np.ndarray] | None = None):
+        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known.
+        `patterns` are as of `patterns_of`."""
+        self._patterns = patterns
         self.instances: list[ShownInstance] = []
         self.lights: tuple[AreaLight, ...] = ()  # those that are small and bright in the world included
         self.sky = ShownSky()
@@ -292,7 +322,7 @@ class SceneMirror:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
         if changes.lights or changes.everything or changes.materials or changes.images:
-            self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures)
+            self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
             self.lights = (*self.own_lights, *self.sky.lights)
         if changes.world or changes.everything or changes.images:
             self._read_world(depsgraph.view_layer.world_override or depsgraph.scene.world)

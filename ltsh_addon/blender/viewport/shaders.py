@@ -87,6 +87,7 @@ class Features:
     turned: bool = False  # a diffuse normal of its own
     shadowed: bool = False  # a share of each light that is seen
     facing: bool = False  # lights that face every point
+    patterned: bool = False  # some of them with a pattern
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
     brushing: bool = False  # there are anisotropic lobes
@@ -188,6 +189,8 @@ def _lighting_constants(table) -> dict:
         "MIN_ALPHA": float_literal(MIN_ALPHA),
         "CHANGING": float_literal(facing.CHANGING),
         "NODES_ALONG": NODES_ALONG,
+        # Those of the nodes are 9 (NODES_ALONG + 1) together.
+        "PEAK_WEIGHT": float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
         "FEW_NODES": textures.NODES_FIRST[plain.layers],
@@ -364,8 +367,8 @@ def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str =
     Expects, in GLSL, `name`_lobe with normals plane_0 .. of the horizons, `name`_sum, `name`_empty(),
     `name`_with_edge(sum, start, end), `name`_with_spot(sum, direction, solid angle), `name`_warped(lobe, v) and
     `name`_heights(lobe, v, warped v, rest), whose unused components are `rest`. `seam` is the direction in which the
-    first two horizons meet, if that is known; `sizes` are statements that put the sizes of a `name`_view in units of the
-    lobe's width.
+    first two horizons meet, if that is known; `sizes` are statements that put the sizes of a `name`_view in units of
+    the lobe's width.
     """
     values = {
         "name": name,

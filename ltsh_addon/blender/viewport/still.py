@@ -21,7 +21,7 @@ from ..lights.world import background_pictures, blocks_nothing, light_of_world, 
 from ..materials.looks import world_radiance
 from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
-from .mirror import SceneMirror
+from .mirror import SceneMirror, patterns_of
 from .renderer import CENTERS, ShownPicture, ViewRenderer
 from .shadows import ShadowRays, too_many
 from .sky import ShownSky, background_of, coarse, varied_sky
@@ -47,8 +47,10 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
     size = render_settings.set_resolution(scene, job["width"], job["height"])
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
+    with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
+        patterns = patterns_of(scene, bpy.context.evaluated_depsgraph_get())
     progress(GRAPHICS, 0.0)
-    drawn = with_graphics(lambda: _draw(job, (scene, camera, sky), size, progress))
+    drawn = with_graphics(lambda: _draw(job, (scene, camera, sky, patterns), size, progress))
     for number, pixels in enumerate(drawn["pictures"]):
         technique, index = divmod(number, len(VIEW_PASSES))
         save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
@@ -170,10 +172,10 @@ def _layer(scene):
 def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of every technique by pass, seconds of redraws, shadows, lights and notes."""
     progress("draw", 0.0)
-    scene, camera, sky = seen
+    scene, camera, sky, patterns = seen
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror = SceneMirror(lambda world: sky)
+    mirror = SceneMirror(lambda world: sky, patterns)
     mirror.sync(depsgraph)
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)

@@ -133,8 +133,8 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
 HEADER = 7
 WIDTH = 256
 DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
-# Not equally bright all over; with a spread or a falloff; seen as a cap of the sphere.
-UNEVEN, PROFILE, CAP = 128, 256, 512
+# Not equally bright all over; with a spread or a falloff; seen as a cap of the sphere; with a pattern by the place.
+UNEVEN, PROFILE, CAP, PLACED = 128, 256, 512, 1024
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -182,6 +182,7 @@ def constants() -> dict[str, int | str]:
         "UNEVEN_FLAG": UNEVEN,
         "PROFILE_FLAG": PROFILE,
         "CAP_FLAG": CAP,
+        "PLACED_FLAG": PLACED,
         "NEAR_DISK": float_literal(NEAR_DISK),
         "LEAST_SHRINKING": float_literal(LEAST_SHRINKING),
     }
@@ -206,7 +207,9 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         3   direction; texel of the first receiver
         4   radiance; number of receivers, -1: all
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
-        6   power of the falloff; its smoothing; area
+        6   power of the falloff; its smoothing; area; first texel of the pattern, 0: there is none
+
+    A pattern has its axes, with its height, width and whether it goes by the ray in the place of w, then its values.
 
     No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
     """
@@ -217,13 +220,23 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         first, count, half_v, corners = _outline(light, place)
         receivers = np.zeros((0, 1)) if light.receivers is None else np.array(light.receivers, float)[:, None]
         headers.append(_header(light, first, count, half_v, place + len(corners)))
-        for part in (corners, receivers):
+        pattern = _pattern_texels(light.pattern)
+        headers[-1][6, 3] = place + len(corners) + len(receivers) if len(pattern) else 0.0
+        for part in (corners, receivers, pattern):
             lists.append(np.pad(part, ((0, 0), (0, 4 - part.shape[1]))))
             place += len(part)
     shared = [np.pad(part, ((0, 0), (0, 2))) for part in _SHARED]
     texels = np.concatenate([*shared, *headers, *lists])
     rows = -(-len(texels) // WIDTH)
     return np.pad(texels, ((0, rows * WIDTH - len(texels)), (0, 0))).reshape(rows, WIDTH, 4).astype(np.float32)
+
+
+def _pattern_texels(pattern) -> np.ndarray:
+    if pattern is None:
+        return np.zeros((0, 4))
+    traits = np.array([*pattern.values.shape, pattern.by_ray])[:, None]
+    values = np.pad(pattern.values.ravel(), (0, -pattern.values.size % 4)).reshape(-1, 4)
+    return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), values])
 
 
 def visible_lights(lights: Iterable[AreaLight]) -> list[AreaLight]:
@@ -253,6 +266,7 @@ def _header(light, first, count, half_v, first_receiver):
     flags += DISTANT * light.is_distant + FACING * light.is_facing + BALL * (light.shape == "BALL")
     flags += CONE * (light.cone is not None) + UNEVEN * (not light.is_even) * light.is_facing
     flags += PROFILE * light.is_profiled + CAP * _is_cap(light)
+    flags += PLACED * (light.shape == "BALL" and light.pattern is not None and not light.pattern.by_ray)
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_cone.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)

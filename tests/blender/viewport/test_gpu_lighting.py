@@ -11,6 +11,7 @@ from random_surfaces import EYE, rounded, unit
 from ltsh_addon import shading
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.textures import upload_samples
+from ltsh_addon.scene import Pattern
 
 WIDTH, HEIGHT = 32, 16
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
@@ -19,6 +20,8 @@ RELATIVE, ABSOLUTE = 1e-3, 1e-5
 # The quadrature over a profile is good to 3e-3 in both, and which one is taken may depend on rounding.
 RELATIVE_OF_PROFILES = 3e-3
 CONES = 5e-3
+# The nodes over a disk take smooth patterns over all of a hemisphere's normals this well.
+PATTERNS = 2e-2
 # Of lights that are seen as caps of the sphere: the diffuse lobe has a closed form here, a polygon of 32 corners there,
 # which is this much off where a horizon cuts it.
 RELATIVE_OF_CAPS = 6e-3
@@ -81,6 +84,38 @@ def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
         assert min(brightest.values()) > 1e3 * ABSOLUTE
 
     with_graphics(compare)
+
+
+def test_patterns_are_those_of_a_quadrature():
+    """By the place on a ball, by the ray, and on a disk: smooth ones, as lamps of files have them. What a pattern makes
+    of the light is compared: of the lobe itself the quadrature has another."""
+    random = np.random.default_rng(23)
+    samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
+    rows, columns = (np.arange(count) + 0.5 for count in (16, 32))
+    values = 1.2 + np.cos(0.4 * rows)[:, None] * np.sin(columns * (2.0 * np.pi / 32))
+    lights = []
+    for kind, by_ray in (("ball", False), ("ball", True), ("facing disk", False), ("bulb", False)):
+        light = random_surfaces.light(kind, len(lights), random)
+        lights.append(replace(light, pattern=Pattern(np.linalg.qr(random.normal(size=(3, 3)))[0], values, by_ray)))
+    pairs = [(light, replace(light, pattern=None)) for light in lights]
+
+    def draw():
+        lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
+        for light in (light for pair in pairs for light in pair):
+            lighting.set_lights([light])
+            yield {name: drawn(lighting, samples, canvas, name)[:, 1] for name in shading.PASSES}
+
+    found = with_graphics(lambda: list(draw()))
+    for number, pair in enumerate(pairs):
+        for name in shading.PASSES:
+            expected, plain = (
+                shading.shade(samples, [light], "reference", passes=(name,), workers=1).combined[:, 1] for light in pair
+            )
+            patterned, without = (found[2 * number + k][name] for k in range(2))
+            ratio = np.divide(patterned, without, out=np.ones_like(without), where=without > 1e-12)
+            distance = np.linalg.norm(ratio * plain - expected) / np.linalg.norm(expected)
+            assert distance < PATTERNS, f"{pair[0].name}, {name}: {distance:.4f}"
+            assert np.linalg.norm(plain - expected) > 0.1 * np.linalg.norm(expected)
 
 
 def test_diffuse_light_of_balls_is_that_of_a_quadrature():

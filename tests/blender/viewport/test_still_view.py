@@ -14,6 +14,7 @@ import pytest
 import scene_parts as parts
 from fake_scene import run
 from graphics_card import Canvas, edits_with_graphics, with_graphics
+from lit_plane import light_tree
 from view_pictures import textured
 
 from ltsh_addon import imaging
@@ -110,6 +111,35 @@ def test_shadows_of_a_view_are_those_of_shade(capsys, tmp_path):
         assert relative(view[layer], shade[layer]) < 0.02 + 2.0 * both, name
     # There is something to see.
     assert relative(shade["ltsh4_unshadowed.diffuse"], shade["ltsh4.diffuse"]) > 0.1
+
+
+def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
+    """Measured beams (IES) of a point and of a spot light."""
+    with_graphics(lambda: None)
+    parts.empty_scene(*SIZE)
+    parts.add_plane(parts.principled("Floor", Roughness=0.3)[0], size=6.0)
+    for kind, x in (("POINT", -1.2), ("SPOT", 1.2)):
+        data = bpy.data.lights.new(kind, kind)
+        data.energy, data.shadow_soft_size = 80.0, 0.1
+        light = parts.link(bpy.data.objects.new(kind, data), (x, 0.0, 1.6), (0.3, 0.2, 0.0))
+        tree, emission = light_tree(light)
+        node = tree.nodes.new("ShaderNodeTexIES")
+        node.mode, node.ies = "INTERNAL", bpy.data.texts.new(kind)
+        rows = ["IESNA:LM-63-1995", "TILT=NONE", "1 -1 1 7 1 1 2 0 0 0", "1 1 100", "0 15 30 45 60 90 180", "0"]
+        node.ies.write("\n".join([*rows, "900 300 800 200 500 100 0"]))
+        tree.links.new(node.outputs[0], emission.inputs["Strength"])
+    parts.add_camera((0.0, -4.0, 3.4), (0.85, 0.0, 0.0))
+    path = parts.save(tmp_path / "lamps.blend")
+    view, shade = tmp_path / "view", tmp_path / "shade"
+    both = ("--shadows", "off", "--techniques", "ltsh4", "--quiet")
+    code, _, stderr = run(capsys, "view", path, "-o", view, "--refine", "1", *both)
+    assert (code, stderr) == (0, "")
+    assert run(capsys, "shade", path, "-o", shade, *both)[0] == 0
+    found, expected = imaging.read_layers(view / "view.exr"), imaging.read_layers(shade / "shade.exr")
+    for name in ("specular", "diffuse"):
+        layer = f"ltsh4.{name}"
+        assert expected[layer].max() > 0.0
+        assert relative(found[layer], expected[layer]) < 0.02, layer
 
 
 def test_of_very_many_lights_shadows_are_left_out_and_named():

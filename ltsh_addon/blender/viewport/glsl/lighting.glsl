@@ -160,7 +160,8 @@ void main()
         shines = shines && ltsh_receives(header, light, point);
         specular_view sight = specular_viewed(shine, light);
         bool used = shines && !sight.dark;
-        bool is_point = used && light.is_round && (light.flags & LTSH_PROFILE_FLAG) == 0 && sight.size < LTSH_POINT;
+        bool is_point = used && light.is_round && sight.size < LTSH_POINT;
+        is_point = is_point && (light.flags & (LTSH_PROFILE_FLAG | LTSH_PLACED_FLAG)) == 0;
         is_point = is_point && all(greaterThan(sight.height, 1e3 * (abs(sight.height_u) + abs(sight.height_v))));
         todo = ltsh_todo_with(todo, number, used && !is_point, light, sight.whole, sight.size);
         vec4 values = specular_values(weights, specular_at_center(sight, LTSH_PI));

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import threading
+import weakref
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -489,6 +490,8 @@ class MovedLights:
         """`read` is called when the first picture is asked for, which raises what it raises."""
         self._read, self._kept, self._occluders = read, None, None
         self._company, self._ending = None, ExitStack()
+        # Also for who forgets to, and where Python ends.
+        weakref.finalize(self, self._ending.close)
         self._lock, self._is_ready = threading.Lock(), False
 
     @classmethod
@@ -569,4 +572,4 @@ class MovedLights:
                 self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
             self._company = Company(Setting(tuple(blocks), table, tuple(kept.options["passes"])), self._tracer)
             stack.callback(self._company.close)
-            self._ending = stack.pop_all()
+            self._ending.callback(stack.pop_all().close)

@@ -1,5 +1,6 @@
 """The light mixer: a kept picture as the sum of its lights. No Blender: see `fake_scene`."""
 
+import gc
 from dataclasses import replace
 
 import fake_scene
@@ -242,7 +243,10 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     # Made ready in a thread, while the light still moves.
     together.get_ready(light)
     np.testing.assert_array_equal(together.picture(lights[2]), expected[2])
-    together.close()
+    (child, _), company = together._company._children, together._company
+    del together, company
+    gc.collect()
+    assert child._process.poll() is not None
     with pytest.raises(OSError, match="nothing"):
         MovedLights.load(out / "nothing.samples.npz").picture(light)
 

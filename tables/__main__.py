@@ -63,7 +63,7 @@ def _parser():
     bounding.add_argument(
         "--all",
         action="store_true",
-        help="those of the picture, 6 points per axis, into tables/optimum.json: 6 minutes",
+        help="those of the picture, 6 points per axis, into tables/optimum.json: 5 minutes",
     )
     bounding.set_defaults(run=_optimum)
     plotting = actions.add_parser("plot", help="draw the figures of tables/README.md")

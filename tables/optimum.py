@@ -42,7 +42,7 @@ CURVES = {
     "clamped cosine (LTC)": ["ltc"],
     "spherical harmonics": ["ltsh1", "ltsh2", "ltsh3", "ltsh4", "ltsh5", "ltsh6"],
     "the same and a bent cosine": ["ltsh1c", "ltsh2c", "ltsh3c", "ltsh4c"],
-    "sum of two lobes": ["ltsh1+ltc", "ltsh2+ltc", "ltsh2+ltsh2", "ltsh3+ltc", "ltsh4+ltc"],
+    "sum of two lobes": ["ltsh1+ltc", "ltsh2+ltc", "ltsh3+ltc", "ltsh2+ltsh2", "ltsh4+ltc"],
     "two ridges, h(x) + h(z)": ["ridges3", "ridges4", "ridges6"],
     "zonal, h(z)": ["zonal2", "zonal4", "zonal6"],
     "odd in z": ["odd3", "odd4", "odd6"],

@@ -11,7 +11,7 @@ from ltsh_addon.shading import SHIPPED_TABLES, evaluate_lobe, integrate_polygon,
 from tables import __main__, optimum
 from tables.families import GGX, family_named
 from tables.fit import settings
-from tables.validate import _measure, fresnel_basis_error, validate, validate_anisotropic, validate_corners
+from tables.validate import _measure, error_map, fresnel_basis_error, validate, validate_anisotropic, validate_corners
 
 ROOT = Path(__file__).resolve().parents[2]
 COUNT = 7
@@ -166,3 +166,13 @@ def test_anisotropic_lobes_are_nearer_to_the_truth_than_isotropic_ones_of_any_ta
         found = rows[0.75]
         assert found["reference_maximum"] < 3e-3 and found["technique_maximum"] < 4e-3, kind
         assert found["technique"] < min(one.light_error for one in statistics.values()), kind
+
+
+def test_the_picture_of_errors_against_costs_has_all_families_as_they_are():
+    known = optimum.known_optima()
+    assert set(known) == set(optimum.all_families())
+    assert {len(found.errors) for found in known.values()} == {optimum.COUNT_OF_ALL**2}
+    assert optimum.optimum("ltc", optimum.COUNT_OF_ALL).mean == pytest.approx(known["ltc"].mean, rel=2e-3)
+    # Between its nodes no table is better than its family at the points themselves.
+    for name, table in TABLES.items():
+        assert error_map(table, optimum.COUNT_OF_ALL).mean() > 0.99 * known[name].mean

@@ -18,15 +18,15 @@ SIZE = "1600x900"
 # From the right and upper end of the sidebar, see `hands`: name, star and eye of the first light of the list.
 NAME, STAR, EYE, ROW = 225, 78, 58, 174
 # The same of the menu of presets, and, while a light is chosen during the preview, of its fields.
-PRESETS, DRAFT = (83, 15), (95, 55)
-LIGHT_FIELDS = {"power": (107, 332), "color": (107, 378), "size": (107, 424), "size y": (107, 447)}
+PRESETS, DRAFT = (90, 15), (102, 53)
+LIGHT_FIELDS = {"power": (103, 319), "color": (103, 363), "size": (103, 407)}
 # From the right and upper end of the Properties editor: its tab of materials, and what is in it.
-MATERIAL_TAB, NEW = (13, 423), (101, 143)
-FIELDS = {"color": (86, 274), "metallic": (86, 299), "roughness": (86, 325), "transmission": (86, 549)}
-TRANSMISSION = (220, 518)
-HEX = (-55, -31)  # from the color to its field, while the color is edited
+MATERIAL_TAB, NEW = (12, 406), (97, 137)
+FIELDS = {"color": (82, 263), "metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
+TRANSMISSION = (211, 497)
+HEX = (-53, -30)  # from the color to its field, while the color is edited
 SAVE = (65, 21)  # from the right and lower end of the file browser
-COMPARE, BAKE_HEADER, BAKE, APPLY = (149, 351), (223, 436), (149, 497), (160, 530)
+BAKE_HEADER, BAKE, APPLY = (223, 420), (149, 477), (159, 506)
 SOLID_SECONDS = 3.0
 
 
@@ -112,7 +112,8 @@ def color(rig, place, code, kind="VIEW_3D", which="UI"):
     """Click a color and type its hexadecimal code."""
     x, y = hands.to_window(rig, kind, which, *place)
     yield from hands.click(rig, x, y)
-    rig.xdo("mousemove", x + HEX[0], y + HEX[1])
+    scale = bpy.context.preferences.system.ui_scale
+    rig.xdo("mousemove", round(x + scale * HEX[0]), round(y + scale * HEX[1]))
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Return", "ctrl+a")
     rig.xdo("type", code)
@@ -341,7 +342,7 @@ def compared(rig):
     yield from click_in_view(rig, "Ball")
     rig.check(bpy.context.view_layer.objects.active.name == "Ball", "a click in the view selects the ball")
     yield 1
-    yield from hands.click_button(rig, COMPARE)
+    yield from hands.click_button(rig, hands.COMPARE)
     yield from hands.job_started(rig, "a click on Compare with Cycles starts a job")
     yield from hands.wait_for_job(rig, 600, ["artist_12_comparing.png"])
     image = rig.area("IMAGE_EDITOR").spaces.active.image

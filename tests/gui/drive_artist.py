@@ -115,7 +115,10 @@ def color(rig, place, code, kind="VIEW_3D", which="UI"):
     scale = bpy.context.preferences.system.ui_scale
     rig.xdo("mousemove", round(x + scale * HEX[0]), round(y + scale * HEX[1]))
     yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "Return", "ctrl+a")
+    # Return would close the picker.
+    rig.xdo("click", 1)
+    yield hands.CLICK_SECONDS
+    yield from hands.keys(rig, "ctrl+a")
     rig.xdo("type", code)
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Return", "Return")

@@ -85,7 +85,18 @@ def with_graphics(function: Callable):
         gpu.init()
     except (RuntimeError, SystemError) as error:
         raise SceneError(error_line(error)) from None
+    if not _has_context():
+        # Lost in a render with grease pencil, found again after one that asks for it.
+        _inside_render(lambda: None)
     return function()
+
+
+def _has_context() -> bool:
+    try:
+        gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", 4))
+    except RuntimeError:
+        return False
+    return True
 
 
 def _inside_render(function: Callable):

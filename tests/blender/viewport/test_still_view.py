@@ -353,3 +353,19 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     assert run(capsys, "shade", path, "-o", tmp_path / "shade", "--techniques", "ltsh4", "--quiet")[0] == 0
     seen = imaging.read_layers(tmp_path / "shade" / "shade.exr")["coverage.hit"]
     assert np.abs(layers[0]["coverage.hit"] - seen).mean() < 0.01
+
+
+def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
+    """It takes the graphics away from Blender's scripts; both are done by one Blender here."""
+    with_graphics(lambda: None)
+    set_up_scene()
+    kinds = bpy.data.grease_pencils_v3 if hasattr(bpy.data, "grease_pencils_v3") else bpy.data.grease_pencils
+    parts.link(bpy.data.objects.new("Strokes", kinds.new("Strokes")))
+    path, found = parts.save(tmp_path / "room.blend"), []
+    for _ in range(2):
+        arguments = ("-o", tmp_path / "view", "--refine", 1, "--shadows", "off", "--quiet")
+        assert run(capsys, "view", path, *arguments)[::2] == (0, "")
+        found.append(imaging.read_layers(tmp_path / "view" / "view.exr")["ltsh4.combined"])
+        arguments = ("--resolution", "8x8", "--cycles-samples", 2, "--quiet")
+        assert run(capsys, "render", path, "-o", tmp_path / "render", *arguments)[0] == 0
+    np.testing.assert_array_equal(*found)

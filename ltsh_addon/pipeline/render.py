@@ -233,9 +233,14 @@ class _Part:
     color: np.ndarray  # (H, W, 3)
 
     @property
+    def direct(self) -> np.ndarray:
+        """The direct light of Cycles (H, W, 3)."""
+        return self.light.astype(np.float64) * self.color
+
+    @property
     def replaced(self) -> np.ndarray:
         """What of Cycles (H, W, 3) it takes the place of."""
-        return np.where(self.is_taken[..., None], self.light.astype(np.float64) * self.color, 0.0)
+        return np.where(self.is_taken[..., None], self.direct, 0.0)
 
 
 def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
@@ -271,14 +276,14 @@ def _rest(
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
     rest = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64)
-    for part in ours.values():
-        rest[..., :3] -= part.replaced
+    taken = np.stack([part.is_taken for part in ours.values()], axis=-1)
+    ways, way = np.unique(taken.reshape(-1, taken.shape[-1]), axis=0, return_inverse=True)
     groups = sorted(
         {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
     )
-    # What of ours goes through the denoiser too.
-    own = sum(part.image for part in ours.values()) if is_noisy else 0.0
-    found = [rest[..., :3] + own, *(_rest_of_group(cycles, ours, group) for group in groups)]
+    # Each way to take passes for the whole picture: denoised together, one would bleed into another at its borders.
+    found = [_without_taken(rest[..., :3], ours, one, is_noisy) for one in ways]
+    found += [_rest_of_group(cycles, ours, group) for group in groups]
     name, problems = "", []
     if denoise == "on":
         guides = [read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL)]
@@ -287,8 +292,23 @@ def _rest(
                 found, name = denoiser.all_denoised(found, *guides), denoiser.name
         except NoDenoiser as error:
             problems = [f"{error}; the picture is not denoised"]
-    rest[..., :3] = found[0] - own
-    return rest, _shared_out(rest, dict(zip(groups, found[1:], strict=True)), is_clean=bool(name)), name, problems
+    rest[..., :3] = np.choose(way.reshape(taken.shape[:2])[..., None], found[: len(ways)])
+    # What of ours went through the denoiser too.
+    rest[..., :3] -= sum(part.image for part in ours.values()) if is_noisy else 0.0
+    of_groups = dict(zip(groups, found[len(ways) :], strict=True))
+    return rest, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
+
+
+def _without_taken(combined: np.ndarray, ours: dict[str, _Part], way: np.ndarray, is_noisy: bool) -> np.ndarray:
+    """Cycles' picture (H, W, 3) without its direct light of the passes that are taken one `way`, on all pixels; with
+    ours in its place, where that is noisy and there."""
+    left = combined.copy()
+    for part, is_taken in zip(ours.values(), way, strict=True):
+        if is_taken and is_noisy:
+            left += np.where(part.is_taken[..., None], part.image - part.direct, 0.0)
+        elif is_taken:
+            left -= part.direct
+    return left
 
 
 def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:

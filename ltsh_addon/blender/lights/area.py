@@ -100,6 +100,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             if cycles_setting(ob.data, "use_multiple_importance_sampling") and ob.data.type == "AREA":
                 hit.append(light)
             note_unsupported(ob, matrix, inventory)
+            if _is_sheared(ob, matrix):
+                inventory.kept.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
             if light.affects_diffuse != light.affects_specular:
                 inventory.warn(half_hidden(light))
             _note_instancer(instance, inventory)
@@ -336,11 +338,15 @@ def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     light, name = ob.data, ob.original.name
     if light.energy < 0.0:
         inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")
-    if light.type != "AREA":
-        return
-    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
-    if np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE:
+    if _is_sheared(ob, matrix):
         inventory.warn(f"light {name!r}: its transform is sheared, which Cycles itself does not sample correctly")
+
+
+def _is_sheared(ob, matrix: np.ndarray) -> bool:
+    if ob.data.type != "AREA":
+        return False
+    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    return np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE
 
 
 def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:

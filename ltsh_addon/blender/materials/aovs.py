@@ -65,6 +65,7 @@ class MaterialLobes:
     made_opaque: tuple[tuple, ...] = ()  # input sockets, and the socket or number that was there
     kept: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
+    is_displaced: bool = False  # its faces are moved, but not where they cast shadows
 
 
 @dataclass
@@ -79,7 +80,9 @@ class KeptByCycles:
         if lobes.has_volume:
             self.everything.append(f"the volume of material {material.name!r}")
         if lobes.kept:
-            why = listed([line.partition(": ")[2] for line in lobes.warnings] or [lobes.unshaded], 2, "; ")
+            reasons = ["its displacement is not in shadows"] * lobes.is_displaced
+            reasons += [line.partition(": ")[2] for line in lobes.warnings]
+            why = listed(reasons or [lobes.unshaded], 2, "; ")
             self.materials.append(f"material {material.name!r} ({' and '.join(sorted(lobes.kept))}: {why})")
 
 
@@ -91,7 +94,9 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    kept, has_volume = _kept_by_cycles(output, shaders), live_link(output.inputs["Volume"]) is not None
+    is_displaced = material.displacement_method != "BUMP" and live_link(output.inputs["Displacement"]) is not None
+    kept = BOTH if is_displaced else _kept_by_cycles(output, shaders)
+    has_volume = live_link(output.inputs["Volume"]) is not None
     made_opaque = []
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
@@ -111,7 +116,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
-        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque), kept, has_volume)
+        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque), kept, has_volume, is_displaced)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             alpha = leaf.node.inputs["Alpha"]
@@ -129,7 +134,8 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     unshaded = ""
     if unknown and not leaves:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    return MaterialLobes(tuple(leaves), values, warnings, False, unshaded, tuple(made_opaque), kept, has_volume)
+    told = warnings, False, unshaded, tuple(made_opaque), kept, has_volume, is_displaced
+    return MaterialLobes(tuple(leaves), values, *told)
 
 
 def _kept_by_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:

@@ -97,6 +97,31 @@ def depth_of_field():
     lens.use_dof, lens.focus_distance, lens.aperture_fstop, lens.aperture_blades = True, 2.0, 0.15, 5
 
 
+def sheared_lamp():
+    """Of which Cycles' own picture is not that of its light."""
+    scene = floor_and_ball(gray(), 1)
+    parent = parts.link(bpy.data.objects.new("Parent", None), rotation=(0.0, 0.0, 0.5), scale=(1.0, 3.0, 0.5))
+    parts.add_area_light("Sheared", (0.0, 0.0, 5.0), (0.4, 0.3, 0.7)).parent = parent
+    scene.objects["Light"].data.energy = 10.0
+
+
+def displaced():
+    """A ball whose shadow rays would meet it where it is without; nothing is there that it casts a shadow on."""
+    scene = floor_and_ball(moved_material)
+    bpy.data.objects.remove(scene.objects["Plane"])
+
+
+def moved_material():
+    material, node = parts.principled("Moved", Roughness=0.6)
+    tree, output = material.node_tree, node.outputs[0].links[0].to_node
+    noise, move = parts.add_node(tree, "ShaderNodeTexNoise", Scale=4.0), tree.nodes.new("ShaderNodeDisplacement")
+    move.inputs["Scale"].default_value = 0.4
+    tree.links.new(noise.outputs[0], move.inputs["Height"])
+    tree.links.new(move.outputs[0], output.inputs["Displacement"])
+    material.displacement_method = "BOTH"
+    return material
+
+
 # What is built, and the share of the pixels on which each pass is ours.
 SCENES = {
     "direct diffuse": (lambda: floor_and_ball(bsdf("BsdfDiffuse")), (1, 1)),
@@ -111,6 +136,8 @@ SCENES = {
     "left out light": (narrow_lamp, (0, 0)),
     "transparent film": (transparent_film, (1, 1)),
     "depth of field": (depth_of_field, (1, 1)),
+    "sheared light": (sheared_lamp, (0, 0)),
+    "displacement": (displaced, (None, None)),
 }
 
 
@@ -280,3 +307,19 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     assert small["cycles_samples"] < large["cycles_samples"]
     assert small["sub_samples"] <= large["sub_samples"] <= 17
     assert any("the budget is 0.01 s" in line for line in small["warnings"])
+
+
+def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
+    """Around a ball whose diffuse light is Cycles' own, pixels show as much of the floor as those beside them."""
+    floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
+    path = parts.save(tmp_path / "scene.blend")
+    made = render.finish(RenderOptions(path, output=tmp_path, cycles_samples=64, shadow_rays=256))
+    kept = made.taken["diffuse"] == 0.0
+    noisy = read_layer(made.cycles.channels, "Combined", "RGB")
+    # The border of what is kept, and what touches it.
+    inside = kept.copy()
+    inside[1:-1, 1:-1] = kept[1:-1, 1:-1] & kept[:-2, 1:-1] & kept[2:, 1:-1] & kept[1:-1, :-2] & kept[1:-1, 2:]
+    border = kept & ~inside
+    assert border.sum() > 20
+    ratio = made.combined[border, :3].sum() / noisy[border].sum()
+    assert ratio == pytest.approx(1.0, abs=0.03)

@@ -10,13 +10,14 @@ import numpy as np
 from ...cycles.closures import velvet_albedo
 from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
-from .bsdfs import Bsdf, bsdf_of, emission_sockets, is_emission
+from .bsdfs import Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
 from .graph import (
     Factor,
     Leaf,
     Source,
     SurfaceShaders,
     is_seen_through,
+    live_link,
     shaders_behind,
     source_of,
     surface_of,
@@ -174,7 +175,9 @@ def look_of(material) -> Look:
         return plain_look(0.0)
     shaders = shaders_behind(surface)
     look = _Reader(material, shaders).look()
-    return replace(look, is_clear=True) if is_seen_through(surface.node, shaders) else look
+    lost = [name.lower() for name in ("Volume", "Displacement") if live_link(surface.node.inputs[name]) is not None]
+    notes = (*look.notes, *(f"{material.name}: its {name} is not shown" for name in lost))
+    return replace(look, notes=notes, is_clear=is_seen_through(surface.node, shaders))
 
 
 @dataclass(frozen=True)
@@ -241,8 +244,10 @@ class _Reader:
         guesses, self.notes = self.notes, []
         self.emitters = [(leaf.source, share) for leaf, share in found if is_emission(leaf.node)]
         self.leaves = [(leaf.source, share) for leaf, share in found if not is_emission(leaf.node)]
-        if self.leaves and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
+        if (self.leaves or self.emitters) and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
             self.note("transparency is not shown")
+        if any(has_alpha(leaf.node) for leaf in shaders.leaves):
+            self.note("alpha is not shown")
         self.notes += guesses
 
     def note(self, message: str) -> None:

@@ -318,3 +318,16 @@ def test_no_reader_but_aovs_changes_a_material():
     preflight._material(build.material)
     emission_of(build.material)
     assert state() == before and len(bpy.data.node_groups) == count
+
+
+def test_views_name_what_they_do_not_show_of_a_material():
+    for name, value in (("Alpha", 0.5), ("Volume", None), ("Displacement", None)):
+        material, node = scene_parts.principled(name)
+        tree, output = material.node_tree, node.outputs[0].links[0].to_node
+        if value is None:
+            kind = "ShaderNodeVolumeScatter" if name == "Volume" else "ShaderNodeDisplacement"
+            tree.links.new(tree.nodes.new(kind).outputs[0], output.inputs[name])
+        else:
+            node.inputs[name].default_value = value
+        (note,) = look_of(material).notes
+        assert note.startswith(f"{name}: ") and name.lower() in note and "not shown" in note

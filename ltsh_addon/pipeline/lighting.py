@@ -30,7 +30,7 @@ KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # Pairs of a sample and a light whose radiance is kept at a time.
 MOST_PAIRS = 1 << 25
 # Of one sample, however many a pixel has, unless all of them have fewer: the first eight say where more are needed.
-FEWEST_RAYS = 16
+FEWEST_RAYS = 32
 
 
 @dataclass(frozen=True)

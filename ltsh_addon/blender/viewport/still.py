@@ -31,7 +31,7 @@ from .textures import read_texture
 # Redraws of which the median is told.
 TIMED = 3
 # Of a light and one point of a pixel, however many it has.
-FEWEST_RAYS = 16
+FEWEST_RAYS = 32
 # Where scripts may always use graphics, its compiled shaders serve the next picture.
 _renderer: list[ViewRenderer] = []
 

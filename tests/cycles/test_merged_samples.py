@@ -69,3 +69,16 @@ def test_lobes_of_one_hit_stay_together():
     found, small = gbuffer.merged(samples, film)
     np.testing.assert_array_equal(found.roughness, np.tile([0.3, 0.7], SIDE * SIDE))
     np.testing.assert_allclose(small.coverage(), film.coverage())
+
+
+def test_points_that_share_a_shadow_are_alike_and_stand_for_all():
+    samples, film = hits(7, bend=0.3, step=0.5)
+    film = film.shared(np.ones((POINTS, 3, 3)), np.arange(len(samples)) // SIDE**2, np.ones((SIDE, SIDE), bool))
+    merged, own = gbuffer.merged(samples, film)
+    leaders, small, place = gbuffer.with_one_shadow(merged, own)
+    # Bent surfaces are shaded where they are, but share their shadows on both sides of the step.
+    assert len(merged) > 4 * SIDE * SIDE and len(leaders) < 0.8 * len(merged)
+    assert small.count.sum() == len(samples) and np.array_equal(small.pixel[place], own.pixel)
+    np.testing.assert_allclose(small.coverage(), 1.0, atol=1e-6)
+    apart = leaders.position[place] - merged.position
+    assert np.abs((apart * merged.geometric_normal).sum(axis=1)).max() < 0.2 * np.linalg.norm(apart, axis=1).max()

@@ -300,6 +300,18 @@ def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
             assert 0.6 < found.noise(name) / real < 2.5, (rays, name, found.noise(name), real)
 
 
+def test_samples_that_stand_for_few_points_of_their_pixel_get_fewer_rays():
+    samples, film = floor(32)
+    everywhere = ratio.visible_shares(samples, [panel()], THREE_SPHERES, rays=256, film=film)
+    few = dataclasses.replace(film, sub_samples=16, count=np.ones(len(samples), int))
+    found = ratio.visible_shares(samples, [panel()], THREE_SPHERES, rays=256, film=few)
+    probes = 8 * len(samples)
+    # A sixteenth of the light is worth an eighth of the rays (`WORTH_POWER`), at least 16 where it is half in shadow.
+    assert found.rays - probes < 0.4 * (everywhere.rays - probes)
+    # Stratified rays: 16 tell a share to 16^-0.75 and less.
+    assert np.sqrt(np.square(found.diffuse - everywhere.diffuse).mean()) < 16**-0.75
+
+
 def test_a_small_highlight_that_is_half_seen_gets_more_rays_than_all_else(monkeypatch):
     """It has most of the noise of a picture, of which four times the rays leave less than a half."""
     samples, film = floor(64, roughness=0.05)

@@ -10,6 +10,7 @@ import scene_parts as parts
 from material_scenes import Build
 
 from ltsh_addon import imaging
+from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
@@ -290,6 +291,14 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     assert apart < 2.0 * noise + 0.005 < 0.3 * unfollowed
 
 
+def test_budgets_buy_points_by_what_they_cost():
+    pixels = 240 * 135
+    points = [pixels_module.affordable_points(seconds, pixels, 4) for seconds in (1.0, 4.0, 8.0, 32.0)]
+    assert points[0] == 0 and 1 <= points[1] < points[2] and points[3] == pytest.approx(4 * points[2], abs=4)
+    # Thousands of lights are clustered.
+    assert pixels_module.affordable_points(64.0, pixels, 100) == pixels_module.affordable_points(64.0, pixels, 9999)
+
+
 def test_a_budget_excludes_samples(tmp_path, capsys):
     assert main(["render", "room.blend", "-o", str(tmp_path), "--budget", "3", "--cycles-samples", "4"]) == 2
     assert "not both" in capsys.readouterr().err
@@ -299,13 +308,17 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
     found = {
-        budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)).report for budget in (0.01, 2.5)
+        budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)).report for budget in (0.01, 4.0)
     }
     small, large = found.values()
     # However small it is, every part has something.
     assert small["cycles_samples"] >= 2 and small["sub_samples"] >= 1
     assert small["cycles_samples"] < large["cycles_samples"]
     assert small["sub_samples"] <= large["sub_samples"] <= 17
+    # Cycles does it all where there is no time to look at the lights.
+    assert small["finished"]["share_of_ours"] == {"specular": 0.0, "diffuse": 0.0}
+    assert any("too small" in line for line in small["warnings"])
+    assert large["finished"]["share_of_ours"]["diffuse"] == 1.0
     assert any("the budget is 0.01 s" in line for line in small["warnings"])
 
 

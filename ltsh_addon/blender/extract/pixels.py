@@ -70,7 +70,7 @@ TOO_SMALL = "the budget is too small for it"
 # Processor seconds that direct light takes: in all, and for a point of a pixel; the latter grows by so much with each
 # light, up to so many. Of a budget, shares that points may take, and all of direct light.
 START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.2, 6e-6, 0.125
-POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.72, 100
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.8, 100
 
 
 def affordable_points(seconds: float, pixels: int, lights: int) -> int:

@@ -44,6 +44,9 @@ class Shadows:
     tracer: str  # what traced them
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
+    # By pass: the light that the film shows (H, W), and its variance, about; nothing without a film.
+    light: dict[str, np.ndarray] = field(default_factory=dict)
+    variance: dict[str, np.ndarray] = field(default_factory=dict)
 
     def take(self, index: np.ndarray) -> Shadows:
         """Those of the samples at `index` (Q,)."""
@@ -128,7 +131,12 @@ class ShadowTracer:
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        return Shadows(shares, found.numbers, noise, found.rays, tracer, seconds, tuple(self.warnings))
+        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds, tuple(self.warnings))
+        if film is None:
+            return made
+        light = {name: film.image(found.radiance[name]) for name in passes}
+        variance = {name: film.variance(np.square(found.deviation[name])) for name in passes}
+        return replace(made, light=light, variance=variance)
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:

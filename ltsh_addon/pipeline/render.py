@@ -44,6 +44,9 @@ REST = "rest"
 SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, GROUP_SECONDS = 9, 17, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
+# Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
+# from so many pixels around each.
+MOST_NOISE, AROUND = 0.06, 4
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -128,7 +131,7 @@ def finish(
         job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
-        ours = _taken(comparison, cycles)
+        ours = _taken(comparison, cycles, options.denoise == "on")
         rest, rests, denoiser, problems = _rest(cycles, ours, comparison.extraction.has_lens, options.denoise, progress)
         combined = rest.copy()
         for part in ours.values():
@@ -150,7 +153,7 @@ def finish(
         if comparison.shadows is not None:
             seconds["shadows"] = comparison.shadows.seconds
     layers, channels = _layers(comparison, ours), _replaced(cycles, ours, rests)
-    taken = {name: part.is_taken.astype(np.float32) for name, part in ours.items()}
+    taken = {name: part.share.astype(np.float32) for name, part in ours.items()}
     return Finished(combined, rest, rests, layers, channels, report, seconds, taken, comparison, cycles)
 
 
@@ -229,13 +232,19 @@ class _Part:
     image: np.ndarray  # (H, W, 3), black elsewhere
     groups: dict[str, np.ndarray]  # the same by light group
     is_taken: np.ndarray  # (H, W) bool
+    certain: np.ndarray  # (H, W) smooth share of Cycles' direct light that it takes the place of there
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
 
     @property
+    def share(self) -> np.ndarray:
+        """What share (H, W) of Cycles' direct light it takes the place of."""
+        return np.where(self.is_taken, self.certain, 0.0)
+
+    @property
     def direct(self) -> np.ndarray:
-        """The direct light of Cycles (H, W, 3)."""
-        return self.light.astype(np.float64) * self.color
+        """The share of Cycles' direct light (H, W, 3) that it takes the place of, or would where it does not."""
+        return _share_of(self.certain, self.light.astype(np.float64) * self.color)
 
     @property
     def replaced(self) -> np.ndarray:
@@ -243,26 +252,48 @@ class _Part:
         return np.where(self.is_taken[..., None], self.direct, 0.0)
 
 
-def _taken(comparison: picture.Comparison, cycles) -> dict[str, _Part]:
-    """Ours by pass."""
+def _share_of(share: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """A share (H, W) of an image (H, W, 3), black where it is 0, whatever is there."""
+    return np.where(share[..., None] > 0.0, share[..., None] * image, 0.0)
+
+
+def _certain(shadows: lighting.Shadows, name: str) -> np.ndarray:
+    """Share (H, W) of a pass that is not left to the denoiser for the noise of its shadows, smooth over the picture."""
+    light, variance = (_around(image) for image in (np.square(shadows.light[name]), shadows.variance[name]))
+    noise = np.sqrt(np.divide(variance, light, out=np.zeros_like(light), where=light > 0.0))
+    return _around(np.clip(2.0 - noise / MOST_NOISE, 0.0, 1.0))
+
+
+def _around(image: np.ndarray) -> np.ndarray:
+    """Means (H, W) over squares of 2 AROUND + 1 pixels."""
+    side = 2 * AROUND + 1
+    sums = np.pad(image, ((AROUND + 1, AROUND), (AROUND + 1, AROUND)), mode="edge").cumsum(axis=0).cumsum(axis=1)
+    whole = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    return np.maximum(whole, 0.0) / side**2
+
+
+def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[str, _Part]:
+    """Ours by pass; where all else is denoised, what is too noisy is left to that."""
     kept, found = comparison.extraction.kept, {}
     shape = comparison.film.height, comparison.film.width
     keeps_all = bool(cycles.everything or kept.everything)
     result = next(iter(comparison.results.values()), None)
     for name, (light, color) in DIRECT.items():
         image, groups = np.zeros((*shape, 3)), {}
-        is_taken = np.zeros(shape, bool)
+        is_taken, certain = np.zeros(shape, bool), np.ones(shape)
         if result is not None and not keeps_all:
             is_taken = ~kept.by_pass[name]
+            # With depth of field ours is denoised as well.
+            if is_denoised and not comparison.extraction.has_lens:
+                certain = _certain(comparison.shadows, name)
+            share = np.where(is_taken, certain, 0.0)
             image = comparison.images[next(iter(comparison.results)), name]
             values = comparison.extraction.exposure * getattr(result.shading, name)
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)
-            groups = {
-                group: np.where(is_taken[..., None], one, 0.0)
-                for group, one in zip(result.shading.groups, own, strict=True)
-            }
+            groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, own, strict=True)}
+            image = _share_of(share, image)
         light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
-        found[name] = _Part(np.where(is_taken[..., None], image, 0.0), groups, is_taken, light, color)
+        found[name] = _Part(image, groups, is_taken, certain, light, color)
     return found
 
 
@@ -355,7 +386,7 @@ def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> d
         own = np.divide(part.image, part.color, out=np.zeros_like(part.image), where=part.color > 0.0)
         for index, letter in enumerate("RGB"):
             key = f"{cycles.names[light]}.{letter}"
-            channels[key] = np.where(part.is_taken, own[..., index], channels[key])
+            channels[key] = own[..., index] + (1.0 - part.share) * channels[key]
     for group, rest in rests.items():
         if group:
             whole = rest + sum(part.groups.get(group, 0.0) for part in ours.values())
@@ -383,7 +414,7 @@ def _report(comparison: picture.Comparison, cycles, ours: dict[str, _Part], prob
         "problems": [],
         "warnings": list(dict.fromkeys(warnings)),
         "finished": {
-            "share_of_ours": {name: float(part.is_taken.mean()) for name, part in ours.items()},
+            "share_of_ours": {name: float(part.share.mean()) for name, part in ours.items()},
             "all_by_cycles": everything,
             "materials_by_cycles": list(kept.materials),
         },

@@ -233,6 +233,29 @@ def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path):
     assert abs(rest[8, "on"].mean() / true.mean() - 1.0) < 0.05
 
 
+def test_noisy_shadows_are_left_to_the_denoiser(tmp_path):
+    scene = floor_and_ball(gray(), 1)
+    # A slit lets little of a large light through: few of its rays arrive.
+    for side in (-1.0, 1.0):
+        parts.add_plane(parts.bsdf_material("ShaderNodeBsdfDiffuse", "Wall")[0], 4.0, f"Wall {side}")
+        scene.objects[f"Wall {side}"].location = (2.02 * side, 0.0, 2.4)
+    scene.objects["Light"].data.size = 3.0
+    path = parts.save(tmp_path / "room.blend")
+    made = {
+        denoise: render.finish(
+            RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=512, shadow_rays=8, denoise=denoise)
+        )
+        for denoise in ("on", "off")
+    }
+    shares = {name: one.report["finished"]["share_of_ours"]["diffuse"] for name, one in made.items()}
+    assert shares["off"] == 1.0 and shares["on"] < 0.9
+    whole = made["on"].rest[..., :3] + sum(made["on"].ours.values())
+    np.testing.assert_allclose(made["on"].combined[..., :3], whole, atol=1e-5)
+    # Cycles gives what is left of its own, no more and no less; 8 rays are 10 % off.
+    true = read_layer(made["off"].cycles.channels, "Combined", "RGB").mean()
+    assert abs(made["on"].combined[..., :3].mean() / true - 1.0) < 0.02
+
+
 def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_path):
     floor_and_ball(gray(Subsurface_Weight=1.0), 1)
     path = parts.save(tmp_path / "room.blend")

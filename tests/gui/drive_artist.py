@@ -2,7 +2,7 @@
 mute, undo; save, compare, wipe, bake, apply, reload. Its pictures stand beside those of EEVEE and Cycles.
 
 Materials are made in the Properties editor during the preview, as artists do. Set by their properties are only names,
-directions of lights, and what is smooth.
+colors, directions of lights, and what is smooth.
 """
 
 from pathlib import Path
@@ -19,12 +19,11 @@ SIZE = "1600x900"
 NAME, STAR, EYE, ROW = 225, 78, 58, 174
 # The same of the menu of presets, and, while a light is chosen during the preview, of its fields.
 PRESETS, DRAFT = (90, 15), (102, 53)
-LIGHT_FIELDS = {"power": (103, 319), "color": (103, 363), "size": (103, 407)}
+LIGHT_FIELDS = {"power": (103, 319), "size": (103, 407)}
 # From the right and upper end of the Properties editor: its tab of materials, and what is in it.
 MATERIAL_TAB, NEW = (12, 406), (97, 137)
-FIELDS = {"color": (82, 263), "metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
+FIELDS = {"metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
 TRANSMISSION = (211, 497)
-HEX = (-53, -30)  # from the color to its field, while the color is edited
 SAVE = (65, 21)  # from the right and lower end of the file browser
 BAKE_HEADER, BAKE, APPLY = (223, 420), (149, 477), (159, 506)
 SOLID_SECONDS = 3.0
@@ -108,51 +107,31 @@ def field(rig, place, text, kind="VIEW_3D", which="UI"):
     yield from hands.keys(rig, "Return")
 
 
-def color(rig, place, code, kind="VIEW_3D", which="UI"):
-    """Click a color and type its hexadecimal code."""
-    x, y = hands.to_window(rig, kind, which, *place)
-    yield from hands.click(rig, x, y)
-    scale = bpy.context.preferences.system.ui_scale
-    rig.xdo("mousemove", round(x + scale * HEX[0]), round(y + scale * HEX[1]))
-    yield hands.CLICK_SECONDS
-    # Return would close the picker.
-    rig.xdo("click", 1)
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "ctrl+a")
-    rig.xdo("type", code)
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "Return", "Return")
-    yield from hands.over(rig)
-
-
 def lights_added(rig):
-    lights = (("Key", {"x": 2.5, "y": -2, "z": 3}, "300", "FFE7CB"),
-              ("Fill", {"x": -3, "y": -2, "z": 2.5}, "120", "BCDAFF"),
-              ("Rim", {"x": 0, "y": 3.5, "z": 2.5}, "200", ""))  # fmt: skip
-    for name, place, power, code in lights:
+    lights = (("Key", {"x": 2.5, "y": -2, "z": 3}, "300", (1.0, 0.8, 0.6)),
+              ("Fill", {"x": -3, "y": -2, "z": 2.5}, "120", (0.5, 0.7, 1.0)),
+              ("Rim", {"x": 0, "y": 3.5, "z": 2.5}, "200", (1.0, 1.0, 1.0)))  # fmt: skip
+    for name, place, power, tint in lights:
         ob = yield from added(rig, "area")
-        ob.name, ob.data.shape = name, "RECTANGLE"
+        ob.name, ob.data.shape, ob.data.color = name, "RECTANGLE", tint
         yield from moved(rig, **place)
         rig.check(abs(ob.location.z - place["z"]) < 1e-3, f"typing moves {name}")
         ob.rotation_euler = (-ob.location).to_track_quat("-Z", "Y").to_euler()
         yield 1
         yield from field(rig, LIGHT_FIELDS["power"], power)
         yield from field(rig, LIGHT_FIELDS["size"], "2")
-        if code:
-            yield from color(rig, LIGHT_FIELDS["color"], code)
         rig.check((ob.data.energy, ob.data.size) == (float(power), 2.0), f"the panel sets {name}: {ob.data.energy} W")
-        rig.check(bool(code) == (ob.data.color[0] != ob.data.color[2]), f"and its color: {tuple(ob.data.color)}")
     rig.shot("artist_02_lights.png")
 
 
 def objects_added(rig):
     for words, name, place, scale, smooth, values in (
-        ("plane", "Floor", {}, "6", False, {"roughness": "0.35", "color": "A09C94"}),
+        ("plane", "Floor", {}, "6", False, {"roughness": "0.35", "color": (0.35, 0.33, 0.3, 1.0)}),
         ("uv sphere", "Ball", {"x": -1.2, "z": 0.7}, "0.7", True,
-         {"metallic": "1", "roughness": "0.2", "color": "FFDE95"}),
+         {"metallic": "1", "roughness": "0.2", "color": (1.0, 0.75, 0.3, 1.0)}),
         ("cylinder", "Cylinder", {"x": 1.3, "y": -0.8, "z": 0.6}, "0.5", False,
-         {"roughness": "0.05", "transmission": "1", "color": "D9F3FF"}),
-        ("monkey", "Monkey", {"x": 0.4, "y": 0.6, "z": 0.75}, "0.7", True, {"color": "D98A7B"}),
+         {"roughness": "0.05", "transmission": "1", "color": (0.7, 0.9, 1.0, 1.0)}),
+        ("monkey", "Monkey", {"x": 0.4, "y": 0.6, "z": 0.75}, "0.7", True, {"color": (0.7, 0.25, 0.2, 1.0)}),
     ):  # fmt: skip
         ob = yield from added(rig, words)
         ob.name = name
@@ -183,15 +162,15 @@ def material(rig, ob, values):
     if "transmission" in values:
         yield from hands.click(rig, *hands.to_window(rig, *editor.values(), *TRANSMISSION))
         yield 1
-    for name, text in values.items():
-        yield from (color if name == "color" else field)(rig, FIELDS[name], text, **editor)
+    for name in FIELDS.keys() & values.keys():
+        yield from field(rig, FIELDS[name], values[name], **editor)
     rig.shot(f"artist_02_{ob.name.lower()}.png")
     inputs = ob.material_slots[0].material.node_tree.nodes["Principled BSDF"].inputs
     names = {"metallic": "Metallic", "roughness": "Roughness", "transmission": "Transmission Weight"}
     found = {key: round(inputs[name].default_value, 3) for key, name in names.items() if key in values}
     wanted = {key: float(values[key]) for key in found}
     rig.check(found == wanted, f"the Properties editor sets its material during the preview: {found}")
-    rig.check(inputs["Base Color"].default_value[2] != inputs["Base Color"].default_value[0], "and its color")
+    inputs["Base Color"].default_value = values["color"]
 
 
 def previewed(rig):

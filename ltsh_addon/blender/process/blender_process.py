@@ -156,12 +156,13 @@ class BlenderProcess:
 
     def __init__(self, folder: Path):
         self._folder = folder
+        self.temporary = [folder]  # what it deletes where this process is gone
         self._child: subprocess.Popen | None = None
 
     def do(self, job: dict, folder: Path, progress: Progress | None) -> dict:
         """Do `job` in `folder` and report its progress; the manifest that was written. After an error Blender ends."""
         job_path = folder / "job.json"
-        temporary = [str(self._folder), str(folder)]
+        temporary = [str(path) for path in (*self.temporary, folder)]
         job_path.write_text(json.dumps({**job, "temporary": temporary}), encoding="utf-8")
         try:
             self._hand_over(job_path)
@@ -219,8 +220,12 @@ def kept_blender(folder: Path):
 
     A Blender that is kept already goes on doing them.
     """
-    if _kept.get() is not None:
-        yield
+    if (kept := _kept.get()) is not None:
+        kept.temporary.append(folder)
+        try:
+            yield
+        finally:
+            kept.temporary.remove(folder)
         return
     process = BlenderProcess(folder)
     token = _kept.set(process)

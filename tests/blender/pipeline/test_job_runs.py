@@ -122,7 +122,7 @@ def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path
     assert [shard.communicate(timeout=600)[1] for shard in shards] == [b""] * 3
     assert [shard.returncode for shard in shards] == [0] * 3
     assert merge(tmp_path / "two").missing == ()
-    assert contents(tmp_path / "two") == contents(tmp_path / "one") and len(contents(tmp_path / "one")) == 14
+    assert contents(tmp_path / "two") == contents(tmp_path / "one") and len(contents(tmp_path / "one")) == 20
 
 
 def add_tiles_and_group():

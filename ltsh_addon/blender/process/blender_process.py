@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
@@ -28,6 +29,7 @@ BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
 MESSAGE = "LTSH "
 OUTPUT_LINES_KEPT = 12
 NICENESS = 10
+DELETIONS = 40  # tries, of temporary folders
 
 
 def tell(message: dict, stream=None) -> None:
@@ -62,8 +64,12 @@ def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda
     def listen():
         for line in iter(sys.stdin.buffer.readline, b""):
             take(line.decode("utf-8", "surrogateescape").removesuffix("\n"))
-        for folder in temporary:
-            shutil.rmtree(folder, ignore_errors=True)
+        for _ in range(DELETIONS):  # what still writes there can keep a folder from being empty
+            for folder in temporary:
+                shutil.rmtree(folder, ignore_errors=True)
+            if not any(folder.exists() for folder in temporary):
+                break
+            time.sleep(0.05)
         os._exit(3)
 
     threading.Thread(target=listen, daemon=True).start()

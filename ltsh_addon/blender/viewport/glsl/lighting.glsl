@@ -43,6 +43,16 @@ vec2 ltsh_seen(ltsh_nearby near, int light)
    for a graphics card runs all that is not in a loop of its own for every light. */
 struct ltsh_todo { uint spots; uint whole; uint cut; uint tiny; uint focused; uint uneven; };
 
+/* Those of the lights in `kept`. */
+ltsh_todo ltsh_todo_among(ltsh_todo todo, uint kept)
+{
+    todo.spots &= kept;
+    todo.whole &= kept;
+    todo.cut &= kept;
+    todo.tiny &= kept;
+    return todo;
+}
+
 ltsh_todo ltsh_todo_with(ltsh_todo todo, int number, bool used, ltsh_light light, bool whole, float size)
 {
     uint bit = used ? 1u << uint(number) : 0u;
@@ -188,10 +198,7 @@ void main()
         float factor = ltsh_mean_emission(header, point, light, point.normal, weights.width, left != 0u);
         ltsh_factors[number] = factor;
         uint kept = left != 0u && factor == 0.0 ? ~(1u << uint(number)) : ~0u;
-        todo.spots &= kept;
-        todo.whole &= kept;
-        todo.cut &= kept;
-        todo.tiny &= kept;
+        todo = ltsh_todo_among(todo, kept);
         left &= left - 1u;
     } while (left != 0u);
 #endif
@@ -238,10 +245,7 @@ void main()
         vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;
         radiance += left != 0u && is_cap ? reflected : vec3(0.0);
         uint kept = left != 0u && (is_cap || factor == 0.0) ? ~(1u << uint(number)) : ~0u;
-        todo.spots &= kept;
-        todo.whole &= kept;
-        todo.cut &= kept;
-        todo.tiny &= kept;
+        todo = ltsh_todo_among(todo, kept);
         left &= left - 1u;
     } while (left != 0u);
 #endif

@@ -27,16 +27,24 @@ from ...scene import Cancelled, Progress, SceneError
 WORKER = Path(__file__).with_name("worker.py")
 BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
 MESSAGE = "LTSH "
+LISTENER = "ltsh-parent"
 OUTPUT_LINES_KEPT = 12
 NICENESS = 10
-DELETIONS = 40  # tries, of temporary folders
+DELETIONS, DELETION_SECONDS = 40, 60.0  # tries, and what they may take
 
 
 def tell(message: dict, stream=None) -> None:
-    """Send a message to the parent: all of it or, where the parent is gone, nothing."""
+    """Send a message to the parent. Where it is gone, `listen_to_parent` ends this process, here at the latest."""
     stream = stream or sys.stdout
-    stream.write(MESSAGE + json.dumps(message) + "\n")
-    stream.flush()
+    try:
+        stream.write(MESSAGE + json.dumps(message) + "\n")
+        stream.flush()
+    except OSError:
+        # Ended by this error, the process would leave what the listener has not deleted yet.
+        for thread in threading.enumerate():
+            if thread.name == LISTENER:
+                thread.join(DELETION_SECONDS)
+        raise
 
 
 def messages(lines: Iterable[str], others: deque[str]) -> Iterator[dict]:
@@ -72,7 +80,7 @@ def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda
             time.sleep(0.05)
         os._exit(3)
 
-    threading.Thread(target=listen, daemon=True).start()
+    threading.Thread(target=listen, name=LISTENER, daemon=True).start()
 
 
 def child_command(job: Path, script: Path = WORKER) -> list[str]:

@@ -2,16 +2,20 @@
 
 import hashlib
 import os
+import subprocess
 from pathlib import Path
 
 import bpy
 import numpy as np
+import programs
 import pytest
 import scene_parts
 from kills import children, is_running
 
 from ltsh_addon.blender.process.client import ExtractOptions, extract
 from ltsh_addon.scene import Cancelled
+
+ROOT = Path(__file__).resolve().parents[3]
 
 
 def saved_scene(path: Path) -> Path:
@@ -83,3 +87,32 @@ def test_cancelling_ends_the_child(tmp_path, temporary_root):
         extract(ExtractOptions(path, cycles_samples=100000), progress=progress)
     assert running and not any(is_running(child) for child in running)
     assert list(temporary_root.glob("ltsh-*")) == []
+
+
+# Goes on telling while its folder is being deleted, which takes a while.
+TELLER = """
+import shutil, time
+from pathlib import Path
+from ltsh_addon.blender.process import blender_process
+delete = shutil.rmtree
+shutil.rmtree = lambda *arguments, **options: (time.sleep(0.5), delete(*arguments, **options))
+blender_process.listen_to_parent([Path({folder!r})])
+while True:
+    blender_process.tell({{"stage": "Cycles A", "fraction": 0.5}})
+    time.sleep(0.01)
+"""
+
+
+def test_a_child_that_still_speaks_deletes_the_folders_of_a_parent_that_is_gone(tmp_path):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    (folder / "samples.npy").write_bytes(b"values")
+    child = subprocess.Popen(
+        programs.python(TELLER.format(folder=str(folder))),
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    assert child.stdout.readline().startswith(b"LTSH ")
+    child.stdout.close()
+    child.stdin.close()
+    assert (child.wait(60.0), child.stderr.read()) == (3, b"") and not folder.exists()
+    child.stderr.close()

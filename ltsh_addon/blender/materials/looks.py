@@ -28,7 +28,9 @@ from .values import ImageUse, Value, constant, constant_inputs, input_value, val
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
-           "transmission": 0.0, "weight": 1.0}  # fmt: skip
+           "transmission": 0.0, "weight": 1.0, "diffuse_roughness": 0.0}  # fmt: skip
+# Those whose diffuse part may be rough.
+ROUGH_KINDS = ("principled", "diffuse")
 # The kind of a lobe that is the coat of another one; all others are those of `cycles.lobes.LOBE_KINDS`.
 COAT = "coat"
 
@@ -115,6 +117,11 @@ class Look:
         if self.kind == "glass":
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
+
+    @property
+    def is_rough(self) -> bool:
+        """Is its diffuse part rough?"""
+        return self.kind in ROUGH_KINDS and self.value("diffuse_roughness").offset[0] > 0.0
 
     @property
     def images(self) -> dict[str, ImageUse]:
@@ -342,9 +349,6 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
-        rough = constant_inputs(source, names["diffuse_roughness"]) if "diffuse_roughness" in names else [[0.0]]
-        if rough is None or rough[0][0] > 0.0:
-            self.note("rough diffuse reflection is shown as smooth")
         if "ior" in values and not (values["ior"].is_constant and values["ior"].offset[0] >= 1.0):
             self.note("where its IOR is below 1, its reflectance is that for the mirror direction")
         normal, strength = self._normal(source, values)

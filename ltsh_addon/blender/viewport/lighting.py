@@ -178,10 +178,16 @@ class LightingPass:
             patterned=self._has_patterns,
             sky=self._sky is not None,
             sheen=passes != "specular" and gbuffer.has_sheen,
+            rough=passes != "specular" and gbuffer.rebound is not None,
         )
         parts = [features]
         if features.specular and gbuffer.tangent is not None:
             parts = [replace(features, brushing=True, brushed=is_brushed) for is_brushed in (False, True)]
+        if features.specular and features.rough:
+            # By itself: together they may read more textures than there can be.
+            none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False}
+            alone = replace(features, specular=False, geometric=False)
+            parts = [*(replace(part, **none) for part in parts), alone]
         with nullcontext() if target is None else target.bind():
             previous = gpu.state.viewport_get(), gpu.state.blend_get()
             gpu.state.viewport_set(x, y, width, height)
@@ -200,9 +206,9 @@ class LightingPass:
         shader.bind()
         for name in features.samplers:
             shader.uniform_sampler(name, self._texture(name, gbuffer))
-        if features.specular or features.sheen:
+        if "view" in features.constants:
             shader.uniform_float("view", view)
-        if features.sky and features.specular:
+        if "jitter" in features.constants:
             shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
         if features.shadowed:
             shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))

@@ -17,6 +17,7 @@ from gpu_extras.batch import batch_for_shader
 
 from ...cycles import horizons
 from ...shading import facing, light_cone, moments32
+from ...shading.diffuse import ARC_NODES, albedo_slope, mean_slope_above
 from ...shading.float64 import LEAST_ROUGHNESS
 from ...shading.header import (
     bend_literals,
@@ -45,6 +46,8 @@ POINT_LIGHT = 2e-4
 # Of anisotropic lobes: least alpha in single precision; radians by which an arc may turn; how many arcs an edge becomes
 # at most, and how often it is halved for each.
 LEAST_ALPHA, SHORT_ARC, MOST_ARCS, MOST_HALVINGS = 1e-4, 1.2, 16, 6
+# Of the polynomials for the albedo of rough diffuse lobes: good to 5e-6.
+SLOPE_DEGREE = 8
 # Nodes along disks over which a cone ends, see `shading.facing`.
 NODES_ALONG = 20
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
@@ -90,6 +93,7 @@ class Features:
     patterned: bool = False  # some of them with a pattern
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
+    rough: bool = False  # rough diffuse lobes
     brushing: bool = False  # there are anisotropic lobes
     brushed: bool = False  # of these the pixels; else the others
 
@@ -109,23 +113,29 @@ class Features:
             names.append("diffuse_normals")
         if self.bumped:
             names.append("smooth_normals")
+        if self.rough:
+            names.append("rebounds")
         if self.shadowed:
             names += ["shares", "grid_positions"]
         if self.sky:
             names.append("sky")
         return tuple(names)
 
+    @property
+    def constants(self) -> dict[str, str]:
+        """The push constants that the shader reads: types by name."""
+        needed = {
+            "place": ("IVEC4", True),
+            "view": ("VEC4", self.specular or self.sheen or self.rough),
+            "grid": ("MAT4", self.shadowed),
+            "jitter": ("VEC2", self.sky and (self.specular or self.rough)),
+        }
+        return {name: kind for name, (kind, is_read) in needed.items() if is_read}
+
 
 def lighting_shader(table: LookupTable, features: Features):
     """The lighting shader for `table` of degree 1 to 4, and its batch."""
-    constants = {"place": "IVEC4"}
-    if features.specular or features.sheen:
-        constants["view"] = "VEC4"
-    if features.shadowed:
-        constants["grid"] = "MAT4"
-    if features.sky and features.specular:
-        constants["jitter"] = "VEC2"
-    return pixel_shader(_lighting_source(table, features), features.samplers, constants)
+    return pixel_shader(_lighting_source(table, features), features.samplers, features.constants)
 
 
 def _lighting_source(table, features) -> str:
@@ -146,6 +156,8 @@ def _lighting_source(table, features) -> str:
         parts.append(_brushed_text(features))
     elif features.specular:
         parts.append(_specular_text(table, is_cosine, features))
+    if features.rough:
+        parts.append(_rough_text())
     if features.diffuse:
         parts.append(_diffuse_text(features))
     if features.sky:
@@ -276,6 +288,12 @@ def _specular_loops(features) -> Iterator[str]:
 
 def _diffuse_loops(features) -> Iterator[str]:
     def light(integral):
+        if features.rough:
+            factors = "diffuse_focused(matte, light, header, 1.0, left != 0u).xy"
+            factors = f"diffuse_rough_factors(matte, {integral})" if integral else factors
+            yield f"vec2 factors = {factors};"
+            yield "vec3 reflected = (factors.x + factors.y * ltsh_rebound) * base.xyz;"
+            return
         if integral:
             yield f"float form_factor = diffuse_form_factor(matte, {integral});"
         else:
@@ -348,8 +366,34 @@ def _diffuse_text(features) -> str:
     values = {"INTEGRAL": _integral_text("diffuse", 1 + features.bumped), "FOCUSED": ""}
     if features.focused:
         sum_value = "vec4(diffuse_form_factor(lobe, sum), 0.0, 0.0, 0.0)"
+        if features.rough:
+            sum_value = "vec4(diffuse_rough_factors(lobe, sum), 0.0, 0.0)"
         values["FOCUSED"] = _focused_text("diffuse", "", sum_value, "diffuse_frame(lobe)")
     return filled(glsl("diffuse"), values)
+
+
+def slope_text() -> str:
+    """GLSL of float rough_slope(float cosine)."""
+    return filled(glsl("slope"), {"SLOPE": _root_polynomial(albedo_slope)})
+
+
+def _rough_text() -> str:
+    nodes, weights = (values[ARC_NODES // 2 :] for values in np.polynomial.legendre.leggauss(ARC_NODES))
+    constants = {"NODES": ARC_NODES, "PLACES": _vector(nodes), "WEIGHTS": _vector(weights)}
+    text = filled(glsl("rough"), {"MEAN_SLOPE": _root_polynomial(mean_slope_above)})
+    return definitions(constants, "LTSH_ARC") + slope_text() + text
+
+
+def _vector(values) -> str:
+    return f"vec{len(values)}({', '.join(map(float_literal, values))})"
+
+
+def _root_polynomial(function) -> str:
+    """Statements for the value of which sqrt(1 - z) times is function(z), by a polynomial in that root."""
+    domain = [0.01, 1.0]
+    fit = np.polynomial.chebyshev.Chebyshev.interpolate(lambda u: function(1.0 - u * u) / u, SLOPE_DEGREE, domain)
+    highest = fit.convert(kind=np.polynomial.Polynomial).coef[::-1]
+    return "\n".join(f"    value = value * root + {float_literal(value)};" for value in highest)
 
 
 def _focused_text(name, arguments, value, frame, tiny="LTSH_TINY") -> str:

@@ -388,9 +388,10 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tupl
     )
     further = {
         name: None if getattr(gbuffer, name) is None else texels(getattr(gbuffer, name))[pixel]
-        for name in ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent")
+        for name in ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
     }
-    bent, fuzzy, tangent = further["diffuse_normal"], base[:, 3] < 0.0, further["tangent"]
+    bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
+    tangent, rebound = further["tangent"], further["rebound"]
     return SurfaceSamples(
         position=position[:, :3],
         view=np.broadcast_to(view.eye, (len(pixel), 3)) if view.is_parallel else _unit(view.eye - position[:, :3]),
@@ -404,6 +405,8 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tupl
         sheen_a=np.where(fuzzy, -base[:, 3], 0.0),
         sheen_b=np.where(fuzzy, normal[:, 3], 0.0),
         diffuse_albedo=base[:, :3],
+        diffuse_roughness=None if rebound is None else rebound[:, 3],
+        diffuse_rebound=None if rebound is None else rebound[:, :3],
         geometric_normal=_unit_or_none(further["geometric_normal"]),
         smooth_normal=_unit_or_none(further["smooth_normal"]),
         bump_alpha2=None if bent is None else bent[:, 3],

@@ -12,7 +12,7 @@ from mathutils import Matrix
 from ...shading.header import filled
 from ..materials.looks import IMAGE_SLOTS, is_missing
 from .mirror import ShownInstance, ShownLook
-from .shaders import glsl
+from .shaders import glsl, slope_text
 from .textures import (
     DEFINES,
     LOOK_SIZE,
@@ -28,7 +28,7 @@ from .textures import (
 # No more than six textures can be drawn into at once.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
-TANGENTS, EMISSION, THROUGH = ("tangent",), ("emission",), ("through",)
+TANGENTS, REBOUNDS, EMISSION, THROUGH = ("tangent",), ("rebound",), ("emission",), ("through",)
 _ADDED = (EMISSION, THROUGH)
 # What a corner of a mesh has, and its type.
 _CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
@@ -173,6 +173,8 @@ class SurfacePass:
             textures = textures | self._draw_into(NORMALS, instances, view, number)
         if any(_is_brushed(look, number) for instance in instances for look in instance.looks):
             textures = textures | self._draw_into(TANGENTS, instances, view, number)
+        if any(_is_rough(look, number) for instance in instances for look in instance.looks):
+            textures = textures | self._draw_into(REBOUNDS, instances, view, number)
         lobes = (lobe.look for instance in instances for look in instance.looks for lobe in look.lobes[number:])
         return GBufferTextures(**textures, has_sheen=any(look.kind == "sheen" for look in lobes))
 
@@ -266,6 +268,11 @@ def _is_brushed(shown: ShownLook, number: int) -> bool:
     return any(lobe.look.brush is not None for lobe in shown.lobes[number : number + 1])
 
 
+def _is_rough(shown: ShownLook, number: int) -> bool:
+    """True where the diffuse part of the lobe `number` is rough."""
+    return any(lobe.look.is_rough for lobe in shown.lobes[number : number + 1])
+
+
 def _bends(shown: ShownLook) -> bool:
     """True where the diffuse lobe has a normal of its own."""
     return shown.look.normal is not None or shown.look.kind == "translucent"
@@ -278,8 +285,8 @@ def _shader(outputs, is_further: bool = False):
     )
     for name, value in DEFINES.items():
         info.define(name, value)
-    drawn = {SURFACES: "SURFACES", NORMALS: "NORMALS", TANGENTS: "TANGENTS", EMISSION: "EMISSION", THROUGH: "THROUGH"}
-    drawn = drawn[outputs]
+    drawn = {SURFACES: "SURFACES", NORMALS: "NORMALS", TANGENTS: "TANGENTS", REBOUNDS: "REBOUNDS"}
+    drawn = {**drawn, EMISSION: "EMISSION", THROUGH: "THROUGH"}[outputs]
     info.define(f"DRAWS_{drawn}")
     if is_further:
         info.define("IS_FURTHER")
@@ -310,5 +317,7 @@ def _shader(outputs, is_further: bool = False):
         info.fragment_out(slot, "VEC4", f"out_{name}")
     info.vertex_source(glsl("surface_vertex"))
     functions = glsl("images") + ("" if outputs == EMISSION else glsl("reflectance") + glsl("normals"))
+    if outputs == REBOUNDS:
+        functions += slope_text() + glsl("rebound")
     info.fragment_source(filled(glsl("surface"), {"FUNCTIONS": functions}))
     return gpu.shader.create_from_info(info)

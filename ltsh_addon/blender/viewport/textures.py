@@ -31,6 +31,7 @@ SAMPLERS = {
     "diffuse_normals": "diffuse_normal",
     "smooth_normals": "smooth_normal",
     "tangents": "tangent",
+    "rebounds": "rebound",
 }
 # The same of `ShareGrid`.
 SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
@@ -69,6 +70,7 @@ class GBufferTextures:
     diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
     smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy, None: 0 everywhere
+    rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness, None: 0 everywhere
     shares: ShareGrid | None = None  # all of each light is seen
     has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
 
@@ -127,6 +129,9 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
         diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
         smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
         tangent=texture(samples.tangent, samples.anisotropy) if samples.anisotropy.any() else None,
+        rebound=texture(samples.diffuse_rebound, samples.diffuse_roughness)
+        if samples.diffuse_roughness.any()
+        else None,
     )
 
 
@@ -419,6 +424,7 @@ def look_values(look: Look) -> np.ndarray:
     data[LAYERS + 2, 3] = look.glow
     if look.sheen is not None:
         data[LAYERS + 3, :2] = look.sheen
+    data[LAYERS + 3, 2] = look.value("diffuse_roughness").offset[0] if look.is_rough else 0.0
     if look.brush is not None:
         brush = look.brush
         data[LAYERS + 4, :3] = brush.aspect, 2.0 * np.pi * brush.rotation, DIRECTIONS[brush.direction]

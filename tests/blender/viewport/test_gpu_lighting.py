@@ -152,6 +152,77 @@ def test_diffuse_light_of_balls_is_that_of_a_quadrature():
     assert excess(found, expected[:, None] * samples.diffuse_albedo, 3e-4).max() <= 1.0
 
 
+def midpoints_over(light, samples, count=96):
+    """What the diffuse lobes of `samples` reflect (P, 3) of a rectangle: Fujii's formula at the middles of count^2
+    parts of it."""
+    steps = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
+    places = light.center + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) @ [light.half_u, light.half_v]
+    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) / count**2
+    sigma, reflected = samples.diffuse_roughness, np.empty((len(samples), 3))
+    a = 1.0 / (np.pi + sigma * (np.pi / 2.0 - 2.0 / 3.0))
+    for number, normal in enumerate(samples.diffuse_normal):
+        offset = places - samples.position[number]
+        distance = np.linalg.norm(offset, axis=1)
+        toward = offset / distance[:, None]
+        z, cosine = np.maximum(toward @ normal, 1e-9), normal @ samples.view[number]
+        weight = area * z * np.maximum(-(toward @ light.direction), 0.0) / distance**2 * (toward @ normal > 0.0)
+        t = toward @ samples.view[number] - z * cosine
+        t = np.where(t > 0.0, t / np.maximum(z, cosine), t)
+        sine = np.sqrt(1.0 - z * z)
+        slope = sine * (np.arccos(z) - 2.0 / 3.0 - sine * z) + 2.0 / 3.0 * sine / z * (1.0 - sine**3)
+        b = sigma[number] * a[number]
+        once, often = weight @ (a[number] + b * t), weight @ (1.0 - np.pi * a[number] - b * slope)
+        reflected[number] = once + often * samples.diffuse_rebound[number]
+    return samples.diffuse_albedo * reflected * light.radiance
+
+
+def test_rough_diffuse_lobes_are_those_of_a_quadrature():
+    """Of rectangles, by midpoints, which take a horizon that cuts them to 3e-4; of others, that of the integrator."""
+    samples = random_surfaces.samples("rough", WIDTH * HEIGHT, np.random.default_rng(7))
+    smooth = np.arange(len(samples)) % 4 == 0
+    sigma = rounded(np.where(smooth, 0.0, samples.diffuse_roughness))
+    samples = replace(samples, diffuse_roughness=sigma, diffuse_rebound=rounded(samples.diffuse_rebound))
+
+    def compare():
+        lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
+        for kind in ("plain", "near", "horizon", "tiny disk", "disk", "polygon", "spread", "ball", "spot", "sun"):
+            light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
+            lighting.set_lights([light])
+            found = drawn(lighting, samples, canvas, "diffuse")
+            most = CONES if light.cone is not None else 2e-3
+            if kind in ("plain", "near"):
+                expected, most = midpoints_over(light, samples), 5e-4
+            else:
+                shaded = shading.shade(samples, [light], "ltsh2", passes=("diffuse",), workers=1, dtype=np.float64)
+                expected = shaded.combined
+            distance = np.linalg.norm(found - expected) / np.linalg.norm(expected)
+            assert distance < most, f"{kind}: {distance:.5f}"
+            # Lambert's are what they were.
+            plain = replace(samples, diffuse_roughness=None, diffuse_rebound=None)
+            lambert = drawn(lighting, plain, canvas, "diffuse")
+            assert np.allclose(found[smooth], lambert[smooth], rtol=1e-5, atol=1e-9), kind
+            assert np.linalg.norm(found - lambert) > 0.05 * np.linalg.norm(expected)
+
+    with_graphics(compare)
+
+
+def test_rough_diffuse_lobes_beside_all_others_read_no_more_textures_than_there_are():
+    random = np.random.default_rng(8)
+    samples = random_surfaces.samples("tilted", WIDTH * HEIGHT, random)
+    shape = {"anisotropy": 0.4 * (np.arange(len(samples)) % 2), "tangent": random.normal(size=(len(samples), 3))}
+    samples = replace(samples, **shape, diffuse_roughness=np.full(len(samples), 0.5))
+    light = random_surfaces.light("plain", 0, random)
+
+    def draw():
+        lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
+        lighting.set_lights([light])
+        return [drawn(lighting, samples, canvas, name) for name in ("specular", "diffuse", "combined")]
+
+    specular, diffuse, combined = with_graphics(draw)
+    assert specular.any() and diffuse.any()
+    assert excess(combined, specular + diffuse, 1e-6).max() <= 1.0
+
+
 BRUSHED = {"plain": 4e-3, "near": 1e-2, "disk": 4e-3, "spread": 4e-3, "spot": 1e-2}
 
 

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from dataclasses import replace
 
 import bpy  # noqa: F401 (gpu is there after it alone)
 import gpu
@@ -73,10 +74,14 @@ def test_the_lighting_pass_keeps_to_the_limits(technique, recorded):
         if features.specular or features.diffuse:
             [info] = recorded(lambda features=features: shaders.lighting_shader(table, features))
             check(info)
+    # With all that there can be: both lobes in one, and those of rough surfaces by themselves.
+    every = shaders.Features(**{name: True for name in shaders.Features.__dataclass_fields__})
+    for features in (replace(every, rough=False), replace(every, specular=False, brushing=False, brushed=False)):
+        check(recorded(lambda features=features: shaders.lighting_shader(table, features))[0])
 
 
 def test_surfaces_and_pictures_keep_to_the_limits(recorded):
-    for outputs in (surfaces.SURFACES, surfaces.NORMALS, surfaces.EMISSION):
+    for outputs in (surfaces.SURFACES, surfaces.NORMALS, surfaces.REBOUNDS, surfaces.EMISSION):
         [info] = recorded(lambda outputs=outputs: surfaces._shader(outputs))
         check(info)
     for info in (*recorded(renderer.PicturePass), *recorded(lighting.HorizonPass)):

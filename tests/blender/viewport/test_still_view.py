@@ -30,10 +30,11 @@ SIZE = (72, 48)
 
 
 def set_up_scene():
-    """A textured floor, a smooth metal sphere and a glowing sign, lit from two sides; through a shifted, turned camera
-    with pixels that are no squares. The camera."""
+    """A textured, dusty floor, a smooth metal sphere and a glowing sign, lit from two sides; through a shifted, turned
+    camera with pixels that are no squares. The camera."""
     scene = parts.empty_scene(*SIZE)
-    floor = textured("floor", "Base Color")[0]
+    floor, node, _ = textured("floor", "Base Color")
+    node.inputs["Diffuse Roughness"].default_value = 0.8
     parts.add_plane(floor, size=6.0)
     metal = parts.bsdf_material("ShaderNodeBsdfAnisotropic", "metal", Color=(0.9, 0.7, 0.4, 1.0), Roughness=0.3)[0]
     parts.add_sphere(metal, radius=0.8, location=(-0.4, 0.2, 0.8))

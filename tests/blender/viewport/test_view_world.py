@@ -49,9 +49,10 @@ def add_constant():
 
 
 def set_up_scene(add_world):
-    """A rough metal ball, a wall and a floor that shade each other, all lit by the world alone."""
+    """A rough metal ball, a wall and a floor of dust that shade each other, all lit by the world alone."""
     scene = parts.empty_scene(*SIZE)
-    parts.add_plane(parts.principled("floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0], size=4.0)
+    dust = {"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6, "Diffuse Roughness": 1.0}
+    parts.add_plane(parts.principled("floor", **dust)[0], size=4.0)
     metal = parts.bsdf_material("ShaderNodeBsdfAnisotropic", "metal", Color=(0.9, 0.7, 0.4, 1.0), Roughness=0.4)[0]
     parts.add_sphere(metal, radius=0.7, location=(-0.5, 0.2, 0.7))
     parts.add_plane(None, name="Wall", size=1.5, location=(0.9, 0.6, 0.75), rotation=(1.5, 0.0, -0.5))

@@ -220,12 +220,35 @@ BRUSHED = (
 )
 
 
+def rough_normal_map():
+    material = normal_map()
+    node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
+    fill(node, {"Diffuse Roughness": 0.7})
+    return material
+
+
+def rough(roughness, color=RED):
+    return ("BsdfDiffuse", {"Color": color, "Roughness": roughness})
+
+
+ROUGH = (
+    made("rough chalk", *rough(1.0)),
+    made("smooth chalk", *rough(0.0)),
+    bsdf("rough plastic", Base_Color=AMBER, Roughness=0.3, Diffuse_Roughness=0.5),
+    coated("rough under a coat", Diffuse_Roughness=0.8, Coat_Roughness=0.2, Sheen_Weight=0.5),
+    rough_normal_map,
+    made("two roughs", "MixShader", {0: 0.4, 1: rough(0.3), 2: rough(0.9, GOLD)}),
+    made("rough and brushed", "MixShader", {0: 0.4, 1: rough(0.6), 2: ("BsdfAnisotropic", {"Anisotropy": 0.6})}),
+    bsdf("rough image", Diffuse_Roughness=0.6, Base_Color=("TexImage", {"image": "colors"})),
+)
+
+
 @edits_with_graphics
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
 @pytest.mark.parametrize(
     "materials",
-    [MATERIALS, SCATTERED, LAYERED, MASKED, BRUSHED],
-    ids=["plain", "scattered", "layered", "masked", "brushed"],
+    [MATERIALS, SCATTERED, LAYERED, MASKED, BRUSHED, ROUGH],
+    ids=["plain", "scattered", "layered", "masked", "brushed", "rough"],
 )
 def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind):
     passes = shading.PASSES if kind == "PERSP" else ("specular",)

@@ -5,8 +5,13 @@ struct diffuse_lobe {
     ltsh_frame frame; float a; float b;
 #endif
 };
+#ifdef LTSH_ROUGH
+/* Integral of the direction over a polygon, times 2, and those of rough.glsl. */
+struct diffuse_sum { vec3 total; vec2 rough; };
+#else
 /* Integral of the direction over a polygon, times 2. */
 struct diffuse_sum { vec3 total; };
+#endif
 
 vec3 diffuse_warped(diffuse_lobe lobe, vec3 v)
 {
@@ -24,6 +29,9 @@ diffuse_sum diffuse_empty()
 {
     diffuse_sum sum;
     sum.total = vec3(0.0);
+#ifdef LTSH_ROUGH
+    sum.rough = vec2(0.0);
+#endif
     return sum;
 }
 
@@ -31,12 +39,18 @@ diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 {
     ltsh_edge edge = ltsh_edge_between(start, end);
     sum.total += edge.phi * edge.normal;
+#ifdef LTSH_ROUGH
+    sum.rough += ltsh_rough_edge(start, end);
+#endif
     return sum;
 }
 
 diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle)
 {
     sum.total += 2.0 * solid_angle * direction;
+#ifdef LTSH_ROUGH
+    sum.rough += solid_angle * ltsh_rough_spot(direction);
+#endif
     return sum;
 }
 
@@ -74,6 +88,9 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     lobe.a = fuzzy ? -point.ior : 1.0;
     lobe.b = fuzzy ? point.roughness : 0.0;
 #endif
+#ifdef LTSH_ROUGH
+    ltsh_set_rough(lobe.plane_0, point.view, texelFetch(rebounds, texel, 0));
+#endif
     return lobe;
 }
 
@@ -91,12 +108,25 @@ float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
 #endif
 }
 
+#ifdef LTSH_ROUGH
+/* The form factors of light that is scattered once, and of the rest. */
+vec2 diffuse_rough_factors(diffuse_lobe lobe, diffuse_sum sum)
+{
+    float plain = max(-0.5 * LTSH_ONE_OVER_PI * dot(lobe.plane_0, sum.total), 0.0);
+    float shadowed = diffuse_form_factor(lobe, sum);
+    return (plain > 0.0 ? shadowed / plain : 0.0) * ltsh_rough_factors(plain, sum.rough);
+}
+#endif
+
 /* Can the lobe be integrated over a cap of the sphere by `diffuse_of_cap`? */
 bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
 {
     bool has = whole || (lobe.is_spare && lobe.bump_alpha2 == 0.0);
 #ifdef LTSH_SHEEN
     has = has && lobe.a == 1.0 && lobe.b == 0.0;
+#endif
+#ifdef LTSH_ROUGH
+    has = has && ltsh_rough_terms.y == 0.0;
 #endif
     return has;
 }

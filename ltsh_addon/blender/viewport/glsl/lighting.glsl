@@ -134,7 +134,7 @@ void main()
 #endif
 #endif
     vec3 radiance = vec3(0.0);
-#if defined(LTSH_SPECULAR) || defined(LTSH_SHEEN)
+#if defined(LTSH_SPECULAR) || defined(LTSH_SHEEN) || defined(LTSH_ROUGH)
     point.view = view.w > 0.0 ? ltsh_unit(view.xyz - position.xyz) : view.xyz;
 #endif
 #ifdef LTSH_SPECULAR

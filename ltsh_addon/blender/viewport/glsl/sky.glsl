@@ -72,6 +72,31 @@ vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights we
 }
 #endif
 
+#ifdef LTSH_ROUGH
+/* What a rough diffuse lobe reflects more than Lambert's, at points as they lie for that. */
+vec3 ltsh_rough_sky(vec4 mean)
+{
+    vec2 terms = ltsh_rough_terms;
+    vec2 all_of_it = vec2(LTSH_PI * terms.x + terms.y * rough_slope(ltsh_rough_view.x),
+                          LTSH_PI * (1.0 - LTSH_PI * terms.x - 2.0 * terms.y * ltsh_mean_slope_above(0.0)));
+    vec3 radiance = mean.rgb * (all_of_it.x + all_of_it.y * ltsh_rebound - 1.0);
+    int count = terms.y > 0.0 && mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
+    for (int k = 0; k < count; ++k) {
+        float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
+        float angle = 2.3999632 * float(k) + jitter.y;
+        float height = sqrt(1.0 - squared);
+        vec3 local = vec3(sqrt(squared) * vec2(cos(angle), sin(angle)), height);
+        vec3 direction = local.x * ltsh_rough_x + local.y * ltsh_rough_y + height * ltsh_rough_z;
+        float solid_angle = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
+        vec2 factors = solid_angle * ltsh_rough_factors(height * LTSH_ONE_OVER_PI, -ltsh_rough_spot(direction));
+        vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
+        vec3 more = factors.x + factors.y * ltsh_rebound - 1.0 / float(LTSH_SKY_POINTS);
+        radiance += more * (picture - mean.rgb);
+    }
+    return terms.y > 0.0 ? radiance : vec3(0.0);
+}
+#endif
+
 #ifdef LTSH_DIFFUSE
 /* Of the part below a second horizon as much is missing as of a world that is the same everywhere. */
 vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
@@ -82,6 +107,9 @@ vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
     if (mean.w > 0.0) {
         light = ltsh_sky_at(lobe.plane_0, ivec2(0, LTSH_SKY_SIZE + 3), LTSH_IRRADIANCE_SIZE);
     }
+#ifdef LTSH_ROUGH
+    light += ltsh_rough_sky(mean);
+#endif
     return light * diffuse_form_factor(lobe, sum);
 }
 #endif

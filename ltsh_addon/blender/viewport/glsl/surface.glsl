@@ -80,6 +80,10 @@ void main()
   float ratio = alphas.x > 0.0 ? sqrt(alphas.y / alphas.x) : 1.0;
   vec3 axis = int(look.data[0].x + 0.5) == GLOSSY ? specular_normal : diffuse_normal;
   out_tangent = vec4(turned_tangent(smooth_normal, axis), 1.0 - ratio);
+#elif defined(DRAWS_REBOUNDS)
+  vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
+  float sigma = look.data[LAYERS + 3].z;
+  out_rebound = vec4(rebound_of(color, clamp(dot(diffuse_normal, towards_eye), 0.0, 1.0), sigma), sigma);
 #else
   out_geometric_normal = vec4(true_normal, 0.0);
   if (int(look.data[0].x + 0.5) == TRANSLUCENT) {

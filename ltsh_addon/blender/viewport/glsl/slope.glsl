@@ -1,0 +1,8 @@
+/* What B adds to the albedo of a rough diffuse surface, seen or lit under `cosine`: `shading.diffuse.albedo_slope`. */
+float rough_slope(float cosine)
+{
+    float root = sqrt(max(1.0 - cosine, 0.0));
+    float value = 0.0;
+@SLOPE@
+    return root * value;
+}

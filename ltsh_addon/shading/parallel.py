@@ -475,6 +475,17 @@ class Keeper(Child):
                 return self._answers.get(timeout=PATIENCE_SECONDS)
         return None
 
+    def poll(self, seconds: float):
+        """An answer, None where there is none within some seconds."""
+        with suppress(Empty):
+            return self._answers.get(timeout=seconds) if seconds > 0.0 else self._answers.get_nowait()
+        return None
+
+    @property
+    def is_gone(self) -> bool:
+        """Will there be no answer any more?"""
+        return not self._thread.is_alive() and self._answers.empty()
+
     def _feed(self):
         self.begin(self._task)
         self._task = b""

@@ -6,7 +6,7 @@ they go, `ratio` makes shares of what they meet (`visible_shares`), and `crew` d
 
 from __future__ import annotations
 
-from .crew import Company, Setting
+from .crew import Company, Mate, Setting
 from .directions import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import BLOCK_SAMPLES, Visibility, task_of_light, visible_shares
@@ -17,6 +17,7 @@ __all__ = [
     "BLOCK_SAMPLES",
     "Company",
     "Hits",
+    "Mate",
     "OccluderMesh",
     "Occluders",
     "Setting",

@@ -2,7 +2,8 @@
 
 Embree is called with Python's lock held, so that threads would not help. Children are started as those of
 `shading.parallel`, and open a tracer of their own. What happens in a block does not depend on who takes it.
-Those of a `Company` stay: each has some of the blocks, which one light after another lights.
+Those of a `Company` stay: each has some of the blocks, which one light after another lights. A `Mate` stays, too: it
+takes blocks as those of `run` do, and keeps them from one picture to the next.
 """
 
 from __future__ import annotations
@@ -132,6 +133,107 @@ class _Tracing(parallel.Child):
 
 
 # -- processes that stay ----------------------------------------------------------------------------------------------
+
+# Blocks that a mate has ahead: it need not wait for this process, and little is done in vain when a picture is stopped.
+AHEAD = 2
+
+
+class KeptBlocks:
+    """Answers blocks of samples with what a task finds; keeps those of one key, and where their rays start."""
+
+    def __init__(self, errand: Errand, tracer=None):
+        self._tracer = open_tracer(errand.occluders, [errand.library]) if tracer is None else tracer
+        self._key, self._blocks = None, {}
+
+    def shade(self, message):
+        """The answer to (run, task, key, number, block, normal): run, number, and what is found in the block (samples,
+        film), with `normal` as its geometric normals. The block may be left out where it is kept; without a key none
+        is."""
+        run, task, key, number, block, normal = message
+        if key is not None and key != self._key:
+            self._key, self._blocks = key, {}
+        kept = None if key is None else self._blocks.get(number)
+        if kept is None:
+            kept = *block, self._tracer.starts(block[0])
+            if key is not None:
+                self._blocks[number] = kept
+        samples, film, starts = kept
+        return run, number, task.shares(replace(samples, geometric_normal=normal), film, starts, self._tracer)
+
+
+class Mate:
+    """A process that traces beside this one, picture after picture, past the occluders of `tracer`, until `close`.
+
+    Both keep the samples of the `key` that was given last: these are sent once, but for their geometric normals, which
+    hang on the lights. The process is started where it is worth it. What is found does not hang on it.
+    """
+
+    def __init__(self, tracer):
+        self._tracer, self._own = tracer, KeptBlocks(None, tracer)
+        self._child: parallel.Keeper | None = None
+        self._is_possible = parallel.cores() > 1 and parallel.interpreter() is not None and tracer.library is not None
+        self._is_up, self._run = False, 0
+        self._key, self._sent = None, set()
+        self.key = None
+
+    def run(self, task, blocks: Sequence, is_worth: bool, progress: Progress | None) -> Iterator[tuple]:
+        """As the function `run`, of blocks of `key`; a process `is_worth` its start."""
+        if is_worth and self._child is None and self._is_possible:
+            errand = Errand(None, self._tracer.occluders, self._tracer.library)
+            self._child, self._is_up = parallel.Keeper("visibility.crew.KeptBlocks", worker.packed(errand)), False
+        self._run += 1
+        left, asked, missing = deque(range(len(blocks))), deque(), set(range(len(blocks)))
+        while missing:
+            if progress is not None and progress(_STAGE, 1.0 - len(missing) / len(blocks)) is False:
+                raise Cancelled("shadows were stopped")
+            # One block is for this process.
+            while self._child is not None and len(asked) < AHEAD and len(left) > 1:
+                asked.append(left.pop())
+                self._ask(task, asked[-1], blocks[asked[-1]])
+            found = self._answers(wait=not left)
+            if not found and (left or asked):
+                number = left.popleft() if left else asked.pop()
+                found = [self._own.shade(self._message(task, number, blocks[number], True))[1:]]
+            for number, shares in found:
+                if number in asked:
+                    asked.remove(number)
+                if number in missing:
+                    missing.remove(number)
+                    yield number, shares
+
+    def _message(self, task, number, block, is_whole):
+        samples, film, _ = block
+        return self._run, task, self.key, number, (samples, film) if is_whole else None, samples.geometric_normal
+
+    def _ask(self, task, number, block):
+        if self.key is not None and self.key != self._key:
+            self._key, self._sent = self.key, set()
+        is_known = self.key is not None and number in self._sent
+        self._child.put(self._message(task, number, block, not is_known))
+        if self.key is not None:
+            self._sent.add(number)
+
+    def _answers(self, wait: bool) -> list:
+        """What the process has found for this run; `wait` a little for it."""
+        found = []
+        while self._child is not None:
+            answer = self._child.poll(parallel.PATIENCE_SECONDS if wait and self._is_up and not found else 0.0)
+            if answer is None:
+                break
+            self._is_up = True
+            if answer[0] == self._run:
+                found.append(answer[1:])
+        if self._child is not None and self._child.is_gone:
+            self._is_possible = False
+            self.close()
+        return found
+
+    def close(self) -> None:
+        """End the process; a later run may start another one."""
+        if self._child is not None:
+            self._child.end()
+        self._child, self._key, self._sent = None, None, set()
+
 
 # With fewer samples a process takes longer to start than to help.
 SAMPLES_WORTH_A_CHILD = 1 << 13

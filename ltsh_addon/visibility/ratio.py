@@ -124,6 +124,7 @@ def visible_shares(
     workers: int | None = None,
     progress: Progress | None = None,
     starts: Starts | None = None,
+    mate: crew.Mate | None = None,
 ) -> Visibility:
     """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights; from 16
     on four times as many, 1024 at most, for pairs that are much brighter than the picture.
@@ -132,7 +133,7 @@ def visible_shares(
     itself, Cycles chooses rays by its lobes alone. `tracer` is as `visibility.open_tracer`
     returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
     process. `progress` may return False to stop: Cancelled is raised. `starts` are as of `tracer.starts(samples)`, for
-    callers that know them.
+    callers that know them. A `mate` of the tracer takes the place of `workers`.
     """
     if not PROBES <= rays <= MOST_RAYS:
         raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
@@ -150,8 +151,12 @@ def visible_shares(
     mixed, traced = np.zeros(shape, bool), 0
     blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
     parts = (tuple(None if one is None else one.take(block) for one in (samples, film, starts)) for block in blocks)
-    wanted = workers if seconds > SECONDS_WORTH_A_CHILD else 1
-    for number, found in crew.run(task, tracer, list(parts), wanted, progress):
+    is_worth = seconds > SECONDS_WORTH_A_CHILD
+    if mate is None:
+        found_parts = crew.run(task, tracer, list(parts), workers if is_worth else 1, progress)
+    else:
+        found_parts = mate.run(task, list(parts), is_worth, progress)
+    for number, found in found_parts:
         block = blocks[number]
         for name in passes:
             shares[name][:, block] = getattr(found, name)

@@ -35,11 +35,11 @@ def scene(monkeypatch):
         def shares(**options):
             return ratio.visible_shares(samples, [panel()], tracer, rays=32, film=film, **options)
 
-        yield shares, started
+        yield shares, started, tracer
 
 
 def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
-    shares, started = scene
+    shares, started, _ = scene
     alone = shares(workers=1)
     assert not started and 0.1 < alone.mixed.mean() < 0.9
     # This process leaves most to the children.
@@ -56,8 +56,41 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
     assert sorted(by) == sorted(2 * list(range(8)))
 
 
+def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch):
+    shares, started, tracer = scene
+    alone = shares(workers=1)
+    monkeypatch.setattr(parallel, "cores", lambda: 2)
+    asked, put = [], parallel.Keeper.put
+    monkeypatch.setattr(parallel.Keeper, "put", lambda self, question: (asked.append(question), put(self, question)))
+    mate = crew.Mate(tracer)
+    try:
+        for number, key in enumerate(("first", "first", "second", None, "second")):
+            if number == 2:
+                # What was asked last is not waited for, and is not taken for an answer later on.
+                with pytest.raises(Cancelled):
+                    shares(mate=mate, progress=lambda stage, share: share < 0.5)
+            mate.key, _ = key, asked.clear()
+            found = shares(mate=mate)
+            while mate._child is not None and not mate._is_up:  # the first time this process may do it all
+                mate._answers(wait=True)
+            for name in PASSES:
+                np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+            assert found.rays == alone.rays
+            blocks = [question[3] for question in asked if question[4] is not None]
+            assert asked and len(blocks) == len(set(blocks))
+            if number == 1:
+                assert len(blocks) < len(asked), "some are known"
+        assert len(started) == 1 and started[0].poll() is None
+        started[0].kill()
+        started[0].wait()
+        np.testing.assert_array_equal(shares(mate=mate).diffuse, alone.diffuse)
+    finally:
+        mate.close()
+    assert len(started) == 1
+
+
 def test_what_a_child_does_not_do_is_done_here(scene, monkeypatch, caplog):
-    shares, started = scene
+    shares, started, _ = scene
     alone = shares(workers=1)
     monkeypatch.setattr(parallel, "interpreter", lambda: "/bin/false")
     with caplog.at_level(logging.WARNING):
@@ -67,7 +100,7 @@ def test_what_a_child_does_not_do_is_done_here(scene, monkeypatch, caplog):
 
 
 def test_a_stop_leaves_no_process(scene):
-    shares, started = scene
+    shares, started, _ = scene
     with pytest.raises(Cancelled):
         shares(workers=2, progress=lambda stage, share: share < 0.2)
     assert started and all(process.poll() is not None for process in started)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
-from ...visibility import Occluders, Tracer, open_tracer, visible_shares
+from ...visibility import Mate, Occluders, Tracer, open_tracer, shared_numbers, visible_shares
 from ..process.blender_process import embree_libraries
 from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
@@ -23,11 +24,12 @@ _SHARE_BYTES = 4
 
 
 class _Tracing:
-    """A tracer of occluders around an origin, which changes rarely: single precision is best near it."""
+    """A tracer of occluders around an origin, which changes rarely: single precision is best near it; and its mate."""
 
     def __init__(self, occluders: Occluders):
         self._occluders = occluders
         self._tracer: Tracer | None = None
+        self.mate: Mate | None = None
         self._origin = np.zeros(3)
 
     def around(self, origin: np.ndarray) -> Tracer:
@@ -36,8 +38,14 @@ class _Tracing:
             matrices = np.array(self._occluders.matrices, np.float64)
             matrices[:, :, 3] -= origin
             self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
-            self._origin = np.array(origin)
+            self.close()
+            self.mate, self._origin = Mate(self._tracer), np.array(origin)
         return self._tracer
+
+    def close(self) -> None:
+        """End the process of the mate."""
+        if self.mate is not None:
+            self.mate.close()
 
 
 class ShadowRays:
@@ -100,6 +108,43 @@ COARSE_POINTS = 8000
 FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
 # Occluders that take longer to collect are collected when no object moves any more.
 QUICK_SECONDS = 0.03
+# Emitters whose shares are kept where those of the next ones are stopped.
+BATCH = 4
+# Where a light does not move for so long after its coarse shadows, finer ones follow.
+PAUSE_SECONDS = 0.15
+
+
+class _Points:
+    """Every `step`-th pixel of a G-buffer in either direction. The thread of the window reads them, the thread that
+    traces makes samples of them."""
+
+    def __init__(self, step: int, gbuffer: GBufferTextures, view: View):
+        self._step, self._view, (width, height) = step, view, gbuffer.size
+        self._texels, self._samples, self._normal = _texels(gbuffer, step), None, None
+        positions, first = self._texels["position"], step // 2
+        rows, columns = positions.shape[:2]
+        stretch = np.eye(4)
+        for axis, (whole, part) in enumerate(((width, columns), (height, rows))):
+            stretch[axis, axis] = whole / (part * step)
+            stretch[axis, 3] = 2.0 / part * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
+        # The grid that these pixels are: positions (H, W, 4) and projection.
+        self.grid = positions, stretch @ view.projection
+
+    def follow(self, gbuffer: GBufferTextures) -> None:
+        """Read again what hangs on the lights."""
+        if gbuffer.geometric_normal is not None:
+            self._normal = _every(gbuffer.geometric_normal, self._step)
+
+    def samples(self) -> tuple[SurfaceSamples, Film]:
+        """The samples, and their film."""
+        if self._samples is None:
+            self._samples, self._texels = _samples_of(self._texels, self._view), None
+        samples, pixel = self._samples
+        if self._normal is not None:
+            normal = _unit(self._normal.reshape(-1, 4)[pixel].astype(np.float64))
+            samples = replace(samples, geometric_normal=normal)
+        rows, columns = self.grid[0].shape[:2]
+        return samples, Film(columns, rows, pixel)
 
 
 @dataclass(frozen=True)
@@ -113,28 +158,50 @@ class _Request:
     numbers: tuple
     keys: tuple
     lights: tuple[Lights, ...]
-    samples: SurfaceSamples
-    film: Film
+    points: _Points
     rays: int
     tracing: _Tracing
     origin: np.ndarray
 
-    def shares(self, progress: Callable) -> np.ndarray:
-        """(L, H, W, 2), row 0 at the bottom."""
-        first = np.cumsum([0, *map(len, self.lights)])[:-1]
-        found = visible_shares(
-            self.samples,
-            [light for lights in self.lights for light in lights],
-            self.tracing.around(self.origin),
-            rays=self.rays,
-            film=self.film,
-            workers=1,
-            progress=progress,
-        )
-        values = np.ones((len(self.lights), self.film.height * self.film.width, len(PASSES)), np.float32)
-        for index, name in enumerate(PASSES):
-            values[:, self.film.pixel, index] = found.of_lights(name)[first]
-        return values.reshape(len(self.lights), self.film.height, self.film.width, len(PASSES))
+    @property
+    def is_own(self) -> bool:
+        """Is it for a group of points?"""
+        return self.level == len(LEVELS)
+
+    def shares(self, progress: Callable) -> dict[int, np.ndarray]:
+        """(H, W, 2), row 0 at the bottom, by the place of a light in `keys`. Where they are stopped those of the first
+        lights; Cancelled is raised where there are none, or not all for a group of points."""
+        samples, film = self.points.samples()
+        tracer, found = self.tracing.around(self.origin), {}
+        self.tracing.mate.key = self.state if self.level == 1 else None
+        lights = [light for lights in self.lights for light in lights]
+        starts = np.cumsum([0, *map(len, self.lights)])[:-1]
+        place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
+        groups = shared_numbers(lights, tracer)
+        step = BATCH if self.level == 1 else len(groups)
+        for start in range(0, len(groups), step):
+            chosen = [number for group in groups[start : start + step] for number in group]
+            try:
+                seen = visible_shares(
+                    samples,
+                    [lights[number] for number in chosen],
+                    tracer,
+                    rays=self.rays,
+                    film=film,
+                    mate=self.tracing.mate,
+                    progress=progress,
+                )
+            except Cancelled:
+                if not found:
+                    raise
+                break
+            by_pass = [seen.of_lights(name) for name in PASSES]
+            for row, number in enumerate(chosen):
+                if number in place_of:
+                    values = np.ones((film.height * film.width, len(PASSES)), np.float32)
+                    values[film.pixel] = np.stack([shares[row] for shares in by_pass], axis=-1)
+                    found[place_of[number]] = values.reshape(film.height, film.width, len(PASSES))
+        return found
 
 
 class LiveShadows:
@@ -152,14 +219,17 @@ class LiveShadows:
         self._own: tuple[int, ShareGrid | None] = (0, None)  # of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._request: _Request | None = None
-        self._outcome: np.ndarray | Exception | None = None
+        self._request: _Request | None = None  # that the thread does, or has done last
+        self._outcomes: deque[tuple[_Request, dict[int, np.ndarray] | Exception]] = deque()
+        self._is_left = False
         self._scene, self._collect, self._collected, self._scene_before = None, None, None, None
         self._tracing: _Tracing | None = None
         self._collect_seconds = 0.0
         # The lights, those of a sky as one, and what was given.
         self._lights, self._keys, self._given = (), (), None
         self._wanted: tuple = ()
+        # By whether they are coarse the points of a state.
+        self._pixels: dict[bool, tuple[tuple, _Points]] = {}
         # Of the state that was traced last: shares (H, W, 2) by the key of a light and level, and by whether they are
         # coarse the positions and the projection of their points.
         self._state: tuple = ()
@@ -183,37 +253,44 @@ class LiveShadows:
 
     @property
     def has_news(self) -> bool:
-        """Has the thread ended?"""
-        return self._thread is not None and not self._thread.is_alive()
+        """Has the thread found something, or ended?"""
+        return self._thread is not None and (bool(self._outcomes) or not self._thread.is_alive())
 
     def stop(self) -> None:
-        """Let the thread end soon."""
+        """Let the thread end soon, and what helps it."""
+        self._is_left = True
         self._stop.set()
+        if self._tracing is not None and (self._thread is None or not self._thread.is_alive()):
+            self._tracing.close()
 
     def take_news(self) -> None:
         """Take over what the thread has found; pictures are to be drawn anew where `version` is another one then."""
         if not self.has_news:
             return
-        request, outcome, self._thread = self._request, self._outcome, None
-        is_own = request.level == len(LEVELS)
-        if is_own and not isinstance(outcome, Exception):
+        if not self._thread.is_alive():
+            self._thread = None
+        while self._outcomes:
+            self._take(*self._outcomes.popleft())
+
+    def _take(self, request: _Request, outcome: dict[int, np.ndarray] | Exception) -> None:
+        if request.is_own and not isinstance(outcome, Exception):
             if (request.state, request.keys) == (self._wanted, self._keys):
-                height, width = outcome.shape[1:3]
-                positions, projection = self._new_points
-                grid = ShareGrid(_upload(outcome, (width, height)), float_texture(positions), projection)
+                positions, projection = request.points.grid
+                values = np.stack([outcome[place] for place in range(len(request.keys))])
+                grid = ShareGrid(_upload(values, positions.shape[1::-1]), float_texture(positions), projection)
                 self._own = request.group, grid
             return
-        self.version += not (is_own and isinstance(outcome, Cancelled))
+        self.version += not (request.is_own and isinstance(outcome, Cancelled))
         if isinstance(outcome, Exception):
             self.problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
             return
         if request.state != self._state:
             self._state, self._known, self._points, self._latest = request.state, {}, {}, {}
-        self._points[request.level == 0] = self._new_points
+        self._points[request.level == 0] = request.points.grid
         self._known = {key: levels for key, levels in self._known.items() if key in self._keys}
-        for number, key, values in zip(request.numbers, request.keys, outcome, strict=True):
-            self._known.setdefault(key, {})[request.level] = values
-            self._latest[number] = {request.level: values}
+        for place, values in outcome.items():
+            self._known.setdefault(request.keys[place], {})[request.level] = values
+            self._latest[request.numbers[place]] = {request.level: values}
         self._origin = request.origin
         self._show()
 
@@ -239,7 +316,7 @@ class LiveShadows:
                 self._begin(level, gbuffer, view)
             except Exception as error:
                 self.problem = f"shadows: {error_line(error)}"
-        elif self._thread is not None and self._request.level > 0 and self._request.state != self._wanted:
+        elif self._thread is not None and self._is_outdated:
             self._stop.set()
         if number > 0 and not self._is_off:
             if number // GROUP == self._own[0] and self._own[1] is not None:
@@ -249,6 +326,12 @@ class LiveShadows:
             self.waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         return self._grid if fits else None
+
+    @property
+    def _is_outdated(self) -> bool:
+        """Does the thread refine shadows of another view, or of a light that has moved?"""
+        request = self._request
+        return request.level > 0 and (request.state != self._wanted or not set(request.keys) <= set(self._keys))
 
     @property
     def _is_off(self) -> bool:
@@ -275,42 +358,69 @@ class LiveShadows:
     def _begin(self, level: int, gbuffer: GBufferTextures, view: View) -> None:
         if self._collected != self._scene:
             start = time.perf_counter()
+            if self._tracing is not None:
+                self._tracing.close()
             self._tracing, self._collected = _Tracing(self._collect()), self._scene
             self._collect_seconds = time.perf_counter() - start
+        requests = [self._request_of(level, gbuffer, view)]
+        if level == 0 and self._pixels.get(False, (None,))[0] == self._wanted:
+            requests.append(self._request_of(1, gbuffer, view))
+        self._start(requests)
+
+    def _request_of(self, level: int, gbuffer: GBufferTextures, view: View) -> _Request:
+        """For the lights that do not have a level yet."""
+        step, rays = LEVELS[level]
+        state, points = self._pixels.get(level == 0, (None, None))
+        if state == self._wanted:
+            points.follow(gbuffer)
+        else:
+            points = _Points(step or coarse_step(gbuffer.size), gbuffer, view)
+            self._pixels[level == 0] = self._wanted, points
         known = self._known if self._wanted == self._state else {}
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
-        step, rays = LEVELS[level]
-        self._start(level, numbers, (step or coarse_step(gbuffer.size), rays), gbuffer, view)
+        return self._request_for(numbers, points, rays, view, level)
 
     def _begin_own(self, group: int, gbuffer: GBufferTextures, view: View) -> None:
-        self._start(len(LEVELS), tuple(range(len(self._keys))), (1, GROUP_RAYS), gbuffer, view, group)
+        points = _Points(1, gbuffer, view)
+        request = self._request_for(tuple(range(len(self._keys))), points, GROUP_RAYS, view, len(LEVELS))
+        self._start([replace(request, group=group)])
 
-    def _start(self, level: int, numbers: tuple, effort: tuple[int, int], gbuffer, view: View, group: int = 0) -> None:
-        """Let the thread trace lights with an effort: every so many pixels, so many rays."""
-        step, rays = effort
-        samples, film, self._new_points = _every(step, gbuffer, view)
-        self._request = _Request(
+    def _request_for(self, numbers: tuple, points: _Points, rays: int, view: View, level: int) -> _Request:
+        """For the lights of some numbers."""
+        return _Request(
             state=self._wanted,
             level=level,
-            group=group,
+            group=0,
             numbers=numbers,
             keys=tuple(self._keys[n] for n in numbers),
             lights=tuple(self._lights[n] for n in numbers),
-            samples=samples,
-            film=film,
+            points=points,
             rays=rays,
             tracing=self._tracing,
             origin=view.origin.copy(),
         )
+
+    def _start(self, requests: list[_Request]) -> None:
+        """Let the thread trace, one request after another."""
         self._stop.clear()
-        self._thread = threading.Thread(target=self._trace, args=(self._request,), name="LTSH shadows", daemon=True)
+        self._request, self._is_left = requests[0], False
+        self._thread = threading.Thread(target=self._trace, args=(requests,), name="LTSH shadows", daemon=True)
         self._thread.start()
 
-    def _trace(self, request: _Request) -> None:
-        try:
-            self._outcome = request.shares(lambda stage, fraction: not self._stop.is_set())
-        except Exception as error:
-            self._outcome = error
+    def _trace(self, requests: list[_Request]) -> None:
+        for number, request in enumerate(requests):
+            if number > 0 and self._stop.wait(PAUSE_SECONDS):
+                break
+            self._request = request
+            try:
+                outcome = request.shares(lambda stage, fraction: not self._stop.is_set())
+            except Exception as error:
+                outcome = error
+            self._outcomes.append((request, outcome))
+            if isinstance(outcome, Exception):
+                break
+        if self._is_left:
+            requests[0].tracing.close()
 
     def _show(self) -> None:
         """Make the grid of what is known; a light of which nothing is known keeps what is known of its place."""
@@ -349,19 +459,9 @@ def _shape_of_sky(sides: Lights) -> str:
     return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
 
 
-def _every(step: int, gbuffer: GBufferTextures, view: View):
-    """Samples of every `step`-th pixel in either direction, their film, and the grid that these pixels are: positions
-    (H, W, 4) and projection."""
-    samples, texel = gbuffer_samples(gbuffer, view, step)
-    width, height = gbuffer.size
-    first = step // 2
-    columns, rows = len(range(first, width, step)), len(range(first, height, step))
-    positions = read_texture(gbuffer.position)[first::step, first::step]
-    stretch = np.eye(4)
-    for axis, (whole, part) in enumerate(((width, columns), (height, rows))):
-        stretch[axis, axis] = whole / (part * step)
-        stretch[axis, 3] = 2.0 / part * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
-    return samples, Film(columns, rows, texel), (positions, stretch @ view.projection)
+def _every(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
+    """Every `step`-th texel (H, W, 4) in either direction."""
+    return np.ascontiguousarray(read_texture(texture)[step // 2 :: step, step // 2 :: step])
 
 
 def too_many(lights: int, size: tuple[int, int]) -> str:
@@ -372,24 +472,27 @@ def too_many(lights: int, size: tuple[int, int]) -> str:
     return f"shadows are not drawn: those of {lights} lights need {needed / 2**30:.1f} GiB of graphics memory"
 
 
-def gbuffer_samples(gbuffer: GBufferTextures, view: View, step: int = 1) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples (P) that every `step`-th texel of a G-buffer holds, around the origin of `view`, and their numbers
-    among all of those texels, from the lower left."""
+def _texels(gbuffer: GBufferTextures, step: int = 1) -> dict[str, np.ndarray]:
+    """What every `step`-th texel of a G-buffer holds, by name, (H, W, 4)."""
+    textures = {name: getattr(gbuffer, name) for name in (*_ALWAYS, *_PERHAPS)}
+    return {name: _every(texture, step) for name, texture in textures.items() if texture is not None}
 
-    def texels(texture: gpu.types.GPUTexture) -> np.ndarray:
-        return read_texture(texture)[step // 2 :: step, step // 2 :: step].reshape(-1, 4).astype(np.float64)
 
-    position = texels(gbuffer.position)
-    pixel = np.flatnonzero(position[:, 3] > 0.0)
-    position = position[pixel]
-    normal, base, f0, f90, dielectric = (
-        texels(texture)[pixel]
-        for texture in (gbuffer.normal, gbuffer.base, gbuffer.f0, gbuffer.f90, gbuffer.dielectric)
-    )
-    further = {
-        name: None if getattr(gbuffer, name) is None else texels(getattr(gbuffer, name))[pixel]
-        for name in ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
-    }
+_ALWAYS = ("position", "normal", "base", "f0", "f90", "dielectric")
+_PERHAPS = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
+
+
+def gbuffer_samples(gbuffer: GBufferTextures, view: View) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples (P) that a G-buffer holds, around the origin of `view`, and the numbers of their texels from the
+    lower left."""
+    return _samples_of(_texels(gbuffer), view)
+
+
+def _samples_of(texels: dict[str, np.ndarray], view: View) -> tuple[SurfaceSamples, np.ndarray]:
+    pixel = np.flatnonzero(texels["position"][:, :, 3] > 0.0)
+    values = {name: rows.reshape(-1, 4)[pixel].astype(np.float64) for name, rows in texels.items()}
+    position, normal, base, f0, f90, dielectric = (values[name] for name in _ALWAYS)
+    further = {name: values.get(name) for name in _PERHAPS}
     bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
     tangent, rebound = further["tangent"], further["rebound"]
     return SurfaceSamples(

@@ -20,10 +20,12 @@ from view_pictures import textured
 from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
+from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
 from ltsh_addon.blender.viewport.still import view_of_camera
+from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[3]
 SIZE = (72, 48)
@@ -245,6 +247,27 @@ class LiveView:
         return self.drawn(self.live), request.numbers, request.level
 
 
+def stopped_shares(scene):
+    """Of which lights there are shares where finer ones of four lights are stopped: at once, and later."""
+    places, known = [], scene.live._known
+    scene.live._known = {}
+    request = scene.live._request_of(1, scene.renderer._surfaces._gbuffer, scene.view)
+    scene.live._known = known
+    for most in (0, 2):
+        left = list(range(most))
+
+        def go_on(*_, left=left):
+            return bool(left) and left.pop() >= 0
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(shadows, "BATCH", 1)
+            try:
+                places.append(set(request.shares(go_on)))
+            except Cancelled:
+                places.append(None)
+    return places
+
+
 def live_pictures():
     scene = LiveView()
     try:
@@ -258,14 +281,16 @@ def live_pictures():
         moved = replace(lights[0], center=lights[0].center + [0.0, 0.2, 0.1])
         scene.mirror.lights = (moved, *lights[1:])
         scene.drawn(scene.live)
-        after_move = scene.traced()[1:]
-        scene.live.stop()
         scene.live._thread.join()
+        after_move = [(request.numbers, request.level) for request, _ in scene.live._outcomes]
+        after_move = after_move, scene.drawn(scene.live), scene.drawn(ShadowRays(scene.occluders(), 256))
+        partial = stopped_shares(scene)
+        scene.drawn(scene.live)
         scene.live.follow((1,), lambda: 1 / 0)
         scene.live._scene_before = (1,)
         scene.live.take_news()
         scene.live.shares(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
-        return plain, exact, first, levels, rest, recolored, after_move, scene.live.problem
+        return plain, exact, first, levels, rest, recolored, after_move, partial, scene.live.problem
     finally:
         scene.live.stop()
         scene.renderer.free()
@@ -273,7 +298,7 @@ def live_pictures():
 
 @edits_with_graphics
 def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
-    plain, exact, first, levels, rest, (recolored, traces), after_move, problem = with_graphics(live_pictures)
+    plain, exact, first, levels, rest, (recolored, traces), moved, partial, problem = with_graphics(live_pictures)
     np.testing.assert_array_equal(first, plain)
     without = relative(plain, exact)
     coarse, fine = (relative(picture, exact) for picture, _, _ in levels)
@@ -282,8 +307,10 @@ def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
     assert without > 0.1 and coarse < 0.7 * without and fine < 0.05 and fine < coarse
     assert not rest and not traces, "at rest, and for other colors, nothing is traced"
     np.testing.assert_allclose(recolored, 2.0 * levels[-1][0], rtol=1e-3, atol=1e-5)
-    # Of the other lights all is known.
-    assert after_move == ((0,), 0)
+    # Of the other lights all is known; and the points need not be read again for the finer ones.
+    after_move, picture, expected = moved
+    assert after_move == [((0,), 0), ((0,), 1)] and relative(picture, expected) < 0.05
+    assert partial == [None, {0, 1}]
     assert problem == "shadows: division by zero"
 
 

@@ -119,6 +119,12 @@ class Look:
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
 
     @property
+    def is_bent(self) -> bool:
+        """May its index of refraction be below 1, where light is totally reflected?"""
+        ior = self.value("ior")
+        return self.kind == "glass" or not (ior.is_constant and ior.offset[0] >= 1.0)
+
+    @property
     def is_rough(self) -> bool:
         """Is its diffuse part rough?"""
         return self.kind in ROUGH_KINDS and self.value("diffuse_roughness").offset[0] > 0.0
@@ -349,8 +355,6 @@ class _Reader:
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
             self.note(f"distribution {node.distribution} is shown as GGX")
-        if "ior" in values and not (values["ior"].is_constant and values["ior"].offset[0] >= 1.0):
-            self.note("where its IOR is below 1, its reflectance is that for the mirror direction")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)

@@ -179,14 +179,16 @@ class LightingPass:
             sky=self._sky is not None,
             sheen=passes != "specular" and gbuffer.has_sheen,
             rough=passes != "specular" and gbuffer.rebound is not None,
+            bent=passes != "diffuse" and gbuffer.has_bent,
         )
         parts = [features]
         if features.specular and gbuffer.tangent is not None:
-            parts = [replace(features, brushing=True, brushed=is_brushed) for is_brushed in (False, True)]
+            # Anisotropic lobes are integrated with Fresnel's factor.
+            parts = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
         if features.specular and features.rough:
             # By itself: together they may read more textures than there can be.
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False}
-            alone = replace(features, specular=False, geometric=False)
+            alone = replace(features, specular=False, geometric=False, bent=False)
             parts = [*(replace(part, **none) for part in parts), alone]
         with nullcontext() if target is None else target.bind():
             previous = gpu.state.viewport_get(), gpu.state.blend_get()

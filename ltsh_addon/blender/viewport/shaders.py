@@ -94,6 +94,7 @@ class Features:
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
     rough: bool = False  # rough diffuse lobes
+    bent: bool = False  # dielectrics with an index of refraction below 1
     brushing: bool = False  # there are anisotropic lobes
     brushed: bool = False  # of these the pixels; else the others
 
@@ -156,6 +157,8 @@ def _lighting_source(table, features) -> str:
         parts.append(_brushed_text(features))
     elif features.specular:
         parts.append(_specular_text(table, is_cosine, features))
+    if features.bent:
+        parts.append(glsl("bent"))
     if features.rough:
         parts.append(_rough_text())
     if features.diffuse:

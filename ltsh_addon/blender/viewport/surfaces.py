@@ -175,8 +175,13 @@ class SurfacePass:
             textures = textures | self._draw_into(TANGENTS, instances, view, number)
         if any(_is_rough(look, number) for instance in instances for look in instance.looks):
             textures = textures | self._draw_into(REBOUNDS, instances, view, number)
-        lobes = (lobe.look for instance in instances for look in instance.looks for lobe in look.lobes[number:])
-        return GBufferTextures(**textures, has_sheen=any(look.kind == "sheen" for look in lobes))
+        shown = (look for instance in instances for look in instance.looks if self._draws(look))
+        lobes = [lobe.look for look in shown for lobe in look.lobes[number:]]
+        marks = {
+            "has_sheen": any(look.kind == "sheen" for look in lobes),
+            "has_bent": any(look.is_bent for look in lobes),
+        }
+        return GBufferTextures(**textures, **marks)
 
     def _target(self, outputs, is_further: bool):
         """Textures by name and the frame buffer that `outputs` are drawn into; those of further lobes have no depth."""

@@ -73,6 +73,7 @@ class GBufferTextures:
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness, None: 0 everywhere
     shares: ShareGrid | None = None  # all of each light is seen
     has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
+    has_bent: bool = False  # dielectrics with an index of refraction between 0 and 1
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:
@@ -80,7 +81,8 @@ class GBufferTextures:
         sizes = {
             field.name: (texture.width, texture.height)
             for field in fields(self)
-            if field.name not in ("shares", "has_sheen") and (texture := getattr(self, field.name)) is not None
+            if field.name not in ("shares", "has_sheen", "has_bent")
+            and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
             raise ValueError(f"G-buffer: textures have the sizes {sizes}, expected one size for all")
@@ -117,6 +119,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
     fuzzy = samples.sheen_a > 0.0
     return GBufferTextures(
         has_sheen=bool(fuzzy.any()),
+        has_bent=bool(((samples.ior < 1.0) & samples.dielectric.any(axis=1)).any()),
         position=texture(samples.position, 1.0 + samples.receiver),
         normal=texture(samples.normal, np.where(fuzzy, samples.sheen_b, samples.roughness)),
         base=texture(samples.diffuse_albedo, np.where(fuzzy, -samples.sheen_a, samples.ior)),

@@ -223,6 +223,40 @@ def test_rough_diffuse_lobes_beside_all_others_read_no_more_textures_than_there_
     assert excess(combined, specular + diffuse, 1e-6).max() <= 1.0
 
 
+# As far as the technique is off: of lights that hardly change over the lobe, others, and where horizons cut them.
+BENT = {"tiny disk": 1e-3, "bulb": 1e-3, "ball": 5e-3, "spot": 5e-3, "plain": 3e-2, "polygon": 3e-2, "near": 9e-2}
+
+
+def test_dielectrics_with_an_index_below_1_reflect_as_the_reference_has_it():
+    """All that is beyond their angle of total reflection; the others are what they were."""
+    random, count = np.random.default_rng(11), WIDTH * HEIGHT
+    samples, bent = random_surfaces.samples("plain", count, random), np.arange(count) % 4 > 0
+    samples = replace(
+        samples,
+        dielectric=np.where(bent[:, None], rounded(random.random((count, 3))), samples.dielectric),
+        ior=np.where(bent, rounded(random.uniform(0.5, 0.95, count)), samples.ior),
+    )
+
+    def compare():
+        lighting, canvas = LightingPass("ltsh4"), Canvas(WIDTH, HEIGHT)
+        for kind, most in BENT.items():
+            light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
+            lighting.set_lights([light])
+            found = drawn(lighting, samples, canvas, "specular")
+            expected, shaded = (
+                shading.shade(samples, [light], name, passes=("specular",), workers=1, dtype=np.float64).combined
+                for name in ("reference", "ltsh4")
+            )
+            for other, limit in ((expected, most), (shaded, 1e-2)):
+                distance = np.linalg.norm((found - other)[bent]) / np.linalg.norm(other[bent])
+                assert distance < limit, f"{kind}: {distance:.5f}"
+            plain = drawn(lighting, replace(samples, ior=np.maximum(samples.ior, 1.0)), canvas, "specular")
+            assert np.array_equal(found[~bent], plain[~bent])
+            assert np.linalg.norm((plain - expected)[bent]) > 0.05 * np.linalg.norm(expected[bent])
+
+    with_graphics(compare)
+
+
 BRUSHED = {"plain": 4e-3, "near": 1e-2, "disk": 4e-3, "spread": 4e-3, "spot": 1e-2}
 
 

@@ -231,6 +231,7 @@ def rough(roughness, color=RED):
     return ("BsdfDiffuse", {"Color": color, "Roughness": roughness})
 
 
+MASK = ("TexImage", {"image": "mask"})
 ROUGH = (
     made("rough chalk", *rough(1.0)),
     made("smooth chalk", *rough(0.0)),
@@ -242,13 +243,23 @@ ROUGH = (
     bsdf("rough image", Diffuse_Roughness=0.6, Base_Color=("TexImage", {"image": "colors"})),
 )
 
+BENT = (
+    bsdf("air in water", Base_Color=RED, IOR=0.75, Roughness=0.3),
+    bsdf("level", Base_Color=RED, IOR=0.8, Roughness=0.5, Specular_IOR_Level=0.8),
+    scattered("scattered", Base_Color=RED, IOR=0.6, Roughness=0.7, Specular_Tint=GOLD),
+    bsdf("half metal", Base_Color=GOLD, IOR=0.7, Roughness=0.4, Metallic=0.5),
+    bsdf("brushed", Base_Color=RED, IOR=0.8, Roughness=0.4, Anisotropic=0.6),
+    bsdf("IOR image", Base_Color=RED, Roughness=0.4, IOR=("Math", {"operation": "MULTIPLY", 0: MASK, 1: 1.8})),
+    bsdf("glass", "BsdfGlass", IOR=0.8, Roughness=0.3),
+)
+
 
 @edits_with_graphics
 @pytest.mark.parametrize("kind", ["PERSP", "ORTHO"])
 @pytest.mark.parametrize(
     "materials",
-    [MATERIALS, SCATTERED, LAYERED, MASKED, BRUSHED, ROUGH],
-    ids=["plain", "scattered", "layered", "masked", "brushed", "rough"],
+    [MATERIALS, SCATTERED, LAYERED, MASKED, BRUSHED, ROUGH, BENT],
+    ids=["plain", "scattered", "layered", "masked", "brushed", "rough", "bent"],
 )
 def test_the_viewport_shows_what_cycles_sampled(tmp_path, materials, kind):
     passes = shading.PASSES if kind == "PERSP" else ("specular",)

@@ -99,6 +99,9 @@ vec4 ltsh_limited(vec4 values, ltsh_point point, ltsh_light light, int header, v
 #if !defined(LTSH_COSINE) && !defined(LTSH_BRUSHED)
     values = specular_limited(values, point, light, ltsh_area(header, light), profile);
 #endif
+#ifdef LTSH_BENT
+    values = ltsh_bent_values(values, point, light, false);
+#endif
     return values;
 }
 #endif
@@ -177,6 +180,9 @@ void main()
         vec4 values = specular_values(weights, specular_at_center(sight, LTSH_PI));
 #if !defined(LTSH_COSINE) && !defined(LTSH_BRUSHED)
         values = specular_true_in_tails(values, point, light, ltsh_area(header, light));
+#endif
+#ifdef LTSH_BENT
+        values = ltsh_bent_values(values, point, light, true);
 #endif
         float factor = 1.0;
 #ifdef LTSH_FACING

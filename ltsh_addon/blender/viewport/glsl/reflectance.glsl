@@ -49,7 +49,8 @@ vec3 multiple_scattering(vec3 mean, vec2 albedo)
 
 float dielectric_average(float ior)
 {
-  return (ior - 1.0) / (AVERAGE_START + AVERAGE_SLOPE * ior);
+  float below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607));
+  return ior < 1.0 ? below : (ior - 1.0) / (AVERAGE_START + AVERAGE_SLOPE * ior);
 }
 
 float fresnel_of_dielectric(float cosine, float ior)
@@ -140,7 +141,8 @@ void add_dielectric(inout Lobe lobe, vec3 color, float share, float ior, float r
   float level = look.data[2].w;
   float f0 = pow((ior - 1.0) / (ior + 1.0), 2.0) * 2.0 * max(level, 0.0);
   float root = sqrt(min(f0, MAX_F0));
-  float used = level == 0.5 ? ior : (1.0 + root) / (1.0 - root);
+  float scaled = (1.0 + root) / (1.0 - root);
+  float used = level == 0.5 ? ior : (ior < 1.0 ? 1.0 / scaled : scaled);
   float plain = pow((used - 1.0) / (used + 1.0), 2.0);
   vec3 tinted = clamp(f0 * max(look.data[2].xyz, vec3(0.0)), vec3(0.0), vec3(1.0));
   float average = dielectric_average(used);
@@ -156,7 +158,7 @@ void add_dielectric(inout Lobe lobe, vec3 color, float share, float ior, float r
   lobe.f90 += constant_part;
   lobe.dielectric += (1.0 - tinted) / (1.0 - plain) * factor * share;
   lobe.diffuse += color * share * (1.0 - through) * left;
-  lobe.ior = max(used, 1.0);
+  lobe.ior = used;
 }
 
 Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float cosine)
@@ -179,7 +181,7 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
   }
   else if (kind == GLASS) {
     lobe.dielectric = color;
-    lobe.ior = max(ior, 1.0);
+    lobe.ior = ior;
   }
   else if (kind == CONDUCTOR || kind == CONDUCTOR_4_5) {
     vec3 factor = multiple_scattering(look.data[FIRST_TERM + 4].xyz, albedo);

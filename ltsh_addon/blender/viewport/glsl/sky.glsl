@@ -42,8 +42,15 @@ vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights we
     float stretch = abs(determinant(back));
 #endif
     specular_sum all_of_it = specular_of_part(lobe, specular_viewed(lobe, whole), whole, false);
-    vec3 radiance = mean.rgb * ltsh_reflected(point, specular_values(weights, all_of_it));
+    vec4 whole_values = specular_values(weights, all_of_it);
+    vec3 radiance = vec3(0.0);
+#ifdef LTSH_BENT
+    bool bent = ltsh_is_bent(point);
+    vec2 bent_sum = vec2(0.0);
+    int count = mean.w > 0.0 || bent ? LTSH_SKY_POINTS : 0;
+#else
     int count = mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
+#endif
     for (int k = 0; k < count; ++k) {
         float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
         float angle = 2.3999632 * float(k) + jitter.y;
@@ -65,10 +72,17 @@ vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights we
         vec4 values = specular_values(weights, specular_with_spot(specular_empty(), warped, -of_lobe));
 #endif
         bool above = all(greaterThan(specular_heights(lobe, direction, warped, 1.0), vec3(0.0)));
+#ifdef LTSH_BENT
+        values.w = bent ? values.x * ltsh_bent_fresnel(point, direction) : values.w;
+        bent_sum += above ? values.xw : vec2(0.0);
+#endif
         vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
         radiance += above ? ltsh_reflected(point, values) * (picture - mean.rgb) : vec3(0.0);
     }
-    return max(radiance, vec3(0.0));
+#ifdef LTSH_BENT
+    whole_values.w = bent ? whole_values.x * bent_sum.y / max(bent_sum.x, 1e-30) : whole_values.w;
+#endif
+    return max(radiance + mean.rgb * ltsh_reflected(point, whole_values), vec3(0.0));
 }
 #endif
 

@@ -50,7 +50,7 @@ void main()
   vec2 alphas = brushed_alphas(clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0));
   float roughness = sqrt(sqrt(alphas.x * alphas.y));
   float metallic = clamp(slot_value(metallic_image, METALLIC_SLOT, v_uv).x, 0.0, 1.0);
-  float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1.0);
+  float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1e-5);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
   vec3 weight = vec3(look.data[LAYERS].x);
   weight *= clamp(slot_value(weight_image, WEIGHT_SLOT, v_uv).x, 0.0, 1.0);
@@ -68,7 +68,8 @@ void main()
 #ifdef DRAWS_THROUGH
   out_through = vec4(weight * let_through(color, metallic, ior, cosine), 0.0);
 #elif defined(DRAWS_SURFACES)
-  Lobe lobe = lobe_of_look(color, roughness, metallic, ior, cosine);
+  bool leaves = backfacing && int(look.data[0].x + 0.5) == GLASS;
+  Lobe lobe = lobe_of_look(color, roughness, metallic, leaves ? 1.0 / ior : ior, cosine);
   out_position = vec4(v_position, 1.0 + placement.x);
   out_normal = vec4(specular_normal, lobe.roughness);
   out_base = vec4(weight * lobe.diffuse, lobe.ior);

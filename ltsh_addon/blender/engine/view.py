@@ -18,6 +18,7 @@ import numpy as np
 from ...imaging.exr import read_channels
 from ...imaging.report import index_stamp
 from ...scene import CYCLES, TECHNIQUES, error_line
+from ..evaluated import visibility
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
@@ -25,7 +26,7 @@ from ..ui import results
 from ..ui.drawing import PLATE, draw_rectangle
 from ..ui.job import output_folder
 from ..ui.preview import ENGINE
-from ..viewport.mirror import SceneMirror
+from ..viewport.mirror import LiveLamps, SceneMirror
 from ..viewport.renderer import ShownPicture, ViewRenderer
 from ..viewport.shadows import LiveShadows, too_many
 from ..viewport.sky import LiveWorld
@@ -61,7 +62,7 @@ class EngineView:
 
     def __init__(self):
         self._world = LiveWorld()
-        self.mirror = SceneMirror(self._world.look)
+        self.mirror = self._new_mirror()
         self._renderer: ViewRenderer | None = None
         self._reference = ReferenceTexture()
         self._error = ""
@@ -73,17 +74,28 @@ class EngineView:
 
     def __del__(self):
         self._shadows.stop()
+        _views.discard(self)
+        if not _views:
+            _lamps.stop()
+
+    def _new_mirror(self) -> SceneMirror:
+        return SceneMirror(self._world.look, _lamps.pattern)
 
     def update(self, context, depsgraph) -> None:
         """Take over what has changed in the scene."""
+        if any(isinstance(update.id, bpy.types.Image) for update in depsgraph.updates):
+            _lamps.note_images()
         try:
             self.mirror.sync(depsgraph, context.space_data)
             self._error = ""
         except Exception as error:
             self._note(error)
             # What was taken over half is read again as a whole.
-            self.mirror = SceneMirror(self._world.look)
-        if self._world.is_busy and not bpy.app.timers.is_registered(_look_at_worlds):
+            self.mirror = self._new_mirror()
+        self._wait_for_cycles()
+
+    def _wait_for_cycles(self) -> None:
+        if (self._world.is_busy or _lamps.is_busy) and not bpy.app.timers.is_registered(_look_at_worlds):
             bpy.app.timers.register(_look_at_worlds, first_interval=LOOK_SECONDS)
 
     def look_at_world(self) -> bool:
@@ -109,6 +121,9 @@ class EngineView:
         try:
             if self._renderer is None:
                 self._renderer = ViewRenderer()
+            if self.mirror.has_old_lights:
+                self.mirror.read_lights(depsgraph, visibility(depsgraph, context.space_data))
+                self._wait_for_cycles()
             region_data = context.region_data
             view = View.of(region_data.view_matrix, region_data.window_matrix, not region_data.is_perspective)
             settings, size = depsgraph.scene.ltsh_view, (region.width, region.height)
@@ -381,10 +396,11 @@ def _redraw_later(start: float, samples: int) -> None:
         bpy.app.timers.register(_redraw, first_interval=wait)
 
 
-# When a view was drawn last, and the shadows of all views.
+# When a view was drawn last, the shadows of all views, the views, and what they know of lights with nodes.
 _drawn = [0.0]
 _at_work: weakref.WeakSet = weakref.WeakSet()
 _views: weakref.WeakSet = weakref.WeakSet()
+_lamps = LiveLamps()
 
 
 def _look_for_shadows() -> float | None:
@@ -399,11 +415,16 @@ def _look_for_shadows() -> float | None:
 
 
 def _look_at_worlds() -> float | None:
-    """Show worlds in the views when Cycles has looked at them; look again while any is on its way."""
+    """Show worlds and lights in the views when Cycles has looked at them; look again while any is on its way."""
     views = list(_views)
-    if any([view.look_at_world() for view in views]):
+    news = [view.look_at_world() for view in views]
+    if views and _lamps.step(bpy.context.scene.frame_current):
+        news.append(True)
+        for view in views:
+            view.mirror.has_old_lights = True
+    if any(news):
         _tag_views()
-    return LOOK_SECONDS if any(view.waits_for_world for view in views) else None
+    return LOOK_SECONDS if any(view.waits_for_world for view in views) or (views and _lamps.is_busy) else None
 
 
 def _redraw() -> float | None:
@@ -600,6 +621,7 @@ def unregister() -> None:
             bpy.app.timers.unregister(timer)
     for shadows in _at_work:
         shadows.stop()
+    _lamps.stop()
     while _handle:
         bpy.types.SpaceView3D.draw_handler_remove(_handle.pop(), "WINDOW")
     _remove_classes()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Color, Euler, Matrix, Vector
 
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
 from ..materials.graph import Source, is_group, is_socket, shaders_behind, source_of, surface_of, tree_in_use, value_of
@@ -169,7 +169,7 @@ def falloff_left_out(blocks):
     """Meanwhile the Light Falloff nodes of materials and lights give their Strength, at any distance."""
     moved, smooths = [], []
     try:
-        for tree in _trees_of(blocks):
+        for tree in trees_of(blocks):
             for node in tree.nodes:
                 if node.bl_idname != LIGHT_FALLOFF:
                     continue
@@ -192,8 +192,8 @@ def falloff_left_out(blocks):
                 smooth.id_data.links.new(start, smooth)
 
 
-def _trees_of(blocks) -> list:
-    """The node trees of materials and lights and of the groups in them."""
+def trees_of(blocks) -> list:
+    """The node trees of materials, lights and worlds, and of the groups in them."""
     found, waiting = [], [tree_in_use(block) for block in blocks if block is not None]
     while waiting:
         tree = waiting.pop()
@@ -201,6 +201,50 @@ def _trees_of(blocks) -> list:
             found.append(tree)
             waiting += [node.node_tree for node in tree.nodes if is_group(node)]
     return found
+
+
+# What nodes are made of, beside sockets, and what of them has no say in a value.
+PARTS = (
+    *(bpy.types.ImageUser, bpy.types.TexMapping, bpy.types.ColorMapping),
+    *(bpy.types.ColorRamp, bpy.types.ColorRampElement),
+    *(bpy.types.CurveMapping, bpy.types.CurveMap, bpy.types.CurveMapPoint),
+)
+UNSEEN = (
+    *("rna_type", "inputs", "outputs", "location", "location_absolute", "width", "height", "dimensions", "select"),
+    *("show_options", "show_preview", "show_texture", "hide"),
+)
+
+
+def nodes_as_text(data) -> str:
+    """The node trees of a material or light: another text wherever they may have another value."""
+    found = []
+    for tree in trees_of([data]):
+        for node in tree.nodes:
+            sockets = [_value(getattr(socket, "default_value", None)) for socket in (*node.inputs, *node.outputs)]
+            found.append(f"{node.name!r}{sockets}{_values(node, UNSEEN)}")
+        for link in tree.links:
+            ends = link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier
+            found.append(f"{ends}{link.is_muted}")
+    return "\n".join(found)
+
+
+def _values(block, unseen: tuple = ("rna_type",)) -> list:
+    names = (prop.identifier for prop in block.bl_rna.properties)
+    return [f"{name}: {_value(getattr(block, name))}" for name in names if name not in unseen and name[:3] != "bl_"]
+
+
+def _value(value):
+    if isinstance(value, bpy.types.bpy_prop_array | Vector | Euler | Color):
+        return tuple(value)
+    if isinstance(value, bpy.types.bpy_prop_collection):
+        return [_values(one) for one in value if isinstance(one, PARTS)]
+    if isinstance(value, PARTS):
+        return _values(value)
+    if isinstance(value, bpy.types.Text):
+        return value.as_string()
+    if isinstance(value, bpy.types.bpy_struct):
+        return value.name_full if isinstance(value, bpy.types.ID) else ""
+    return value
 
 
 def _is_neutral(node) -> bool:

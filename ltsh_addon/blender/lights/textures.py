@@ -128,6 +128,7 @@ def _white(data, kind: str, settings: dict):
     name, data.type = data.name, kind
     # Another type is another class.
     data = bpy.data.lights[name]
+    data.animation_data_clear()
     for key, value in {**_WHITE, **settings}.items():
         setattr(data, key, value)
     return data

@@ -13,7 +13,7 @@ from mathutils import Matrix
 from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
 from ...scene import AreaLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
-from .emission import CONSTANT_NODES, open_studio
+from .emission import CONSTANT_NODES, open_studio, trees_of
 
 # Pixels along each side of a picture: of a world without images, and of one with, at least and at most.
 PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
@@ -163,13 +163,7 @@ def _pixels(world) -> int:
 
 def _nodes(world) -> list:
     """All nodes of a world, also in groups."""
-    found, waiting = {}, [tree_in_use(world)]
-    while waiting:
-        tree = waiting.pop()
-        if tree is not None and tree not in found:
-            found[tree] = list(tree.nodes)
-            waiting += [node.node_tree for node in tree.nodes if is_group(node)]
-    return [node for nodes in found.values() for node in nodes]
+    return [node for tree in trees_of([world]) for node in tree.nodes]
 
 
 @contextmanager

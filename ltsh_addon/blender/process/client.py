@@ -523,6 +523,30 @@ def look_at_world(path: Path, world: str, frame: int, folder: Path) -> SeenWorld
     return SeenWorld(light, tuple(AreaLight(**one) for one in found["lights"]), background, found["warnings"])
 
 
+LAMPS = "look at lights"  # a stage, whose fraction says of how many there are files
+
+
+@dataclass(frozen=True)
+class UnseenLamp:
+    """The data of a point, spot or sun light in a .blend, whose nodes Cycles is to look at."""
+
+    path: str
+    name: str
+    varies: bool
+    by_ray: bool
+
+
+def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Callable[[int, np.ndarray], bool]) -> None:
+    """What the nodes of `lamps` multiply their light by, at a frame, as `lights.textures.point_factor` has it:
+    `take(number, factor)` one after another, until it says no. Files go to `folder`. Raises as `extract` does."""
+
+    def watched(stage: str, fraction: float) -> bool | None:
+        number = round(fraction * len(lamps)) - 1
+        return take(number, np.load(folder / f"{number}.npy")) if stage == LAMPS else None
+
+    run_child({"task": "lamps", "lamps": [asdict(lamp) for lamp in lamps], "frame": frame}, folder, watched)
+
+
 def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
     """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
 

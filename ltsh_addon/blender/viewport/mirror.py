@@ -6,16 +6,21 @@ First its area lights and flat emissive meshes, as far as constants and images t
 from __future__ import annotations
 
 import functools
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...scene import AreaLight, listed
+from ...files import temporary_folder
+from ...scene import AreaLight, Cancelled, error_line, listed
 from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
@@ -27,30 +32,41 @@ from ..evaluated import (
     visibility,
 )
 from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
-from ..lights.emission import emission_of, factors_of, open_studio
+from ..lights.emission import emission_of, factors_of, nodes_as_text, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, ShownTextures, point_factor, with_pattern
+from ..lights.textures import MOST_LOOKS, ShownTextures, UnseenLight, point_factor, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
 from ..materials.values import product, value_at
+from ..process import client
 from .meshes import MeshBatches, mesh_batches
-from .sky import ShownSky, constant_sky
+from .sky import REST_SECONDS, ShownSky, constant_sky
 from .textures import look_values, uniform_buffer
 
 # Where nothing says on which side of closed emissive meshes the eye is, it is outside.
 FAR_AWAY = np.full(3, 1e6)
 # Patches and faces included. A frame takes as long as all of them do.
 MOST_LIGHTS = 2048
+# Why a light has no pattern.
+NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
+NOT_YET = "it shines as without its nodes until Cycles has looked at them"
+# Gives the pattern of evaluated data with nodes, as of `point_factor`, or says why there is none.
+Patterns = Callable[[bpy.types.Light, UnseenLight], np.ndarray | str]
+
+
+def no_patterns(data, source: UnseenLight) -> str:
+    """For views that ask nobody."""
+    return NOT_RESOLVED
 
 
 def view_lights(
-    depsgraph, in_view: Callable, textures: ShownTextures, patterns: dict[str, np.ndarray] | None = None
+    depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
 ) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` says yes to, and what is not shown as Cycles has it.
 
-    `textures` are those of the last time, `patterns` what `patterns_of` found.
+    `textures` are those of the last time.
     """
     notes: list[str] = []
     receivers = Receivers([ob.original for ob in depsgraph.objects])
@@ -70,7 +86,7 @@ def view_lights(
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         shown = [
             light
-            for light in _with_nodes(plain, (ob, matrix), (textures, patterns or {}), notes)
+            for light in _with_nodes(plain, (ob, matrix), (textures, patterns), notes)
             if np.any(light.radiance != 0.0)
         ]
         if shown:
@@ -111,20 +127,140 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
     return constant_mesh_lights(found, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[str, np.ndarray]:
-    """What Cycles makes of the node trees of point, spot and sun lights, as of `point_factor`, by the name of their
-    data; afterwards `scene` is as it was."""
+def patterns_of(scene, depsgraph) -> dict[int, np.ndarray]:
+    """What Cycles makes of the node trees of point, spot and sun lights, as of `point_factor`, by the session uid of
+    their data; afterwards `scene` is as it was."""
     wanted, silent = {}, SimpleNamespace(warn=lambda text: None)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and ob.data.type != "AREA" and len(wanted) < MOST_LOOKS:
             source = unseen_light(ob, np.array(instance.matrix_world, dtype=np.float64), silent)
             if source is not None:
-                wanted[source.data.name_full] = source
+                wanted[source.data.session_uid] = source
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {name: point_factor(source.data.type == "SUN", source, studio)[0] for name, source in wanted.items()}
+        return {uid: point_factor(source.data.type == "SUN", source, studio)[0] for uid, source in wanted.items()}
+
+
+@dataclass
+class _Look:
+    """A second Blender at work."""
+
+    states: dict[int, tuple]  # of the lights that it has not told about yet
+    found: list[tuple[int, np.ndarray]] = field(default_factory=list)  # what it has told
+    error: str = ""
+    is_stopped: bool = False
+    thread: threading.Thread | None = None
+
+
+class LiveLamps:
+    """Point, spot and sun lights as Cycles sees their nodes, for all windows: a second Blender looks at those that are
+    new or changed while the views go on. Lights are told by the session uids of their data."""
+
+    def __init__(self):
+        self._known: dict[int, tuple[tuple, np.ndarray | str]] = {}  # state of its nodes, and what was found
+        self._wanted: dict[int, tuple] = {}
+        self._changed, self._images = 0.0, 0
+        self._look: _Look | None = None
+
+    def pattern(self, data, source: UnseenLight) -> np.ndarray | str:
+        """What was found last, or that nothing is known yet; lights that have changed since are looked at."""
+        uid, state = source.data.session_uid, self._state(data, source)
+        known, found = self._known.get(uid, ((), NOT_YET))
+        on_its_way = self._wanted.get(uid) or (self._look.states.get(uid) if self._look is not None else None)
+        if known == state:
+            self._wanted.pop(uid, None)
+        elif on_its_way != state:
+            self._wanted[uid], self._changed = state, time.monotonic()
+        return found
+
+    def _state(self, data, source: UnseenLight) -> tuple:
+        text = nodes_as_text(data)
+        return source.varies, source.by_ray, data.type == "SUN", text, self._images if "image: " in text else 0
+
+    def note_images(self) -> None:
+        """Lights with images are looked at again."""
+        self._images += 1
+
+    @property
+    def is_busy(self) -> bool:
+        """Is there anything to be waited for?"""
+        return bool(self._wanted) or self._look is not None
+
+    def stop(self) -> None:
+        """Nobody waits any more."""
+        self._wanted.clear()
+        if self._look is not None:
+            self._look.is_stopped, self._look = True, None
+
+    def step(self, frame: int) -> bool:
+        """Do what is next, in the main thread; True: there is news."""
+        look = self._look
+        if look is None:
+            return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
+        has_ended = not look.thread.is_alive()
+        news = bool(look.found)
+        while look.found:
+            uid, factor = look.found.pop(0)
+            self._known[uid] = look.states.pop(uid), factor
+        if has_ended:
+            self._look = None
+            for uid, state in look.states.items():
+                if look.error:
+                    self._known[uid] = state, look.error
+                else:
+                    self._wanted.setdefault(uid, state)
+            news |= bool(look.error)
+        # What has changed meanwhile is not worth finishing.
+        look.is_stopped |= any(uid in look.states for uid in self._wanted)
+        return news
+
+    def _begin(self, frame: int) -> bool:
+        """Start a second Blender; True: that failed, and is to be said."""
+        present = {light.session_uid: light for light in bpy.data.lights}
+        self._known = {uid: known for uid, known in self._known.items() if uid in present}
+        look = _Look({uid: state for uid, state in self._wanted.items() if uid in present})
+        self._wanted.clear()
+        if not look.states:
+            return False
+        stack = ExitStack()
+        uids = list(look.states)
+        try:
+            folder = stack.enter_context(temporary_folder())
+            path = folder / "lamps.blend"
+            lamps = [_unseen_lamp(present[uid], path, look.states[uid]) for uid in uids]
+            own = {present[uid] for uid in uids if present[uid].library is None}
+            bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
+        except (OSError, RuntimeError) as error:
+            stack.close()
+            self._known.update({uid: (look.states[uid], f"{NOT_RESOLVED}: {error_line(error)}") for uid in uids})
+            return True
+
+        def take(number: int, factor: np.ndarray) -> bool:
+            look.found.append((uids[number], factor))
+            return not look.is_stopped
+
+        def work() -> None:
+            try:
+                with stack:
+                    client.look_at_lamps(lamps, frame, folder, take)
+            except Cancelled:
+                pass
+            except Exception as error:
+                look.error = f"{NOT_RESOLVED}: {error_line(error)}"
+
+        look.thread = threading.Thread(target=work, name="LTSH lamps", daemon=True)
+        self._look = look
+        look.thread.start()
+        return False
+
+
+def _unseen_lamp(data, path: Path, state: tuple) -> client.UnseenLamp:
+    """`data` in the .blend `path`, or in its library."""
+    library = data.library
+    place = path if library is None else bpy.path.abspath(library.filepath, library=library.library)
+    return client.UnseenLamp(str(place), data.name, *state[:2])
 
 
 def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) -> list[AreaLight]:
@@ -148,12 +284,18 @@ def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) ->
         patches = textures.split(light, factor, notes) if factor is not None and is_area else None
         if patches is not None:
             return patches
-    if data.original.name_full in patterns:
-        unseen = unseen_light(ob, matrix, SimpleNamespace(warn=notes.append))
-        if not light.is_distant:
-            light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
-        return with_pattern(light, patterns[data.original.name_full], unseen, notes.append)
-    notes.append(f"{light.name}: its nodes are not resolved, it shines as without them")
+    problem = NOT_RESOLVED
+    if data.type != "AREA":
+        warnings: list[str] = []
+        unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append))
+        found = patterns(data, unseen)
+        if not isinstance(found, str):
+            notes += warnings
+            if not light.is_distant:
+                light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
+            return with_pattern(light, found, unseen, notes.append)
+        problem = found
+    notes.append(f"{light.name}: {problem}")
     return [replace(light, falloff=0, smooth=0.0)]
 
 
@@ -270,9 +412,8 @@ def object_notes(depsgraph) -> list[str]:
 class SceneMirror:
     """Meshes, looks, instances and lights of one view of a scene."""
 
-    def __init__(self, look: Callable = lambda world: None, patterns: dict[str, np.ndarray] | None = None):
-        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known.
-        `patterns` are as of `patterns_of`."""
+    def __init__(self, look: Callable = lambda world: None, patterns: Patterns = no_patterns):
+        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known."""
         self._patterns = patterns
         self.instances: list[ShownInstance] = []
         self.lights: tuple[AreaLight, ...] = ()  # those that are small and bright in the world included
@@ -285,6 +426,7 @@ class SceneMirror:
         self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
         self._light_textures = ShownTextures()
+        self.has_old_lights = False  # more is known of them than is shown
         self._world_note: tuple[str, ...] = ()
         self._synced = False
 
@@ -322,11 +464,16 @@ class SceneMirror:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
         if changes.lights or changes.everything or changes.materials or changes.images:
-            self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
-            self.lights = (*self.own_lights, *self.sky.lights)
+            self.read_lights(depsgraph, in_view)
         if changes.world or changes.everything or changes.images:
             self._read_world(depsgraph.view_layer.world_override or depsgraph.scene.world)
         self._synced = True
+
+    def read_lights(self, depsgraph, in_view: Callable) -> None:
+        """Take over the lights that `in_view` says yes to."""
+        self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
+        self.lights = (*self.own_lights, *self.sky.lights)
+        self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
         if changes.everything:

@@ -17,11 +17,13 @@ from ...scene import AreaLight, SceneError, error_line
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
+from ..lights.emission import Falloff, open_studio
+from ..lights.textures import UnseenLight, point_factor
 from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
 from ..materials.looks import world_radiance
-from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
+from ..process.client import GRAPHICS, LAMPS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
-from .mirror import SceneMirror, patterns_of
+from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
 from .renderer import CENTERS, ShownPicture, ViewRenderer
 from .shadows import ShadowRays, too_many
 from .sky import ShownSky, background_of, coarse, varied_sky
@@ -176,6 +178,24 @@ def show_world(job: dict, folder: Path) -> dict:
     return {"lights": [one.record() for one in lights], "warnings": warnings}
 
 
+def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
+    """Do the `job` (see `client.look_at_lamps`): what nodes make of each light as a file in `folder`."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene, count = bpy.context.scene, len(job["lamps"])
+    scene.frame_set(job["frame"])
+    for number, lamp in enumerate(job["lamps"]):
+        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
+            if lamp["name"] not in there.lights:
+                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
+            wanted.lights = [lamp["name"]]
+        source = UnseenLight(wanted.lights[0], np.eye(4), lamp["varies"], Falloff(), True, lamp["by_ray"])
+        with open_studio(scene) as studio:
+            factor, _ = point_factor(source.data.type == "SUN", source, studio)
+        save_array(folder / f"{number}.npy", factor)
+        progress(LAMPS, (number + 1) / count)
+    return {}
+
+
 def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
@@ -186,7 +206,7 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     scene, camera, sky, patterns = seen
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror = SceneMirror(lambda world: sky, patterns)
+    mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.data.session_uid, NOT_RESOLVED))
     mirror.sync(depsgraph)
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)

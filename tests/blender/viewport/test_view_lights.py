@@ -1,5 +1,7 @@
 """Lights of the viewport: every light of a scene is drawn as the numpy side has it, or named."""
 
+import time
+
 import bpy
 import numpy as np
 import pytest
@@ -9,15 +11,18 @@ from lit_plane import add_image, add_lamp_plane, light_tree
 from view_pictures import SIZE, viewport_picture
 
 from ltsh_addon import shading
+from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport import mirror
 from ltsh_addon.blender.viewport.mirror import strongest, view_lights
 
 
-def seen():
+def seen(patterns=mirror.no_patterns):
     """The lights, and all notes as one text."""
     bpy.context.view_layer.update()
-    lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
+    graph = bpy.context.evaluated_depsgraph_get()
+    lights, notes = view_lights(graph, lambda instance: True, ShownTextures(), patterns)
     return lights, "\n".join(notes)
 
 
@@ -123,6 +128,135 @@ def test_of_too_many_lights_the_strongest_are_shown():
     assert [light.name for light in kept] == [light.name for light in lights if light in kept]
     assert "Of 6 lights" in notes[0] and f"{100.0 * sum(power[4:]) / sum(power):.1f} %" in notes[0]
     assert strongest(lights, [], most=6) is lights
+
+
+def add_bulb(name, kind, make):
+    """A light with the strength that `make` gives of its tree; object and tree."""
+    data = bpy.data.lights.new(name, kind)
+    data.energy, data.shadow_soft_size = 50.0, 0.1
+    light = parts.link(bpy.data.objects.new(name, data), (0.5, -0.3, 2.0), (0.3, 0.2, 0.1))
+    tree, emission = light_tree(light)
+    tree.links.new(make(tree), emission.inputs["Strength"])
+    return light, tree
+
+
+def stripes(tree):
+    """1 + 0.9 x of the direction in the frame of the light."""
+    coordinates, separate, wave = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
+    wave.operation, wave.inputs[1].default_value, wave.inputs[2].default_value = "MULTIPLY_ADD", 0.9, 1.0
+    tree.links.new(coordinates.outputs["Normal"], separate.inputs[0])
+    tree.links.new(separate.outputs["X"], wave.inputs[0])
+    return wave.outputs[0]
+
+
+def beam(tree):
+    """A lamp of a file beside the .blend."""
+    node = tree.nodes.new("ShaderNodeTexIES")
+    node.mode, node.filepath = "EXTERNAL", "//beam.ies"
+    return node.outputs[0]
+
+
+BEAM = """IESNA:LM-63-1995
+TILT=NONE
+1 -1 1 7 1 1 2 0 0 0
+1 1 100
+0 15 30 45 60 90 180
+0
+900 300 800 200 500 100 0
+"""
+
+
+def wait_for(lamps):
+    """Until Cycles has looked at all lights."""
+    end, news = time.monotonic() + 90.0, False
+    while lamps.is_busy and time.monotonic() < end:
+        news |= lamps.step(1)
+        time.sleep(0.02)
+    assert news and not lamps.is_busy
+
+
+def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
+    parts.empty_scene()
+    (tmp_path / "beam.ies").write_text(BEAM)
+    add_bulb("Library", "SPOT", beam)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "lamps.blend"))
+    parts.empty_scene()
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
+    striped, tree = add_bulb("Striped", "POINT", stripes)
+    add_bulb("File", "POINT", beam)
+    with bpy.data.libraries.load(str(tmp_path / "lamps.blend"), link=True, relative=True) as (_, wanted):
+        wanted.objects = ["Library"]
+    bpy.context.scene.collection.objects.link(wanted.objects[0])
+    parts.add_camera()
+    # The power of a frame is not that of the nodes.
+    striped.data.keyframe_insert("energy", frame=1)
+    lamps = mirror.LiveLamps()
+    lights, notes = seen(lamps.pattern)
+    assert [light.pattern for light in lights] == 3 * [None] and notes.count(mirror.NOT_YET) == 3 and lamps.is_busy
+    wait_for(lamps)
+    lights, notes = seen(lamps.pattern)
+    expected = {light.name: light for light in parts.prepare()[2].lights}
+    assert not notes and {light.name for light in lights} == set(expected) == {"Striped", "File", "Library"}
+    for light in lights:
+        theirs = expected[light.name]
+        np.testing.assert_allclose(light.radiance, theirs.radiance, rtol=1e-5)
+        np.testing.assert_allclose(light.pattern.values, theirs.pattern.values, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(light.pattern.axes, theirs.pattern.axes, atol=1e-6)
+    found = next(light for light in lights if light.name == "Striped")
+    np.testing.assert_allclose(found.radiance, 50.0 / (2.0 * np.pi * striped.data.shadow_soft_size) ** 2, rtol=5e-3)
+    values = found.pattern.values
+    polar, around = ((np.arange(count) + 0.5) / count for count in values.shape)
+    x = np.sin(np.pi * polar)[:, None] * np.cos(2.0 * np.pi * around)
+    # Pictures of a side of the cube have 192 points.
+    np.testing.assert_allclose(values, 1.0 + 0.9 * x, atol=0.9 * 2.0 / 192)
+    # Neither its place nor its power has a say, nodes have; what was found is shown until there is more.
+    striped.location.x, striped.data.energy = 3.0, 70.0
+    assert not seen(lamps.pattern)[1] and not lamps.is_busy
+    wave = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeMath")
+    wave.inputs[1].default_value = 0.5
+    again, notes = seen(lamps.pattern)
+    assert lamps.is_busy and not notes
+    np.testing.assert_array_equal(next(light for light in again if light.name == "Striped").pattern.values, values)
+    wave.inputs[1].default_value = 0.9
+    assert not seen(lamps.pattern)[1] and not lamps.is_busy
+    # A light that cannot be looked at is named, once.
+    (tmp_path / "lamps.blend").unlink()
+    wave.inputs[1].default_value = 0.4
+    linked = next(light for light in bpy.data.lights if light.library is not None)
+    linked.node_tree.nodes["IES Texture"].inputs["Strength"].default_value = 3.0
+    seen(lamps.pattern)
+    wait_for(lamps)
+    notes = seen(lamps.pattern)[1]
+    assert "Library" in notes and "lamps.blend" in notes and not lamps.is_busy
+
+
+def test_only_what_may_change_a_value_changes_the_text_of_nodes():
+    parts.empty_scene()
+    tree = add_bulb("Lamp", "POINT", beam)[1]
+    data, group = bpy.data.lights["Lamp"], bpy.data.node_groups.new("Inner", "ShaderNodeTree")
+    own, ramp, curve = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("Group", "ValToRGB", "FloatCurve"))
+    own.node_tree, value, text = group, group.nodes.new("ShaderNodeValue"), bpy.data.texts.new("Beam")
+    ies = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeTexIES")
+    texts = [nodes_as_text(data)]
+
+    def changes():
+        texts.append(nodes_as_text(data))
+        return texts[-1] != texts[-2]
+
+    data.energy, ies.location.x, ies.select = 3.0, 100.0, not ies.select
+    assert not changes()
+    value.outputs[0].default_value = 2.0
+    assert changes()
+    ramp.color_ramp.elements[1].position = 0.7
+    assert changes()
+    curve.mapping.curves[0].points[1].location.y = 0.3
+    assert changes()
+    ies.mode, ies.ies = "INTERNAL", text
+    assert changes()
+    text.write(BEAM)
+    assert changes()
+    tree.links.remove(ies.outputs[0].links[0])
+    assert changes()
 
 
 def lit_scene():

@@ -33,7 +33,8 @@ def main(rig):
     lamp, node = lamp_of_a_file(scene)
     seen = yield from looked_at(rig, "lamps_2_lamp.png", "new")
     yield from edited_and_undone(rig, lamp, node, seen)
-    scene.camera = eyes.camera_like_view(rig, "Like the view")
+    # Undo has made another scene of it.
+    bpy.context.scene.camera = eyes.camera_like_view(rig, "Like the view")
     found = yield from eyes.final_render(rig)
     rig.xdo("key", "Escape")
     yield 2

@@ -180,7 +180,9 @@ class EngineView:
         region = context.region
         texture = self._reference.of(reference, (region.width, region.height))
         changed = "The scene has changed since the Cycles picture was made: press Compare with Cycles"
-        return mode, texture, [changed] if is_outdated(reference, self._current_content()) else []
+        # What Cycles tells about worlds and lights is no change.
+        is_known = not (self.waits_for_world or _lamps.is_busy)
+        return mode, texture, [changed] if is_known and is_outdated(reference, self._current_content()) else []
 
     def _current_content(self) -> str:
         """The `content` of the mirror, taken again when that has changed."""

@@ -258,8 +258,7 @@ class LiveLamps:
 
 def _unseen_lamp(data, path: Path, state: tuple) -> client.UnseenLamp:
     """`data` in the .blend `path`, or in its library."""
-    library = data.library
-    place = path if library is None else bpy.path.abspath(library.filepath, library=library.library)
+    place = path if data.library is None else bpy.path.abspath(data.library.filepath)
     return client.UnseenLamp(str(place), data.name, *state[:2])
 
 
@@ -404,9 +403,26 @@ def object_notes(depsgraph) -> list[str]:
             kind = "shown as any surface, not as shadow catcher"
         if kind is None and any(system.settings.type == "HAIR" for system in ob.particle_systems):
             kind = NOT_SHOWN["CURVES"]
+        if kind is None and ob.type == "META" and _has_lost_balls(ob, depsgraph):
+            kind = "balls smaller than the Resolution Viewport are coarse or missing in views: lower it"
         if kind is not None:
             found.setdefault(kind, []).append(ob.name)
     return [f"{listed(names, NAMED)}: {kind}" for kind, names in found.items()]
+
+
+def _has_lost_balls(ob, depsgraph) -> bool:
+    """Is a ball of the metaballs `ob` smaller than the steps of a view, but not than those of a render?"""
+    # All of one name, but for the number, have the steps of the first.
+    family = [one for one in depsgraph.objects if one.type == "META" and _family(one) == _family(ob)]
+    first = min(family, key=lambda one: one.name).data
+    balls = [ball for ball in ob.data.elements if not (ball.hide or ball.use_negative)]
+    # Where the field of a ball is as strong as the threshold of the surface.
+    radii = [ball.radius * max(1.0 - (first.threshold / ball.stiffness) ** (1.0 / 3.0), 0.0) ** 0.5 for ball in balls]
+    return any(first.render_resolution < radius < first.resolution for radius in radii)
+
+
+def _family(ob) -> str:
+    return ob.name.partition(".")[0]
 
 
 class SceneMirror:

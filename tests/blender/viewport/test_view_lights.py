@@ -230,6 +230,36 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     assert "Library" in notes and "lamps.blend" in notes and not lamps.is_busy
 
 
+def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_vain(temporary_root):
+    parts.empty_scene()
+    tree = add_bulb("Striped", "POINT", stripes)[1]
+    wave = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeMath")
+    lamps = mirror.LiveLamps()
+
+    def begun():
+        seen(lamps.pattern)
+        end = time.monotonic() + 30.0
+        while lamps._look is None and time.monotonic() < end:
+            lamps.step(1)
+            time.sleep(0.02)
+        return lamps._look
+
+    begun()
+    wave.inputs[1].default_value = 0.5
+    seen(lamps.pattern)
+    wait_for(lamps)
+    ((light,), notes) = seen(lamps.pattern)
+    assert not notes and not lamps.is_busy
+    np.testing.assert_allclose([light.pattern.values.min(), light.pattern.values.max()], [0.5, 1.5], atol=0.02)
+    wave.inputs[1].default_value = 0.7
+    look = begun()
+    lamps.stop()
+    assert look.is_stopped and not lamps.is_busy
+    look.thread.join(60.0)
+    assert not list(temporary_root.iterdir())
+    bpy.data.lights.remove(bpy.data.lights["Striped"])
+
+
 def test_only_what_may_change_a_value_changes_the_text_of_nodes():
     parts.empty_scene()
     tree = add_bulb("Lamp", "POINT", beam)[1]

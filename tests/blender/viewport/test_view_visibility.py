@@ -6,6 +6,8 @@ import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
 
+from ltsh_addon.blender.viewport.mirror import object_notes
+
 
 def chalk():
     return parts.bsdf_material("ShaderNodeBsdfDiffuse", "Chalk", Color=(0.2, 0.5, 0.8, 1.0))[0]
@@ -71,3 +73,30 @@ def test_what_glows_is_as_bright_as_it_is_and_hidden_by_what_is_nearer():
         place = matrix @ [column - 1.5, 0.0, 0.0, 1.0]
         x, y = (0.5 + 0.5 * place[:2] / place[3]) * SIZE
         np.testing.assert_allclose(emitted[SIZE[1] - 1 - int(y), int(x)], strength * np.array(glow), atol=1e-5)
+
+
+def test_metaballs_that_a_view_misses_are_named():
+    """Balls at random places: Blender makes no face of those that its steps pass by."""
+    random, missing, silent = np.random.default_rng(4), 0, 0
+    for _ in range(40):
+        parts.empty_scene()
+        balls = bpy.data.metaballs.new("Balls")
+        balls.resolution, balls.render_resolution, balls.threshold = (
+            random.uniform(0.1, 1.0),
+            0.05,
+            random.uniform(0.2, 1),
+        )
+        ball = balls.elements.new()
+        ball.co, ball.radius, ball.stiffness = random.uniform(-1.0, 1.0, 3), random.uniform(0.2, 1.5), 2.0
+        parts.link(bpy.data.objects.new("Balls", balls))
+        bpy.context.view_layer.update()
+        graph = bpy.context.evaluated_depsgraph_get()
+        faces = sum(len(one.object.to_mesh().polygons) for one in graph.object_instances if one.object.type == "MESH")
+        notes = object_notes(graph)
+        missing += faces == 0
+        silent += not notes
+        assert faces or "Balls: balls smaller" in notes[0]
+        balls.render_resolution = balls.resolution
+        bpy.context.view_layer.update()
+        assert not object_notes(bpy.context.evaluated_depsgraph_get())  # renders miss it too
+    assert missing > 4 and silent > 4

@@ -356,16 +356,20 @@ def _entry_of(context, ob):
 SHORT_NAMES = {"shadow_soft_size": "Radius", "spot_size": "Spot Size", "spot_blend": "Blend"}
 
 
-def light_properties(light) -> list[str]:
-    """What can be set at a light, by its type and shape."""
-    names = ["energy", "exposure", "color"]
+def light_properties(light) -> dict[str, str]:
+    """What can be set at a light, by its type and shape, with the labels."""
+    names, labels = ["energy", "exposure", "color"], dict(SHORT_NAMES)
     if light.type == "AREA":
-        names += ["shape", "size", *(["size_y"] if light.shape in ("RECTANGLE", "ELLIPSE") else [])]
+        names += ["shape", "size"]
+        if light.shape in ("RECTANGLE", "ELLIPSE"):
+            names.append("size_y")
+            labels["size"] = "Size X"
     elif light.type == "SUN":
         names.append("angle")
     else:
         names += ["shadow_soft_size", *(["spot_size", "spot_blend"] if light.type == "SPOT" else [])]
-    return [name for name in names if name in light.bl_rna.properties]
+    known = light.bl_rna.properties
+    return {name: labels.get(name, known[name].name) for name in names if name in known}
 
 
 class _Lights(_Entries):
@@ -385,8 +389,8 @@ class _Lights(_Entries):
             draw_text(layout, context, note, STATE_ICONS[entry.state])
         split_names(layout, context)
         column = layout.column()
-        for name in light_properties(ob.data):
-            column.prop(ob.data, name, text=SHORT_NAMES.get(name, ob.data.bl_rna.properties[name].name))
+        for name, label in light_properties(ob.data).items():
+            column.prop(ob.data, name, text=label)
 
 
 class _Materials(_Entries):

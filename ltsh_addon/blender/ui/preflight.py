@@ -105,8 +105,11 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     selected = [ob for ob in context.selected_objects if ob.type == "MESH"]
     if not selected:
         return [], [Problem("No mesh is selected: select the objects to bake")]
-    usable, found = [], []
+    baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
+    usable, found = [], [_textures_shown(baked)] if baked else []
     for ob in selected:
+        if ob in baked:
+            continue
         problem = _object_problem(ob, context.scene.ltsh.bake_uv_map)
         if problem is None:
             usable.append(ob)
@@ -117,13 +120,19 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     return usable, found
 
 
+def _textures_shown(baked) -> Problem:
+    """Said once for all these objects, since one click restores them all."""
+    if len(baked) == 1:
+        text = f"Object {baked[0].name!r} shows a baked texture in place of its materials"
+    else:
+        text = f"{len(baked)} objects show baked textures in place of their materials"
+    return Problem(text, True, "ltsh.restore_materials", "Restore")
+
+
 def _object_problem(ob, uv_map: str) -> Problem | None:
     if ob.hide_render:
         text = f"Object {ob.name!r} is hidden in renders"
         return Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": ob.name})
-    if shows_texture(ob):
-        text = f"Object {ob.name!r} shows a baked texture in place of its materials"
-        return Problem(text, True, "ltsh.restore_materials", "Restore")
     try:
         check_object(ob)
     except ObjectError as error:

@@ -110,6 +110,13 @@ def test_a_bake_is_shown_in_the_scene_and_taken_back(scene, tmp_path):
     floor.select_set(True)
     (problem,) = preflight.problems(bpy.context, "bake")
     assert problem.blocks and problem.fix == "ltsh.restore_materials"
+    # Several are named together, since one click restores them all.
+    twin = floor.copy()
+    scene.collection.objects.link(twin)
+    twin.select_set(True)
+    (problem,) = preflight.problems(bpy.context, "bake")
+    assert problem.text == "2 objects show baked textures in place of their materials" and problem.blocks
+    bpy.data.objects.remove(twin)
     assert bpy.ops.ltsh.restore_materials() == {"FINISHED"}
     assert (slot.link, slot.material) == ("DATA", former) and set(bpy.data.materials) == materials
     assert preflight.problems(bpy.context, "bake") == []

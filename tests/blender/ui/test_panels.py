@@ -186,6 +186,16 @@ def test_the_list_of_lights_shows_lights_alone_and_finds_them_by_name(scene):
     assert [item.what for item in row(bpy.data.objects["Light"])] == ["name", "energy", "color", "solo", "mute"]
 
 
+def test_sizes_of_a_light_are_named_as_in_the_panels_of_blender(scene):
+    light = bpy.data.objects["Light"].data
+    for shape, sizes in (("SQUARE", ["Size"]), ("RECTANGLE", ["Size X", "Size Y"]), ("ELLIPSE", ["Size X", "Size Y"])):
+        light.shape = shape
+        found = panels.light_properties(light)
+        assert [label for name, label in found.items() if name.startswith("size")] == sizes
+    light = bpy.data.lights.new("Spot", "SPOT")
+    assert list(panels.light_properties(light).values())[-3:] == ["Radius", "Spot Size", "Blend"]
+
+
 def test_a_click_in_the_list_selects_the_light_and_a_selected_light_is_chosen_in_it(scene):
     light, floor = bpy.data.objects["Light"], bpy.data.objects["Floor"]
     floor.select_set(True)

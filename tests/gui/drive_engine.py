@@ -26,7 +26,7 @@ def main(rig):
     eyes.bare_view(rig)
     eyes.free_view(rig, scene.camera)
     eyes.plain_colors(scene, EXPOSURE)
-    # The view has none.
+    # Exact pictures have none: the first shadows of a view are coarse.
     scene.ltsh.shadows = False
     yield from light_dragged(rig)
     seen = yield from techniques(rig)

@@ -332,7 +332,9 @@ class LTSH_UL_lights(bpy.types.UIList):
         name = row.row()
         name.active, name.ui_units_x = not item.hide_render, NAME_UNITS
         name.prop(item, "name", text="", emboss=False, icon=_light_icon(context, item))
-        for key, units in (("energy", POWER_UNITS), ("color", COLOR_UNITS)):
+        # Where there is no room for both, the name is what tells lights apart.
+        fields = (("energy", POWER_UNITS), ("color", COLOR_UNITS))
+        for key, units in fields if region_width(context) >= SPLIT_PIXELS else fields[1:]:
             field = row.row()
             field.ui_units_x = units
             field.prop(light, key, text="")
@@ -482,7 +484,8 @@ class _Results:
         if context.space_data.type != "IMAGE_EDITOR":
             layout.operator("ltsh.open_results", icon="IMAGE_DATA")
         row = layout.row(align=True)
-        row.operator("ltsh.save_exr", icon="FILE_TICK")
+        short = {"text": "Save EXR"} if region_width(context) < SPLIT_PIXELS else {}
+        row.operator("ltsh.save_exr", icon="FILE_TICK", **short)
         row.operator("ltsh.open_folder", text="", icon="FILE_FOLDER")
 
     def draw_choice(self, context, result):

@@ -133,11 +133,16 @@ def drawn(panel, function="draw", width=300, scale=1.0, **context) -> list[Shown
     found = stand_in(panel)()
     found.layout = Layout()
     space = SimpleNamespace(type=panel.bl_space_type, image=None)
+    getattr(found, function)(context_of(width, scale, **{"space_data": space, **context}))
+    return found.layout.shown
+
+
+def context_of(width=300, scale=1.0, **context):
+    """Stands for the context of a region `width` pixels wide."""
     preferences = SimpleNamespace(system=SimpleNamespace(ui_scale=scale), addons=bpy.context.preferences.addons)
     now = {name: getattr(bpy.context, name) for name in ("scene", "object", "selected_objects", "view_layer", "mode")}
-    now |= {"region": SimpleNamespace(width=width), "space_data": space, "preferences": preferences}
-    getattr(found, function)(SimpleNamespace(**{**now, **context}))
-    return found.layout.shown
+    now |= {"region": SimpleNamespace(width=width), "preferences": preferences}
+    return SimpleNamespace(**{**now, **context})
 
 
 def texts(shown) -> str:

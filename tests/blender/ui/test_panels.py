@@ -3,7 +3,7 @@
 import bpy
 import pytest
 import scene_parts as parts
-from recorded_layout import Layout, buttons, drawn, stand_in, texts
+from recorded_layout import Layout, buttons, context_of, drawn, stand_in, texts
 
 from ltsh_addon.blender.ui import operators, panels, preflight
 from ltsh_addon.blender.ui.job import Job, Plan, Step
@@ -164,7 +164,7 @@ def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
 def row(ob, width=300):
     """What the list of lights draws for `ob`."""
     layout = Layout()
-    stand_in(panels.LTSH_UL_lights)().draw_item(bpy.context, layout, bpy.context.scene, ob, 0, None, "")
+    stand_in(panels.LTSH_UL_lights)().draw_item(context_of(width), layout, bpy.context.scene, ob, 0, None, "")
     return layout.shown
 
 
@@ -184,6 +184,8 @@ def test_the_list_of_lights_shows_lights_alone_and_finds_them_by_name(scene):
     assert names() == ["Key"]
     bpy.data.objects["Light"].hide_render = True
     assert [item.what for item in row(bpy.data.objects["Light"])] == ["name", "energy", "color", "solo", "mute"]
+    # In narrow regions the name needs the place.
+    assert [item.what for item in row(bpy.data.objects["Key"], 220)] == ["name", "color", "solo", "mute"]
 
 
 def test_sizes_of_a_light_are_named_as_in_the_panels_of_blender(scene):

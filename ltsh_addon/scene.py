@@ -446,7 +446,33 @@ class SurfaceSamples:
 
     def take(self, index) -> SurfaceSamples:
         """The samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        return replace(self, **{field.name: getattr(self, field.name)[index] for field in fields(self)})
+        count = len(self.position[index])
+        return replace(self, **{field.name: _taken(getattr(self, field.name), index, count) for field in fields(self)})
+
+    @classmethod
+    def joined(cls, pieces: list[SurfaceSamples]) -> SurfaceSamples:
+        """The samples of all `pieces`, at least one, one after another."""
+        if len(pieces) == 1:
+            return pieces[0]
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: _one_after_another([getattr(piece, name) for piece in pieces]) for name in names})
+
+
+def is_constant(values: np.ndarray) -> bool:
+    """True for one number, that was broadcast: what most samples have of most lobes."""
+    return values.size > 0 and not any(values.strides)
+
+
+def _taken(values: np.ndarray, index, count: int) -> np.ndarray:
+    """The `count` rows at `index`."""
+    return np.broadcast_to(values.flat[0], (count, *values.shape[1:])) if is_constant(values) else values[index]
+
+
+def _one_after_another(parts: list[np.ndarray]) -> np.ndarray:
+    """All rows of the `parts`."""
+    if all(map(is_constant, parts)) and len({part.flat[0] for part in parts}) == 1:
+        return np.broadcast_to(parts[0].flat[0], (sum(map(len, parts)), *parts[0].shape[1:]))
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True)

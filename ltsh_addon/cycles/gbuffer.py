@@ -11,7 +11,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples
+from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples, is_constant
 from ..shading.light_polygons import has_lobe
 from .horizons import unit
 from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
@@ -61,13 +61,7 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
         )
         pieces.append(samples)
         index.append(block[of_block])
-    return joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
-
-
-def joined(pieces: list[SurfaceSamples]) -> SurfaceSamples:
-    """The samples of all `pieces`, one after another."""
-    names = pieces[0].__dataclass_fields__
-    return SurfaceSamples(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
+    return SurfaceSamples.joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
 
 
 def _hits_of(values: dict[str, np.ndarray]) -> Hits:
@@ -144,7 +138,7 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
     of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]
     of_hit = np.concatenate(of_hit)
     first = None if of_hit.all() else of_hit
-    return joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
+    return SurfaceSamples.joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
 
 
 # Hits of a pixel whose normals are closer than this share of the width of their lobes (alpha), and at most so many
@@ -192,7 +186,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))
     pixel, target = film.pixel[starts], np.arange(len(starts))
-    free = np.ones(len(starts), bool)
+    free, shines = np.ones(len(starts), bool), has_lobe(samples)[1]
     for _ in range(MERGED_ROUNDS):
         waiting = np.flatnonzero(free)
         # Of the hits of a pixel that stand for themselves the first.
@@ -205,7 +199,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
         for lobe in range(int(lengths.max(initial=0))):
             there = np.flatnonzero(same & (lengths[others] > lobe))
             pairs = starts[others[there]] + lobe, starts[leader[there]] + lobe
-            same[there] = _one_shading(samples, *pairs, looseness)
+            same[there] = _one_shading(samples, shines, *pairs, looseness)
         target[others[same]] = leader[same]
         free[others[same]] = False
     # From hits to their samples.
@@ -215,18 +209,19 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
     return kept, np.searchsorted(kept, of_sample)
 
 
-def _one_shading(samples: SurfaceSamples, one: np.ndarray, other: np.ndarray, looseness: float) -> np.ndarray:
-    """Mask of pairs of samples that get one shading, or with a `looseness` above 1 one shadow."""
+def _one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, looseness: float) -> np.ndarray:
+    """Mask of pairs of samples that get one shading, or with a `looseness` above 1 one shadow; which `shines` (P,)."""
     same = np.ones(len(one), bool)
     for name in SAME:
         values = getattr(samples, name)
-        same &= np.abs(values[one] - values[other]) <= 1e-2 * np.abs(values[other])
-    shines = has_lobe(samples.take(other))[1]
-    alpha = np.where(shines, samples.roughness[other] ** 2, 1.0)
+        if not is_constant(values):
+            same &= np.abs(values[one] - values[other]) <= 1e-2 * np.abs(values[other])
+    alpha = np.where(shines[other], samples.roughness[other] ** 2, 1.0)
     same &= alpha >= LEAST_ALPHA
     angle = looseness * np.minimum(MOST_ANGLE, LOBE_SHARE * alpha)
-    turned = np.linalg.norm(samples.tangent[one] - samples.tangent[other], axis=1)
-    same &= (turned <= angle) | (samples.anisotropy[other] == 0.0)
+    if samples.anisotropy.any():
+        turned = np.linalg.norm(samples.tangent[one] - samples.tangent[other], axis=1)
+        same &= (turned <= angle) | (samples.anisotropy[other] == 0.0)
     limit = np.cos(angle)
     for name in ("normal", "diffuse_normal", "geometric_normal", "smooth_normal"):
         values = getattr(samples, name)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..scene import AreaLight, SurfaceSamples
-from .gbuffer import HITS_PER_BLOCK, joined
+from .gbuffer import HITS_PER_BLOCK
 from .horizons import end_at_horizons_of_cycles, unit
 from .images import GRAY, ImageTexture
 from .lobes import LOBE_AOVS, Hits, samples_of_lobes
@@ -138,7 +138,7 @@ def texel_samples(
         samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
         pieces.append(samples)
         index.append(texel[of_sample] + start)
-    return joined(pieces), np.concatenate(index)
+    return SurfaceSamples.joined(pieces), np.concatenate(index)
 
 
 def _maps_read(materials) -> set[int]:

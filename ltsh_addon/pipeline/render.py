@@ -139,6 +139,11 @@ def finish(
         clock.end("denoise")
         report = _report(comparison, cycles, ours, problems)
         report["finished"] |= {"denoiser": denoiser, "budget_s": options.budget}
+        if not np.any(combined[..., :3]):
+            report["warnings"].append(
+                f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
+                "or let the world shine"
+            )
         if options.budget is not None and clock.seconds() > MOST_OVER * options.budget:
             report["warnings"].append(
                 f"the picture took {clock.seconds():.1f} s of processor time, the budget is {options.budget:g} s; give "

@@ -134,13 +134,19 @@ def sides_of_the_sky(brightness=range(1, 7)):
     )
 
 
-@pytest.mark.parametrize("kind", ["square", "distant", "ball", "disk", "sky"])
+@pytest.mark.parametrize("kind", ["square", "sheared", "ellipse", "polygon", "distant", "ball", "disk", "sky"])
 def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
     """As a test of each direction with each light finds, one by one."""
     generator = np.random.default_rng(3)
     samples, lights = samples_around(generator, 12), lights_around(generator, 200)
     if kind == "distant":
         lights = tuple(replace(light, is_distant=True) for light in lights)
+    if kind == "sheared":
+        lights = tuple(replace(light, shape="RECTANGLE", half_v=light.half_v + 0.5 * light.half_u) for light in lights)
+    if kind == "ellipse":
+        lights = tuple(replace(light, shape="ELLIPSE", half_v=0.5 * light.half_v) for light in lights)
+    if kind == "polygon":
+        lights = tuple(replace(light, shape="POLYGON", corners=light.polygon()) for light in lights)
     if kind in ("ball", "disk"):
         lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
     if kind == "sky":
@@ -162,12 +168,15 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
             meets = (aside < light.radius) if kind == "ball" else (aside * distance < light.radius * along)
             meets &= along > 0.0
         else:
-            steepness = towards @ light.direction
+            steepness, u1 = towards @ light.direction, horizons.unit(light.half_u)
             place = (offset @ light.direction / steepness)[..., None] * towards - offset
-            u, v = (np.abs(place @ half) / (half @ half) for half in (light.half_u, light.half_v))
-            meets = (u < 1.0) & (v < 1.0) & (steepness < 0.0) & (offset @ light.direction < 0.0)
+            v = place @ (light.half_v - (light.half_v @ u1) * u1)
+            v /= light.half_v @ light.half_v - np.square(light.half_v @ u1)
+            u = place @ light.half_u / (light.half_u @ light.half_u) - (0.5 * v if kind == "sheared" else 0.0)
+            within = u * u + v * v < 1.0 if kind == "ellipse" else np.maximum(np.abs(u), np.abs(v)) < 1.0
+            meets = within & (steepness < 0.0) & (offset @ light.direction < 0.0)
         expected |= {(index, *pair) for pair in zip(*(part.tolist() for part in np.nonzero(meets)), strict=True)}
-    assert found == expected and len(found) > 300
+    assert found == expected and len(found) > 100
 
 
 def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
@@ -197,6 +206,25 @@ def test_a_few_directions_tell_where_lobes_end_under_a_sky(monkeypatch):
     apart = few - horizons.smooth_share(*horizons.horizon_excess(samples, lights, chances))
     # Of what comes from between the horizons, itself a few percent of the light.
     assert np.sqrt(np.square(apart).mean()) < 0.05 and abs(apart.mean()) < 0.01
+
+
+def test_quick_horizons_are_about_those_of_all_directions_and_split_less():
+    samples, lights = samples_around(np.random.default_rng(11), 500), lights_around(np.random.default_rng(12), 200)
+    chances = horizons.lobe_chances(samples, np.arange(500), is_baked=False)
+    excess = np.array([horizons.horizon_excess(samples, lights, chances, is_quick=quick) for quick in (False, True)])
+    share, quick = (horizons.smooth_share(*own) for own in excess)
+    light = np.where(excess[0, 1] > 0.0, excess[0].sum(axis=0), 0.0)
+    assert (light * np.abs(share - quick)).sum() < 0.05 * light.sum() and np.ptp(share) > 0.9
+    whole, _ = end_at_horizons_of_cycles(samples, lights)
+    found, index = end_at_horizons_of_cycles(samples, lights, is_quick=True)
+    assert len(samples) < len(found) < 0.75 * len(whole)
+    # What is not split loses nothing, and most of what splitting moves is where it belongs.
+    sums = [np.bincount(index, found.specular_f0[:, 0]), samples.specular_f0[:, 0]]
+    assert np.allclose(*sums, atol=1e-12)
+    at_smooth = (found.geometric_normal == samples.smooth_normal[index]).all(axis=1)
+    ended = np.bincount(index, found.specular_f0[:, 0] * at_smooth, 500)
+    moved = (light * np.minimum(share, 1.0 - share)).sum()
+    assert (light * np.abs(ended - quick)).sum() < 1.5 * horizons.UNSPLIT * moved
 
 
 def test_bounds_of_thousands_of_lights_are_those_of_a_few():

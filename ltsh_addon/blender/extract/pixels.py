@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 import bpy
@@ -32,11 +33,15 @@ from ..render_settings import (
     shared_points,
     shifted_pixels,
     sub_pixel_offsets,
+    without_lights,
     without_scripts,
     working_space,
 )
 from .occluders import collect_occluders
 from .origin import move_to_origin
+
+# So many samples, whose files take about 1 GB, are worth no compression that takes long.
+FAST_PIXELS = 10_000_000
 
 
 def render_pixel_samples(
@@ -52,13 +57,15 @@ def render_pixel_samples(
         cycles.samples, cycles.use_sample_subset, cycles.sample_subset_length = sub_samples, True, 1
     # Only the camera differs: the others need no second look at the scene, and show the same bits.
     scene.render.use_persistent_data = sub_samples > 1
+    # Faster to write than ZIP, 2.4 times larger on the example scene.
+    codec = "RLE" if sub_samples * scene.render.resolution_x * scene.render.resolution_y <= FAST_PIXELS else "ZIP"
     with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             cycles.sample_offset = index  # of a subset
             with shifted_pixels(scene, offset):
-                render_exr(scene, folder / files[-1])
+                render_exr(scene, folder / files[-1], codec)
     scene.render.use_persistent_data = cycles.use_sample_subset = False
     remove_aovs(view_layer)
     return files
@@ -289,7 +296,9 @@ def extract(job: dict, folder: Path, progress) -> dict:
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
     with world_behind(scene, inventory.behind if has_rest and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if has_rest else ()), *job.get("indices", ()))
-        samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
+        # Lights in sight are part of the rest.
+        with nullcontext() if has_rest else without_lights(scene):
+            samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None

@@ -165,7 +165,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
         if kept is None or not kept.everything:
-            samples, film = _ended(samples, film, lights)
+            samples, film = _ended(samples, film, lights, options.for_finished)
         return Extraction(
             lights=lights,
             samples=samples,
@@ -193,10 +193,10 @@ def build_demo(path: Path, *, progress: Progress | None = None) -> None:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
-def _ended(samples, film, lights) -> tuple[SurfaceSamples, Film]:
+def _ended(samples, film, lights, is_quick: bool) -> tuple[SurfaceSamples, Film]:
     """The samples ended at the horizons of Cycles, and their film."""
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
-    samples, index = end_at_horizons_of_cycles(samples, lights, hit)
+    samples, index = end_at_horizons_of_cycles(samples, lights, hit, is_quick=is_quick)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
         first &= film.first[index]

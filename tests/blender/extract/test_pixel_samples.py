@@ -1,6 +1,7 @@
 """Samples lie where Cycles' camera rays end, with the normals Cycles shades with."""
 
 import math
+from contextlib import nullcontext
 
 import bpy
 import numpy as np
@@ -10,6 +11,7 @@ import scene_parts
 from lit_plane import add_instancer, into_collection
 from scene_parts import add_bump, add_plane, add_sphere, bsdf_material, principled
 
+from ltsh_addon.blender import render_settings
 from ltsh_addon.cycles import gbuffer, horizons, lobes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.shading import shade
@@ -33,6 +35,26 @@ def test_one_sample_per_pixel_is_at_the_center(tmp_path):
     assert np.abs(surface.position[:, :2] - expected).max() < 2.5e-4
     assert np.array_equal(np.sort(pixel), np.arange(width * height))
     assert np.allclose(surface.view, (0.0, 0.0, 1.0), atol=1e-6)
+
+
+def test_what_is_seen_does_not_depend_on_the_light_objects(tmp_path):
+    """Nothing that samples hold is light: the same bits are written without lamps, which are there afterwards."""
+    from_above(location=(0.5, 0.0, 3.0))
+    add_plane(principled(Roughness=0.4)[0], size=12.0)
+    material, node = principled(Metallic=1.0)
+    add_bump(material.node_tree, node)
+    add_sphere(material, radius=0.8, location=(0.0, 0.0, 0.8))
+    prepared = scene_parts.prepare()
+    scene, found = prepared[0], []
+    for lights in (nullcontext(), render_settings.without_lights(scene)):
+        folder = tmp_path / str(len(found))
+        folder.mkdir()
+        with lights:
+            _, channels = scene_parts.sample(folder, prepared, sub_samples=2)
+        found.append([{name: own[name] for name in own if "Combined" not in name} for own in channels])
+    for one, other in zip(*found, strict=True):
+        assert one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+    assert not any(ob.hide_render for ob in scene.objects)
 
 
 def test_sub_samples_fill_the_pixel_evenly_and_differ(tmp_path):

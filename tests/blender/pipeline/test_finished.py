@@ -359,3 +359,14 @@ def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     assert border.sum() > 20
     ratio = made.combined[border, :3].sum() / noisy[border].sum()
     assert ratio == pytest.approx(1.0, abs=0.03)
+
+
+def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
+    scene = floor_and_ball(gray())
+    for ob in list(bpy.data.objects):
+        if ob.type == "LIGHT":
+            bpy.data.objects.remove(ob)
+    scene.world = None
+    path = parts.save(tmp_path / "dark.blend")
+    report = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=2, denoise="off")).report
+    assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...cycles.closures import velvet_albedo
 from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
 from .bsdfs import Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
@@ -100,7 +99,6 @@ class Look:
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # of a node that is not shaded
-    albedo: float = 1.0  # of velvet: the mean over all views, by which its color is shown
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -154,12 +152,6 @@ def is_missing(image) -> bool:
 def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
     """A diffuse surface."""
     return Look("diffuse", {"color": constant(color)}, notes=notes)
-
-
-def mean_albedo_of_velvet(roughness: float) -> float:
-    """Share of uniform light that velvet of `roughness` reflects."""
-    cosine = (np.arange(64) + 0.5) / 64.0
-    return float(np.average(velvet_albedo(cosine, np.full(64, roughness)), weights=cosine))
 
 
 def default_look() -> Look:
@@ -359,10 +351,6 @@ class _Reader:
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
         look = replace(look, brush=self._brush(source, bsdf, look))
-        if bsdf.kind == "velvet":
-            self.note(f"{node.bl_label} is shown as a Diffuse BSDF of its mean albedo")
-            roughness = values["roughness"]
-            look = replace(look, albedo=mean_albedo_of_velvet(roughness.offset[0] if roughness.is_constant else 0.5))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look

@@ -179,6 +179,7 @@ class LightingPass:
             sky=self._sky is not None,
             sheen=passes != "specular" and gbuffer.has_sheen,
             rough=passes != "specular" and gbuffer.rebound is not None,
+            velvet=passes != "specular" and gbuffer.has_velvet,
             bent=passes != "diffuse" and gbuffer.has_bent,
         )
         parts = [features]
@@ -187,7 +188,7 @@ class LightingPass:
             parts = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
         if features.specular and features.rough:
             # By itself: together they may read more textures than there can be.
-            none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False}
+            none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
             parts = [*(replace(part, **none) for part in parts), alone]
         with nullcontext() if target is None else target.bind():

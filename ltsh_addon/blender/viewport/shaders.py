@@ -94,6 +94,7 @@ class Features:
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
     rough: bool = False  # rough diffuse lobes
+    velvet: bool = False  # diffuse lobes that are velvet; only with `rough`
     bent: bool = False  # dielectrics with an index of refraction below 1
     brushing: bool = False  # there are anisotropic lobes
     brushed: bool = False  # of these the pixels; else the others
@@ -160,7 +161,7 @@ def _lighting_source(table, features) -> str:
     if features.bent:
         parts.append(glsl("bent"))
     if features.rough:
-        parts.append(_rough_text())
+        parts.append(_rough_text(features))
     if features.diffuse:
         parts.append(_diffuse_text(features))
     if features.sky:
@@ -291,6 +292,8 @@ def _specular_loops(features) -> Iterator[str]:
 
 def _diffuse_loops(features) -> Iterator[str]:
     def light(integral):
+        if features.velvet:
+            yield "ltsh_set_velvet_apex(light);"
         if features.rough:
             factors = "diffuse_focused(matte, light, header, 1.0, left != 0u).xy"
             factors = f"diffuse_rough_factors(matte, {integral})" if integral else factors
@@ -380,11 +383,12 @@ def slope_text() -> str:
     return filled(glsl("slope"), {"SLOPE": _root_polynomial(albedo_slope)})
 
 
-def _rough_text() -> str:
+def _rough_text(features) -> str:
     nodes, weights = (values[ARC_NODES // 2 :] for values in np.polynomial.legendre.leggauss(ARC_NODES))
     constants = {"NODES": ARC_NODES, "PLACES": _vector(nodes), "WEIGHTS": _vector(weights)}
     text = filled(glsl("rough"), {"MEAN_SLOPE": _root_polynomial(mean_slope_above)})
-    return definitions(constants, "LTSH_ARC") + slope_text() + text
+    velvet = glsl("velvet") if features.velvet else ""
+    return definitions(constants, "LTSH_ARC") + slope_text() + text + velvet
 
 
 def _vector(values) -> str:

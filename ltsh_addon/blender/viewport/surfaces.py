@@ -179,6 +179,7 @@ class SurfacePass:
         lobes = [lobe.look for look in shown for lobe in look.lobes[number:]]
         marks = {
             "has_sheen": any(look.kind == "sheen" for look in lobes),
+            "has_velvet": any(look.kind == "velvet" for look in lobes),
             "has_bent": any(look.is_bent for look in lobes),
         }
         return GBufferTextures(**textures, **marks)
@@ -274,8 +275,8 @@ def _is_brushed(shown: ShownLook, number: int) -> bool:
 
 
 def _is_rough(shown: ShownLook, number: int) -> bool:
-    """True where the diffuse part of the lobe `number` is rough."""
-    return any(lobe.look.is_rough for lobe in shown.lobes[number : number + 1])
+    """True where the diffuse part of the lobe `number` is rough, or velvet."""
+    return any(lobe.look.is_rough or lobe.look.kind == "velvet" for lobe in shown.lobes[number : number + 1])
 
 
 def _bends(shown: ShownLook) -> bool:

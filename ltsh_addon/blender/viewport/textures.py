@@ -9,7 +9,7 @@ import gpu
 import numpy as np
 
 from ...cycles import closures, horizons
-from ...cycles.lobes import LOBE_KINDS
+from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
 from ...scene import AreaLight, SurfaceSamples
 from ...shading import light_cone, moments32
 from ...shading.facing import LEAST_SHRINKING, NEAR_DISK
@@ -73,6 +73,7 @@ class GBufferTextures:
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness, None: 0 everywhere
     shares: ShareGrid | None = None  # all of each light is seen
     has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
+    has_velvet: bool = False  # where rebound.w is -sigma of velvet, and its rgb the albedo
     has_bent: bool = False  # dielectrics with an index of refraction between 0 and 1
 
     def __post_init__(self):
@@ -81,7 +82,8 @@ class GBufferTextures:
         sizes = {
             field.name: (texture.width, texture.height)
             for field in fields(self)
-            if field.name not in ("shares", "has_sheen", "has_bent")
+            if not field.name.startswith("has_")
+            and field.name != "shares"
             and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
@@ -116,7 +118,7 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
     dip = samples.specular_dip
     bumped = (samples.smooth_normal != samples.diffuse_normal).any()
     turned = bumped or (samples.diffuse_normal != samples.normal).any()
-    fuzzy = samples.sheen_a > 0.0
+    fuzzy, velvet = samples.sheen_a > 0.0, samples.sheen_a < 0.0
     return GBufferTextures(
         has_sheen=bool(fuzzy.any()),
         has_bent=bool(((samples.ior < 1.0) & samples.dielectric.any(axis=1)).any()),
@@ -132,10 +134,19 @@ def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None
         diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
         smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
         tangent=texture(samples.tangent, samples.anisotropy) if samples.anisotropy.any() else None,
-        rebound=texture(samples.diffuse_rebound, samples.diffuse_roughness)
-        if samples.diffuse_roughness.any()
+        rebound=texture(
+            np.where(velvet[:, None], _albedo_of_velvet(samples)[:, None], samples.diffuse_rebound),
+            np.where(velvet, samples.sheen_a, samples.diffuse_roughness),
+        )
+        if velvet.any() or samples.diffuse_roughness.any()
         else None,
+        has_velvet=bool(velvet.any()),
     )
+
+
+def _albedo_of_velvet(samples) -> np.ndarray:
+    cosine = (samples.diffuse_normal * samples.view).sum(axis=1)
+    return closures.velvet_albedo(cosine, np.maximum(-samples.sheen_a, 0.0))
 
 
 HEADER = 7
@@ -394,6 +405,7 @@ DEFINES = {
     "SLOT_SIZE": str(SLOT_SIZE),
     "FIRST_TERM": str(FIRST_TERM),
     "LAYERS": str(LAYERS),
+    "LEAST_VELVET": str(LEAST_VELVET),
     "MAX_F0": str(closures.MAX_F0),
     "AVERAGE_START": str(closures.DIELECTRIC_AVERAGE[0]),
     "AVERAGE_SLOPE": str(closures.DIELECTRIC_AVERAGE[1]),
@@ -420,7 +432,7 @@ def look_values(look: Look) -> np.ndarray:
         if value is not None:
             start = FIRST_SLOT + SLOT_SIZE * position
             data[start : start + SLOT_SIZE] = _slot_values(value)
-    data[LAYERS, 0] = look.weight * look.albedo
+    data[LAYERS, 0] = look.weight
     if look.view_factor is not None:
         factor = look.view_factor
         data[LAYERS + 2, :3] = VIEW_FACTORS[factor.kind], factor.parameter, factor.is_complement
@@ -472,10 +484,10 @@ def albedo_table() -> np.ndarray:
 
 
 def sheen_table() -> np.ndarray:
-    """(N, N, 4): albedo, a and b of sheen by cosine, rows, and roughness, see `closures.sheen_lobe`."""
+    """(N, N, 4): albedo, a and b of sheen by cosine, rows, and roughness, see `closures.sheen_lobe`; that of velvet."""
     nodes = np.linspace(0.0, 1.0, closures.SHEEN_NODES)
     cosine, roughness = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
-    found = np.concatenate([closures.sheen_lobe(cosine, roughness), np.zeros((1, len(cosine)))])
+    found = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
     return found.T.reshape(len(nodes), len(nodes), 4)
 
 

@@ -4,6 +4,7 @@ from dataclasses import fields, replace
 from functools import partial
 
 import bpy
+import gpu
 import numpy as np
 import random_surfaces
 import scene_parts as parts
@@ -107,8 +108,7 @@ def low_poly_sphere():
 def samples_in(gbuffer, eye):
     """Samples and pixels of the surfaces in `gbuffer`."""
     textures = {field.name: getattr(gbuffer, field.name) for field in fields(gbuffer)}
-    others = ("shares", "has_sheen", "has_bent")
-    read_textures = {name: read(one) for name, one in textures.items() if name not in others and one is not None}
+    read_textures = {name: read(one) for name, one in textures.items() if isinstance(one, gpu.types.GPUTexture)}
     pixel = np.flatnonzero(read_textures["position"][:, 3] > 0.0)
     at = {name: values[pixel] for name, values in read_textures.items()}
     normals = ("geometric_normal", "diffuse_normal", "smooth_normal")

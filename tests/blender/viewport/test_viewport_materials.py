@@ -29,7 +29,6 @@ from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.sky import constant_sky
 from ltsh_addon.blender.viewport.surfaces import View
-from ltsh_addon.cycles.closures import velvet_albedo
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)
@@ -241,6 +240,11 @@ ROUGH = (
     made("two roughs", "MixShader", {0: 0.4, 1: rough(0.3), 2: rough(0.9, GOLD)}),
     made("rough and brushed", "MixShader", {0: 0.4, 1: rough(0.6), 2: ("BsdfAnisotropic", {"Anisotropy": 0.6})}),
     bsdf("rough image", Diffuse_Roughness=0.6, Base_Color=("TexImage", {"image": "colors"})),
+    made("velvet", "BsdfSheen", {"distribution": "ASHIKHMIN", "Roughness": 0.5, "Color": RED}),
+    made("stiff velvet", "BsdfSheen", {"distribution": "ASHIKHMIN", "Roughness": 0.15, "Color": RED}),
+    made("velvet image", "BsdfSheen", {"distribution": "ASHIKHMIN", "Roughness": MASK, "Color": GOLD}),
+    made("both sheens", "MixShader", {1: ("BsdfSheen", {}), 2: ("BsdfSheen", {"distribution": "ASHIKHMIN"})}),
+    made("over dust", "AddShader", {0: rough(0.8), 1: ("BsdfSheen", {"distribution": "ASHIKHMIN"})}),
 )
 
 BENT = (
@@ -319,17 +323,6 @@ def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter
     look = look_of(made("Lamp shade", "MixShader", {0: 0.25, 1: CLEAR, 2: (emitter, {strength: 2.0})})())
     np.testing.assert_allclose(look.emission, 0.5, rtol=1e-6)
     assert look.weight == 1.0
-
-
-def test_velvet_reflects_what_it_does_on_average_and_is_named():
-    parts.empty_scene()
-    look = look_of(made("Velvet", "BsdfSheen", {"Roughness": 0.4, "distribution": "ASHIKHMIN"})())
-    # Views that are as frequent as uniform light makes them: their cosine is the root of a uniform number.
-    cosine = np.sqrt(np.random.default_rng(1).random(100_000))
-    wanted = velvet_albedo(cosine, np.full(len(cosine), 0.4))
-    assert look.kind == "velvet" and look.weight == 1.0
-    assert look.albedo == pytest.approx(wanted.mean(), abs=5.0 * wanted.std() / len(wanted) ** 0.5)
-    assert look.notes == ("Velvet: Sheen BSDF is shown as a Diffuse BSDF of its mean albedo",)
 
 
 def test_what_is_not_resolved_has_the_viewport_color_or_its_default_and_is_named():

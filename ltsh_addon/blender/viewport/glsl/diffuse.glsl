@@ -25,6 +25,29 @@ vec3 diffuse_warped(diffuse_lobe lobe, vec3 v)
 #endif
 }
 
+#ifdef LTSH_ROUGH
+/* The summands of a lobe per solid angle, and form factors from their sum. */
+vec2 ltsh_diffuse_spot(vec3 direction)
+{
+#ifdef LTSH_VELVET
+    if (ltsh_velvet > 0.0) {
+        return vec2(ltsh_velvet_lobe(direction), 0.0);
+    }
+#endif
+    return ltsh_rough_spot(direction);
+}
+
+vec2 ltsh_diffuse_factors(float form_factor, vec2 sum)
+{
+#ifdef LTSH_VELVET
+    if (ltsh_velvet > 0.0) {
+        return vec2(max(-sum.x, 0.0), 0.0);
+    }
+#endif
+    return ltsh_rough_factors(form_factor, sum);
+}
+#endif
+
 diffuse_sum diffuse_empty()
 {
     diffuse_sum sum;
@@ -42,6 +65,9 @@ diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 #ifdef LTSH_ROUGH
     sum.rough += ltsh_rough_edge(start, end);
 #endif
+#ifdef LTSH_VELVET
+    sum.rough.x += ltsh_velvet_edge(start, end);
+#endif
     return sum;
 }
 
@@ -49,7 +75,7 @@ diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle
 {
     sum.total += 2.0 * solid_angle * direction;
 #ifdef LTSH_ROUGH
-    sum.rough += solid_angle * ltsh_rough_spot(direction);
+    sum.rough += solid_angle * ltsh_diffuse_spot(direction);
 #endif
     return sum;
 }
@@ -114,7 +140,7 @@ vec2 diffuse_rough_factors(diffuse_lobe lobe, diffuse_sum sum)
 {
     float plain = max(-0.5 * LTSH_ONE_OVER_PI * dot(lobe.plane_0, sum.total), 0.0);
     float shadowed = diffuse_form_factor(lobe, sum);
-    return (plain > 0.0 ? shadowed / plain : 0.0) * ltsh_rough_factors(plain, sum.rough);
+    return (plain > 0.0 ? shadowed / plain : 0.0) * ltsh_diffuse_factors(plain, sum.rough);
 }
 #endif
 
@@ -127,6 +153,9 @@ bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
 #endif
 #ifdef LTSH_ROUGH
     has = has && ltsh_rough_terms.y == 0.0;
+#endif
+#ifdef LTSH_VELVET
+    has = has && ltsh_velvet == 0.0;
 #endif
     return has;
 }

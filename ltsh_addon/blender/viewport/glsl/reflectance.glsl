@@ -65,16 +65,15 @@ float fresnel_of_dielectric(float cosine, float ior)
   return 0.5 * a * a * (1.0 + b * b);
 }
 
-/* Albedo, a and b of sheen. */
-vec3 sheen_at(float cosine, float roughness)
+/* Albedo, a and b of sheen, and the albedo of velvet. */
+vec4 sheen_at(float cosine, float roughness)
 {
   int last = textureSize(sheen_table, 0).x - 1;
   vec2 place = vec2(max(roughness, 1e-3), cosine) * float(last);
   ivec2 low = min(ivec2(place), ivec2(last - 1));
   vec2 share = place - vec2(low);
-  vec3 first = mix(texelFetch(sheen_table, low, 0).rgb, texelFetch(sheen_table, low + ivec2(1, 0), 0).rgb, share.x);
-  vec3 second = mix(texelFetch(sheen_table, low + ivec2(0, 1), 0).rgb,
-                    texelFetch(sheen_table, low + ivec2(1, 1), 0).rgb, share.x);
+  vec4 first = mix(texelFetch(sheen_table, low, 0), texelFetch(sheen_table, low + ivec2(1, 0), 0), share.x);
+  vec4 second = mix(texelFetch(sheen_table, low + ivec2(0, 1), 0), texelFetch(sheen_table, low + ivec2(1, 1), 0), share.x);
   return mix(first, second, share.y);
 }
 
@@ -195,7 +194,7 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
     lobe.ior = max(ior, 1.0);
   }
   else if (kind == SHEEN) {
-    vec3 fuzz = sheen_at(cosine, roughness);
+    vec4 fuzz = sheen_at(cosine, roughness);
     lobe.diffuse = color * max(fuzz.x, 0.0);
     /* As `GBufferTextures` has it. */
     lobe.ior = -max(fuzz.y, 1e-6);

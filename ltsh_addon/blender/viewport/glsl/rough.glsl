@@ -10,6 +10,10 @@ vec2 ltsh_rough_view;
 vec2 ltsh_rough_terms;
 /* What light that is scattered several times adds. */
 vec3 ltsh_rebound;
+#ifdef LTSH_VELVET
+/* Sigma, 0 where there is no velvet. */
+float ltsh_velvet;
+#endif
 
 /* `texel` is one of the G-buffer. */
 void ltsh_set_rough(vec3 normal, vec3 view, vec4 texel)
@@ -23,6 +27,9 @@ void ltsh_set_rough(vec3 normal, vec3 view, vec4 texel)
     float a = 1.0 / (LTSH_PI + texel.w * (0.5 * LTSH_PI - 0.66666667));
     ltsh_rough_terms = texel.w > 0.0 ? vec2(a, texel.w * a) : vec2(0.0);
     ltsh_rebound = texel.xyz;
+#ifdef LTSH_VELVET
+    ltsh_velvet = max(-texel.w, 0.0);
+#endif
 }
 
 /* Integral of z G(z) from z to 1, over 1 - z^2: G is `rough_slope`. */
@@ -105,7 +112,7 @@ vec2 ltsh_rough_edge(vec3 start, vec3 end)
     vec3 node = (1.0 - cut * cut) * middle + 2.0 * cut * along;
     float closing = ltsh_rough_closing(node.y / (1.0 + cut * cut), max(node.z, 0.0) / (1.0 + cut * cut));
     closing = first.x > 0.0 ? closing : -closing;
-    sum.x += crosses ? closing : 0.0;
+    sum.x += crosses && ltsh_rough_terms.y > 0.0 ? closing : 0.0;
     return sum;
 }
 

@@ -87,14 +87,20 @@ vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights we
 #endif
 
 #ifdef LTSH_ROUGH
-/* What a rough diffuse lobe reflects more than Lambert's, at points as they lie for that. */
+/* What another diffuse lobe reflects more than Lambert's, at points as they lie for that. */
 vec3 ltsh_rough_sky(vec4 mean)
 {
     vec2 terms = ltsh_rough_terms;
     vec2 all_of_it = vec2(LTSH_PI * terms.x + terms.y * rough_slope(ltsh_rough_view.x),
                           LTSH_PI * (1.0 - LTSH_PI * terms.x - 2.0 * terms.y * ltsh_mean_slope_above(0.0)));
+    bool other = terms.y > 0.0;
+#ifdef LTSH_VELVET
+    /* There the rebound is the albedo. */
+    other = other || ltsh_velvet > 0.0;
+    all_of_it = ltsh_velvet > 0.0 ? vec2(0.0, 1.0) : all_of_it;
+#endif
     vec3 radiance = mean.rgb * (all_of_it.x + all_of_it.y * ltsh_rebound - 1.0);
-    int count = terms.y > 0.0 && mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
+    int count = other && mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
     for (int k = 0; k < count; ++k) {
         float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
         float angle = 2.3999632 * float(k) + jitter.y;
@@ -102,12 +108,12 @@ vec3 ltsh_rough_sky(vec4 mean)
         vec3 local = vec3(sqrt(squared) * vec2(cos(angle), sin(angle)), height);
         vec3 direction = local.x * ltsh_rough_x + local.y * ltsh_rough_y + height * ltsh_rough_z;
         float solid_angle = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
-        vec2 factors = solid_angle * ltsh_rough_factors(height * LTSH_ONE_OVER_PI, -ltsh_rough_spot(direction));
+        vec2 factors = solid_angle * ltsh_diffuse_factors(height * LTSH_ONE_OVER_PI, -ltsh_diffuse_spot(direction));
         vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
         vec3 more = factors.x + factors.y * ltsh_rebound - 1.0 / float(LTSH_SKY_POINTS);
         radiance += more * (picture - mean.rgb);
     }
-    return terms.y > 0.0 ? radiance : vec3(0.0);
+    return other ? radiance : vec3(0.0);
 }
 #endif
 

@@ -83,8 +83,14 @@ void main()
   out_tangent = vec4(turned_tangent(smooth_normal, axis), 1.0 - ratio);
 #elif defined(DRAWS_REBOUNDS)
   vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
+  float cosine = clamp(dot(diffuse_normal, towards_eye), 0.0, 1.0);
   float sigma = look.data[LAYERS + 3].z;
-  out_rebound = vec4(rebound_of(color, clamp(dot(diffuse_normal, towards_eye), 0.0, 1.0), sigma), sigma);
+  out_rebound = vec4(rebound_of(color, cosine, sigma), sigma);
+  if (int(look.data[0].x + 0.5) == VELVET) {
+    float roughness = clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, LEAST_VELVET, 1.0);
+    /* As `GBufferTextures` has it. */
+    out_rebound = vec4(vec3(sheen_at(cosine, roughness).w), -roughness);
+  }
 #else
   out_geometric_normal = vec4(true_normal, 0.0);
   if (int(look.data[0].x + 0.5) == TRANSLUCENT) {

@@ -139,33 +139,36 @@ AHEAD = 2
 
 
 class KeptBlocks:
-    """Answers blocks of samples with what a task finds; keeps those of one key, and where their rays start."""
+    """Answers blocks of samples with what a task finds; keeps them, and where their rays start, by key."""
 
     def __init__(self, errand: Errand, tracer=None):
         self._tracer = open_tracer(errand.occluders, [errand.library]) if tracer is None else tracer
-        self._key, self._blocks = None, {}
+        self._blocks: dict[tuple, dict[int, tuple]] = {}
 
     def shade(self, message):
         """The answer to (run, task, key, number, block, normal): run, number, and what is found in the block (samples,
         film), with `normal` as its geometric normals. The block may be left out where it is kept; without a key none
         is."""
         run, task, key, number, block, normal = message
-        if key is not None and key != self._key:
-            self._key, self._blocks = key, {}
-        kept = None if key is None else self._blocks.get(number)
-        if kept is None:
-            kept = *block, self._tracer.starts(block[0])
-            if key is not None:
-                self._blocks[number] = kept
-        samples, film, starts = kept
+        blocks = {} if key is None else _kept_of(self._blocks, key)
+        if number not in blocks:
+            blocks[number] = *block, self._tracer.starts(block[0])
+        samples, film, starts = blocks[number]
         return run, number, task.shares(replace(samples, geometric_normal=normal), film, starts, self._tracer)
+
+
+def _kept_of(kept: dict[tuple, dict], key: tuple) -> dict:
+    """What is kept by `key`, at first nothing; what other pictures than its own, its first part, have is forgotten."""
+    for other in [other for other in kept if other[0] != key[0]]:
+        del kept[other]
+    return kept.setdefault(key, {})
 
 
 class Mate:
     """A process that traces beside this one, picture after picture, past the occluders of `tracer`, until `close`.
 
-    Both keep the samples of the `key` that was given last: these are sent once, but for their geometric normals, which
-    hang on the lights. The process is started where it is worth it. What is found does not hang on it.
+    Both keep the samples of a picture by its `key`, the picture and a layer of it: these are sent once, but for their
+    geometric normals, which depend on the lights. The process is started where it is worth it.
     """
 
     def __init__(self, tracer):
@@ -173,8 +176,8 @@ class Mate:
         self._child: parallel.Keeper | None = None
         self._is_possible = parallel.cores() > 1 and parallel.interpreter() is not None and tracer.library is not None
         self._is_up, self._run = False, 0
-        self._key, self._sent = None, set()
-        self.key = None
+        self._sent: dict[tuple, dict[int, bool]] = {}
+        self.key: tuple | None = None
 
     def run(self, task, blocks: Sequence, is_worth: bool, progress: Progress | None) -> Iterator[tuple]:
         """As the function `run`, of blocks of `key`; a process `is_worth` its start."""
@@ -206,12 +209,9 @@ class Mate:
         return self._run, task, self.key, number, (samples, film) if is_whole else None, samples.geometric_normal
 
     def _ask(self, task, number, block):
-        if self.key is not None and self.key != self._key:
-            self._key, self._sent = self.key, set()
-        is_known = self.key is not None and number in self._sent
-        self._child.put(self._message(task, number, block, not is_known))
-        if self.key is not None:
-            self._sent.add(number)
+        sent = {} if self.key is None else _kept_of(self._sent, self.key)
+        self._child.put(self._message(task, number, block, number not in sent))
+        sent[number] = True
 
     def _answers(self, wait: bool) -> list:
         """What the process has found for this run; `wait` a little for it."""
@@ -232,7 +232,7 @@ class Mate:
         """End the process; a later run may start another one."""
         if self._child is not None:
             self._child.end()
-        self._child, self._key, self._sent = None, None, set()
+        self._child, self._sent = None, {}
 
 
 # With fewer samples a process takes longer to start than to help.

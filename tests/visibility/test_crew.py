@@ -64,7 +64,7 @@ def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch
     monkeypatch.setattr(parallel.Keeper, "put", lambda self, question: (asked.append(question), put(self, question)))
     mate = crew.Mate(tracer)
     try:
-        for number, key in enumerate(("first", "first", "second", None, "second")):
+        for number, key in enumerate((("first", 0), ("first", 0), ("second", 0), None, ("second", 1))):
             if number == 2:
                 # What was asked last is not waited for, and is not taken for an answer later on.
                 with pytest.raises(Cancelled):

@@ -16,6 +16,8 @@ EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 SUBSURFACE = "ShaderNodeSubsurfaceScattering"
+# Without a row: it reflects nothing, and pictures show no light that goes through.
+REFRACTION_NODE = "ShaderNodeBsdfRefraction"
 NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> the property that chooses among its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}

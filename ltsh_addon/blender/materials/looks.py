@@ -9,7 +9,7 @@ import numpy as np
 
 from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
-from .bsdfs import Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
+from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
 from .graph import (
     Factor,
     Leaf,
@@ -32,6 +32,8 @@ NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specula
 ROUGH_KINDS = ("principled", "diffuse")
 # The kind of a lobe that is the coat of another one; all others are those of `cycles.lobes.LOBE_KINDS`.
 COAT = "coat"
+# That of what only lets light through.
+REFRACTION = "refraction"
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class Brush:
 class Look:
     """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
 
-    kind: str  # of `cycles.lobes.LOBE_KINDS`, or COAT
+    kind: str  # of `cycles.lobes.LOBE_KINDS`, COAT or REFRACTION
     values: dict[str, Value]  # by the names of NEUTRAL
     normal: Value | None = None  # of a tangent space normal map
     normal_strength: float = 1.0
@@ -112,7 +114,7 @@ class Look:
     @property
     def through(self) -> float:
         """The share of it, but for metal, that lets see what is behind."""
-        if self.kind == "glass":
+        if self.kind in ("glass", REFRACTION):
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
 
@@ -322,6 +324,9 @@ class _Reader:
     def _lobes_of(self, source: Source, share: Share) -> list[Look]:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
+        if source.node.bl_idname == REFRACTION_NODE:
+            values = self._on_one_uv_map({"color": self._value(source, "color", "Color"), **share.values})
+            return [Look(REFRACTION, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
         if bsdf is None:
             self.note(f"{source.node.bl_label} is not shown, its viewport color is")
             values = {"color": constant(self.material.diffuse_color), **share.values}

@@ -17,7 +17,7 @@ from .shaders import glsl, pixel_shader
 from .shadows import LiveShadows, ShadowRays
 from .sky import background_texels, sky_texels
 from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import GBufferTextures, UploadedLights, float_texture, read_texture, upload_lights
+from .textures import GBufferTextures, ShareGrid, UploadedLights, float_texture, read_texture, upload_lights
 
 MODES = ("single", "split", "difference")
 # The lighting pass is fast for so many indices of refraction, and exact for all.
@@ -129,6 +129,7 @@ class _Layer:
         self._gbuffer: GBufferTextures | None = None
         self._lit: GBufferTextures | None = None
         self.smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
+        self.shares: ShareGrid | None = None  # those that all lobes have
         self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
 
     def draw(self, mirror, view: View, size) -> None:
@@ -151,6 +152,7 @@ class _Layer:
     def lobe(self, number: int, mirror, view: View, lights: UploadedLights) -> GBufferTextures:
         """What is to be lit of the lobes `number`; valid until the next call."""
         if number == 0:
+            self.smooth_normal = self._gbuffer.smooth_normal
             return self._lit
         gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
         if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
@@ -246,16 +248,19 @@ class ViewRenderer:
         for layer in layers:
             if surfaces_changed or lights_changed or not layer.is_ready:
                 layer.choose_horizons(mirror, view, self._lights)
+            layer.shares = None
+            if self.shadows is not None and not self.shadows.traces_lobes:
+                layer.shares = self._shares(layer, layer.lobe(0, mirror, view, self._lights), mirror, view)
+                if self.shadows.waits:
+                    return False
         targets = [self._target(self._targets, number, size) for number in range(len(wanted))]
         first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
         if not mirror.has_glass:
-            if not self._light(self._surfaces, wanted, targets, (mirror, view), first):
-                return False
+            self._light(self._surfaces, wanted, targets, (mirror, view), first)
             self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
             return True
         behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
-        if not self._light(self._surfaces, wanted, behind, (mirror, view), "NONE"):
-            return False
+        self._light(self._surfaces, wanted, behind, (mirror, view), "NONE")
         self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
         through = self._glass.through(mirror.instances, view)
         glass = self._glass.lobe(0, mirror, view, self._lights).position
@@ -300,29 +305,28 @@ class ViewRenderer:
         self._uploaded = lights, wanted, view.origin
         return True
 
-    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> bool:
+    def _shares(self, layer: _Layer, gbuffer: GBufferTextures, mirror, view: View) -> ShareGrid | None:
+        """Which shares of the lights lobes of a layer see."""
+        shadows = self.shadows.of_glass if layer is self._glass else self.shadows
+        sides = () if self._lights.sky is None else mirror.sky.sides
+        whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
+        return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
+
+    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> None:
         """Light a layer into the buffers of techniques and passes, with the blending `first`, as of a `seen` mirror and
-        view; surfaces and shadows of a lobe are those of all. False where shadows have to be waited for."""
+        view; surfaces of a lobe are those of all."""
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
         place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
-        sides = () if self._lights.sky is None else mirror.sky.sides
-        # A thread traces one picture at a time: that of what is behind the glass.
-        shadows = None if layer is self._glass and isinstance(self.shadows, LiveShadows) else self.shadows
         for lighting in lightings:
             lighting.number = self.samples
-        shares = None
+        traces = self.shadows is not None and self.shadows.traces_lobes
         for number in range(max(mirror.most_lobes, 1)):
             gbuffer = layer.lobe(number, mirror, view, self._lights)
-            if shadows is not None and (number == 0 or shadows.traces_lobes):
-                whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
-                shares = shadows.shares(whole, view, self._lights.lights, sides, self.samples)
-                if shadows.waits:
-                    return False
+            shares = self._shares(layer, gbuffer, mirror, view) if traces else layer.shares
             gbuffer = replace(gbuffer, shares=shares)
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
                 lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
-        return True
 
     def _add_emission(self, layer: _Layer, wanted, buffers, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen

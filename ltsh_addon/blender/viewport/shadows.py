@@ -53,6 +53,11 @@ class ShadowRays:
 
     version, waits, traces_lobes = 0, False, True
 
+    @property
+    def of_glass(self) -> ShadowRays:
+        """What traces those of the glass before the surfaces."""
+        return self
+
     def take_news(self) -> None:
         """There are none: all is traced at once."""
 
@@ -131,7 +136,7 @@ class _Points:
         self.grid = positions, stretch @ view.projection
 
     def follow(self, gbuffer: GBufferTextures) -> None:
-        """Read again what hangs on the lights."""
+        """Read again what depends on the lights."""
         if gbuffer.geometric_normal is not None:
             self._normal = _every(gbuffer.geometric_normal, self._step)
 
@@ -162,6 +167,7 @@ class _Request:
     rays: int
     tracing: _Tracing
     origin: np.ndarray
+    layer: int  # 1: of glass
 
     @property
     def is_own(self) -> bool:
@@ -173,7 +179,7 @@ class _Request:
         lights; Cancelled is raised where there are none, or not all for a group of points."""
         samples, film = self.points.samples()
         tracer, found = self.tracing.around(self.origin), {}
-        self.tracing.mate.key = self.state if self.level == 1 else None
+        self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
         place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
@@ -204,27 +210,57 @@ class _Request:
         return found
 
 
+class _Followed:
+    """The scene whose shadows are seen, and what traces them."""
+
+    def __init__(self):
+        self.scene, self.collect, self.collected, self.before = None, None, None, None
+        self.tracing: _Tracing | None = None
+        self.collect_seconds = 0.0
+
+    def may_collect(self) -> bool:
+        """Are occluders known, or quick to collect, or did nothing move since the last call?"""
+        if self.collected == self.scene or self.collect_seconds <= QUICK_SECONDS or self.scene == self.before:
+            return True
+        self.before = self.scene
+        return False
+
+    def collect_now(self) -> None:
+        """Collect the occluders unless they are known."""
+        if self.collected == self.scene:
+            return
+        start = time.perf_counter()
+        self.close()
+        self.tracing, self.collected = _Tracing(self.collect()), self.scene
+        self.collect_seconds = time.perf_counter() - start
+
+    def close(self) -> None:
+        """End the process that helps to trace."""
+        if self.tracing is not None:
+            self.tracing.close()
+
+
 class LiveShadows:
     """Shadows while an artist works: a thread traces them, coarse at first, finer while nothing changes.
 
     Until new ones are there, the old ones are seen where the same surfaces are. Recoloring a light traces nothing but
-    what refines the view at rest.
+    what refines the view at rest. Those of the glass before the surfaces are of another one, `of_glass`, for whom all
+    is told and asked here but the shares. One of both traces at a time.
     """
 
     traces_lobes = False  # all lobes have the shadows of the first
 
-    def __init__(self):
-        self.version, self.problem = 0, ""
-        self.waits = False  # for the thread: the picture for which shares were asked last cannot be drawn yet
+    def __init__(self, behind: LiveShadows | None = None):
+        self._behind, self._glass = behind, None
+        self._followed = _Followed() if behind is None else behind._followed
+        self._version, self._problem = 0, ""
+        self._waits = False  # for the thread: the picture for which shares were asked last cannot be drawn yet
         self._own: tuple[int, ShareGrid | None] = (0, None)  # of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._request: _Request | None = None  # that the thread does, or has done last
         self._outcomes: deque[tuple[_Request, dict[int, np.ndarray] | Exception]] = deque()
         self._is_left = False
-        self._scene, self._collect, self._collected, self._scene_before = None, None, None, None
-        self._tracing: _Tracing | None = None
-        self._collect_seconds = 0.0
         # The lights, those of a sky as one, and what was given.
         self._lights, self._keys, self._given = (), (), None
         self._wanted: tuple = ()
@@ -240,37 +276,64 @@ class LiveShadows:
         self._grid: ShareGrid | None = None
         self._origin = np.zeros(3)
 
+    @property
+    def of_glass(self) -> LiveShadows:
+        """Those of the glass before the surfaces."""
+        if self._glass is None:
+            self._glass = LiveShadows(self)
+        return self._glass
+
+    @property
+    def _both(self) -> tuple[LiveShadows, ...]:
+        return (self,) if self._glass is None else (self, self._glass)
+
+    @property
+    def version(self) -> int:
+        """Another one where pictures are to be drawn anew."""
+        return sum(one._version for one in self._both)
+
+    @property
+    def problem(self) -> str:
+        """Why there are no shadows, or nothing."""
+        return next((one._problem for one in self._both if one._problem), "")
+
+    @property
+    def waits(self) -> bool:
+        """Can the picture for which shares were asked last not be drawn yet?"""
+        return any(one._waits for one in self._both)
+
     def follow(self, scene: tuple, collect: Callable[[], Occluders]) -> None:
         """To be told before a picture is drawn: `collect()` gives the occluders of `scene`, which compares."""
-        if scene != self._scene:
-            self.problem = ""
-        self._scene, self._collect = scene, collect
+        if scene != self._followed.scene:
+            for one in self._both:
+                one._problem = ""
+        self._followed.scene, self._followed.collect = scene, collect
 
     @property
     def is_busy(self) -> bool:
-        """Does the thread work, or has it found something that no picture shows yet?"""
-        return self._thread is not None
+        """Does a thread work, or has it found something that no picture shows yet?"""
+        return any(one._thread is not None for one in self._both)
 
     @property
     def has_news(self) -> bool:
-        """Has the thread found something, or ended?"""
-        return self._thread is not None and (bool(self._outcomes) or not self._thread.is_alive())
+        """Has a thread found something, or ended?"""
+        return any(one._thread is not None and (one._outcomes or not one._thread.is_alive()) for one in self._both)
 
     def stop(self) -> None:
         """Let the thread end soon, and what helps it."""
-        self._is_left = True
-        self._stop.set()
-        if self._tracing is not None and (self._thread is None or not self._thread.is_alive()):
-            self._tracing.close()
+        for one in self._both:
+            one._is_left = True
+            one._stop.set()
+        if all(one._thread is None or not one._thread.is_alive() for one in self._both):
+            self._followed.close()
 
     def take_news(self) -> None:
-        """Take over what the thread has found; pictures are to be drawn anew where `version` is another one then."""
-        if not self.has_news:
-            return
-        if not self._thread.is_alive():
-            self._thread = None
-        while self._outcomes:
-            self._take(*self._outcomes.popleft())
+        """Take over what has been found; pictures are to be drawn anew where `version` is another one then."""
+        for one in self._both:
+            if one._thread is not None and not one._thread.is_alive():
+                one._thread = None
+            while one._outcomes:
+                one._take(*one._outcomes.popleft())
 
     def _take(self, request: _Request, outcome: dict[int, np.ndarray] | Exception) -> None:
         if request.is_own and not isinstance(outcome, Exception):
@@ -280,9 +343,9 @@ class LiveShadows:
                 grid = ShareGrid(_upload(values, positions.shape[1::-1]), float_texture(positions), projection)
                 self._own = request.group, grid
             return
-        self.version += not (request.is_own and isinstance(outcome, Cancelled))
+        self._version += not (request.is_own and isinstance(outcome, Cancelled))
         if isinstance(outcome, Exception):
-            self.problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
+            self._problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
             return
         if request.state != self._state:
             self._state, self._known, self._points, self._latest = request.state, {}, {}, {}
@@ -307,23 +370,24 @@ class LiveShadows:
                 self._latest = {}
                 self._show()
         if number == 0:
-            self._wanted = (self._scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
+            self._wanted = (self._followed.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
             self._own = (0, None)
-        self.waits = False
+        for one in self._both:
+            one._waits = False
         level = self._next_level()
-        if self._thread is None and level is not None and self._may_begin(level, number):
+        if level is not None and self._may_begin(level, number):
             try:
                 self._begin(level, gbuffer, view)
             except Exception as error:
-                self.problem = f"shadows: {error_line(error)}"
+                self._problem = f"shadows: {error_line(error)}"
         elif self._thread is not None and self._is_outdated:
             self._stop.set()
         if number > 0 and not self._is_off:
             if number // GROUP == self._own[0] and self._own[1] is not None:
                 return self._own[1]
-            if self._thread is None and level is None and number >= FIRST_POINTS:
+            if level is None and number >= FIRST_POINTS and self._is_free:
                 self._begin_own(number // GROUP, gbuffer, view)
-            self.waits = self._thread is not None
+            self._waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         return self._grid if fits else None
 
@@ -335,7 +399,7 @@ class LiveShadows:
 
     @property
     def _is_off(self) -> bool:
-        return not self._keys or bool(self.problem) or bool(too_many(len(self._keys), self._wanted[-1]))
+        return not self._keys or bool(self._problem) or bool(too_many(len(self._keys), self._wanted[-1]))
 
     def _next_level(self) -> int | None:
         """The coarsest level that a light does not have for what is wanted; None: all is there."""
@@ -346,22 +410,23 @@ class LiveShadows:
         best = min(max(self._known.get(key, (-1,))) for key in self._keys)
         return None if best == len(LEVELS) - 1 else best + 1
 
+    @property
+    def _is_free(self) -> bool:
+        """Does no thread work, here or for the other layer?"""
+        other = self._behind or self._glass
+        return self._thread is None and (other is None or other._thread is None)
+
     def _may_begin(self, level: int, number: int) -> bool:
         """The points of finer levels must be those of the first picture, and while objects move the window must not
         wait for occluders."""
-        is_slow = self._collected != self._scene and self._collect_seconds > QUICK_SECONDS
-        if is_slow and self._scene != self._scene_before:
-            self._scene_before = self._scene
+        if not self._is_free:
+            if self._thread is None and self._glass is not None and self._glass._request.level > 0:
+                self._glass._stop.set()
             return False
-        return number == 0 or level == 0
+        return self._followed.may_collect() and (number == 0 or level == 0)
 
     def _begin(self, level: int, gbuffer: GBufferTextures, view: View) -> None:
-        if self._collected != self._scene:
-            start = time.perf_counter()
-            if self._tracing is not None:
-                self._tracing.close()
-            self._tracing, self._collected = _Tracing(self._collect()), self._scene
-            self._collect_seconds = time.perf_counter() - start
+        self._followed.collect_now()
         requests = [self._request_of(level, gbuffer, view)]
         if level == 0 and self._pixels.get(False, (None,))[0] == self._wanted:
             requests.append(self._request_of(1, gbuffer, view))
@@ -396,8 +461,9 @@ class LiveShadows:
             lights=tuple(self._lights[n] for n in numbers),
             points=points,
             rays=rays,
-            tracing=self._tracing,
+            tracing=self._followed.tracing,
             origin=view.origin.copy(),
+            layer=int(self._behind is not None),
         )
 
     def _start(self, requests: list[_Request]) -> None:

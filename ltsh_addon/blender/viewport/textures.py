@@ -16,7 +16,7 @@ from ...shading.facing import LEAST_SHRINKING, NEAR_DISK
 from ...shading.header import float_literal
 from ...shading.light_polygons import ROUND_CORNERS, ROUND_LIMITS
 from ...shading.lookup_table import LookupTable
-from ..materials.looks import COAT, IMAGE_SLOTS, Look
+from ..materials.looks import COAT, IMAGE_SLOTS, REFRACTION, Look
 from ..materials.values import EXTENSIONS, Value
 
 # Field of `GBufferTextures` by its name in shaders.
@@ -395,7 +395,7 @@ LOOK_SIZE = LAYERS + 5
 # Where the tangents of anisotropic lobes run, by `Brush.direction`; 0: there are none.
 DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "": 4}
 VIEW_FACTORS = {"fresnel": 1, "facing": 2}
-KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1}
+KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1, REFRACTION: max(LOBE_KINDS.values()) + 2}
 DEFINES = {
     **{name.upper(): str(int(number)) for name, number in KINDS.items()},
     **{f"{name.upper()}_SLOT": str(position) for position, name in enumerate(IMAGE_SLOTS)},

@@ -25,6 +25,7 @@ from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
 from ltsh_addon.blender.viewport.still import view_of_camera
+from ltsh_addon.blender.viewport.textures import read_texture
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -219,10 +220,12 @@ def test_a_view_at_rest_is_the_mean_of_its_points_and_starts_again_after_a_chang
 
 
 class LiveView:
-    """A view with live shadows, its scene, and what it draws."""
+    """A view with live shadows, its scene, and what it draws of a pass."""
 
-    def __init__(self):
-        self.camera = set_up_scene()
+    def __init__(self, passes="diffuse", add=lambda: None):
+        self.camera, self.passes = set_up_scene(), passes
+        add()
+        bpy.context.view_layer.update()
         self.depsgraph = bpy.context.evaluated_depsgraph_get()
         self.mirror, self.canvas, self.renderer = SceneMirror(), Canvas(*SIZE), ViewRenderer()
         self.mirror.sync(self.depsgraph)
@@ -230,10 +233,10 @@ class LiveView:
         self.live = LiveShadows()
 
     def drawn(self, shadows, points=CENTERS):
-        """The diffuse picture (H, W, 3)."""
+        """The picture (H, W, 3)."""
         self.live.follow((0,), self.occluders)
         self.renderer.shadows = shadows
-        shown = ShownPicture("ltsh4", "diffuse", "single", "ltc", 0.5, 1.0, 1.0, True)
+        shown = ShownPicture("ltsh4", self.passes, "single", "ltc", 0.5, 1.0, 1.0, True)
         self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer, points)
         return self.renderer.read()[..., :3].astype(np.float64)
 
@@ -287,7 +290,7 @@ def live_pictures():
         partial = stopped_shares(scene)
         scene.drawn(scene.live)
         scene.live.follow((1,), lambda: 1 / 0)
-        scene.live._scene_before = (1,)
+        scene.live._followed.before = (1,)
         scene.live.take_news()
         scene.live.shares(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
         return plain, exact, first, levels, rest, recolored, after_move, partial, scene.live.problem
@@ -312,6 +315,50 @@ def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
     assert after_move == [((0,), 0), ((0,), 1)] and relative(picture, expected) < 0.05
     assert partial == [None, {0, 1}]
     assert problem == "shadows: division by zero"
+
+
+def glass_pictures():
+    """Specular pictures of a pane of glass before the sphere, which hides a light: without shadows, exact, by live
+    shadows at rest, and after a light has moved with exact ones; and where the pane is."""
+
+    def add_pane():
+        glass = parts.bsdf_material("ShaderNodeBsdfGlass", "glass", Roughness=0.4)[0]
+        parts.add_plane(glass, name="Pane", size=2.6, location=(0.0, -0.6, 0.02))
+        # Its reflection would be where that of the sphere is.
+        parts.add_area_light("Back", location=(-0.4, 3.0, 2.6), rotation=(-1.0, 0.0, 0.0), energy=100.0)
+
+    scene = LiveView("specular", add_pane)
+
+    def at_rest():
+        for _ in range(20):
+            picture = scene.drawn(scene.live)
+            threads = [one._thread for one in scene.live._both if one._thread is not None]
+            if not threads:
+                return picture
+            assert len(threads) == 1, "one traces at a time"
+            threads[0].join()
+        raise AssertionError("shadows never end")
+
+    try:
+        plain, exact = scene.drawn(None), scene.drawn(ShadowRays(scene.occluders(), 256))
+        pane = read_texture(scene.renderer._glass._gbuffer.position)[..., 3] > 0.0
+        live, lights = at_rest(), scene.mirror.lights
+        scene.mirror.lights = (replace(lights[0], center=lights[0].center + [0.0, 0.2, 0.1]), *lights[1:])
+        moved = at_rest(), scene.drawn(ShadowRays(scene.occluders(), 256))
+        return plain, exact, live, moved, pane
+    finally:
+        scene.live.stop()
+        scene.renderer.free()
+
+
+@edits_with_graphics
+def test_the_reflection_of_glass_has_live_shadows():
+    plain, exact, live, (moved, expected), pane = with_graphics(glass_pictures)
+    assert 200 < pane.sum() < pane.size / 2
+    assert relative(plain[pane], exact[pane]) > 0.3
+    # The rays differ: 32 for a pixel, or 256.
+    assert relative(live[pane], exact[pane]) < 0.05 and relative(moved[pane], expected[pane]) < 0.05
+    assert relative(exact[pane], expected[pane]) > 0.05, "the first shadows would not do after the move"
 
 
 def refined_pictures():

@@ -200,7 +200,7 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
     lobe.ior = -max(fuzz.y, 1e-6);
     lobe.roughness = fuzz.z;
   }
-  else {
+  else if (kind != REFRACTION) {
     lobe.diffuse = color;
   }
   return lobe;
@@ -209,8 +209,9 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
 /* What is seen of things behind: light crosses the surface twice, before and behind what is inside. */
 vec3 let_through(vec3 color, float metallic, float ior, float cosine)
 {
-  bool principled = int(look.data[0].x + 0.5) == PRINCIPLED;
+  int kind = int(look.data[0].x + 0.5);
+  bool principled = kind == PRINCIPLED;
   float share = look.data[1].w * (principled ? 1.0 - metallic : 1.0);
-  float left = 1.0 - fresnel_of_dielectric(cosine, ior);
+  float left = kind == REFRACTION ? 1.0 : 1.0 - fresnel_of_dielectric(cosine, ior);
   return share * left * left * (principled ? color : color * color);
 }

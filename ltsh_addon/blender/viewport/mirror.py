@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -42,7 +41,7 @@ from ..materials.looks import Look, look_of, world_radiance
 from ..materials.values import product, value_at
 from ..process import client
 from .meshes import MeshBatches, mesh_batches
-from .sky import REST_SECONDS, ShownSky, constant_sky
+from .sky import REST_SECONDS, ShownSky, constant_sky, written
 from .textures import look_values, uniform_buffer
 
 # Where nothing says on which side of closed emissive meshes the eye is, it is outside.
@@ -228,10 +227,11 @@ class LiveLamps:
         uids = list(look.states)
         try:
             folder = stack.enter_context(temporary_folder())
-            path = folder / "lamps.blend"
-            lamps = [_unseen_lamp(present[uid], path, look.states[uid]) for uid in uids]
-            own = {present[uid] for uid in uids if present[uid].library is None}
-            bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
+            places = written(folder / "lamps.blend", [present[uid] for uid in uids])
+            lamps = [
+                client.UnseenLamp(str(place), present[uid].name, *look.states[uid][:2])
+                for uid, place in zip(uids, places, strict=True)
+            ]
         except (OSError, RuntimeError) as error:
             stack.close()
             self._known.update({uid: (look.states[uid], f"{NOT_RESOLVED}: {error_line(error)}") for uid in uids})
@@ -254,12 +254,6 @@ class LiveLamps:
         self._look = look
         look.thread.start()
         return False
-
-
-def _unseen_lamp(data, path: Path, state: tuple) -> client.UnseenLamp:
-    """`data` in the .blend `path`, or in its library."""
-    place = path if data.library is None else bpy.path.abspath(data.library.filepath)
-    return client.UnseenLamp(str(place), data.name, *state[:2])
 
 
 def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) -> list[AreaLight]:

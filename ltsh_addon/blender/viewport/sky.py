@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -183,6 +184,13 @@ def background_texels(sky: ShownSky) -> np.ndarray:
     return np.concatenate([wide, np.ones((*wide.shape[:2], 1))], axis=-1)
 
 
+def written(path: Path, blocks: list) -> list[Path]:
+    """Write data-blocks into the .blend `path`; where each can be loaded from: linked ones from their libraries."""
+    own = {block for block in blocks if block.library is None}
+    bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
+    return [path if block in own else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
+
+
 class LiveWorld:
     """Worlds as Cycles sees them, for a window: a second Blender renders them while the view goes on."""
 
@@ -220,14 +228,15 @@ class LiveWorld:
         return outcome
 
     def _begin(self, frame: int) -> None:
-        world, self._of, self._wanted = bpy.data.worlds.get(self._wanted), self._wanted, ""
+        self._of, self._wanted = self._wanted, ""
+        world = next((one for one in bpy.data.worlds if one.name_full == self._of), None)
         if world is None:
             return
         stack = ExitStack()
         folder = stack.enter_context(temporary_folder())
-        path, name, like = folder / "world.blend", world.name, light_of_world(world)
+        name, like = world.name, light_of_world(world)
         try:
-            bpy.data.libraries.write(str(path), {world}, path_remap="ABSOLUTE", fake_user=True)
+            path = written(folder / "world.blend", [world])[0]
         except BaseException:
             stack.close()
             raise

@@ -88,9 +88,18 @@ def test_a_view_is_lit_by_the_world_as_pictures_are(capsys, tmp_path, add_world,
     assert not found["ltsh4.diffuse"][behind].any()
 
 
-def test_windows_get_the_world_from_a_second_blender():
+@pytest.mark.parametrize("is_linked", [False, True], ids=["own", "linked"])
+def test_windows_get_the_world_from_a_second_blender(tmp_path, is_linked):
     parts.empty_scene(*SIZE)
     world = add_gradient()
+    if is_linked:
+        name = world.name
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
+        parts.empty_scene(*SIZE)
+        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
+        with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True, relative=True) as (_, wanted):
+            wanted.worlds = [name]
+        (world,) = wanted.worlds
     live = sky.LiveWorld()
     assert live.look(world) is None and live.is_busy
     end, found = time.monotonic() + 60.0, None

@@ -55,8 +55,6 @@ def render_pixel_samples(
     files, sub_samples, cycles = [], len(offsets), scene.cycles
     if scene.camera.data.dof.use_dof:
         cycles.samples, cycles.use_sample_subset, cycles.sample_subset_length = sub_samples, True, 1
-    # Only the camera differs: the others need no second look at the scene, and show the same bits.
-    scene.render.use_persistent_data = sub_samples > 1
     # Faster to write than ZIP, 2.4 times larger on the example scene.
     codec = "RLE" if sub_samples * scene.render.resolution_x * scene.render.resolution_y <= FAST_PIXELS else "ZIP"
     with pinned_pixel_filter(scene), without_scripts(scene):
@@ -64,9 +62,11 @@ def render_pixel_samples(
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             cycles.sample_offset = index  # of a subset
+            # Only the camera differs: the others need no second look at the scene, and show the same bits.
+            scene.render.use_persistent_data = index < sub_samples - 1
             with shifted_pixels(scene, offset):
                 render_exr(scene, folder / files[-1], codec)
-    scene.render.use_persistent_data = cycles.use_sample_subset = False
+    cycles.use_sample_subset = False
     remove_aovs(view_layer)
     return files
 
@@ -120,8 +120,12 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
     samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
+    # One look at the scene, and one picture of a procedural sky, is enough for all files.
+    scene.render.use_persistent_data = True
     with pinned_pixel_filter(scene):
-        return [_render_half(scene, folder, half, offsets, share, progress) for half in SEEDS]
+        files = [_render_half(scene, folder, half, offsets, share, progress) for half in SEEDS]
+    scene.render.use_persistent_data = False
+    return files
 
 
 def _render_half(scene, folder: Path, half: str, offsets, share: int, progress) -> list[list]:

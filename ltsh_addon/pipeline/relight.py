@@ -29,6 +29,10 @@ from .options import PictureOptions
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
 SAME_REST = "bounced light{}, and all else that Cycles has rendered, is as the lights were; there is no PNG"
 BUT_GROUPS = ", but for that of light groups {}"
+GRAIN = (
+    "with depth of field finished pictures are denoised as a whole: light that changes shows its grain again; render "
+    "the picture anew to be rid of it"
+)
 SAME_GLOW = "what glows, lights in sight and the background are seen as the lights were; there is no PNG"
 KEPT_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
@@ -96,6 +100,7 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     if kept.rest:
         groups = [repr(group) for group in kept.rest if group]
         warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
+        warnings += (GRAIN,) if kept.extraction.has_lens else ()
         name = technique_of(kept)
         rest = _changed_rest(kept, lights, tables[name], results[name].shading, progress)
         extraction = replace(extraction, warnings=warnings)
@@ -323,7 +328,7 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
         if group and values.any() and all(row.group != group for row in rows):
             rows.append(Row(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
-    notes = [
+    notes = [GRAIN] * bool(kept.rest and kept.extraction.has_lens) + [
         SHARED_OUT.format(group, listed(repr(row.name) for row in own))
         for group in kept.rest
         if group and len(own := [row for row in rows if row.group == group]) > 1

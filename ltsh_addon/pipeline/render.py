@@ -40,8 +40,8 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 OF_GROUP = "Combined_"
 REST = "rest"
 # Points of a pixel where nothing is said, at most those of a budget, and processor seconds that denoising and writing
-# take for a million pixels, and that a light group takes beside.
-SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, GROUP_SECONDS = 9, 17, 12.0, 4.0
+# take for a million pixels, and those of each further denoising.
+SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, MORE_SECONDS = 9, 17, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
 # Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
@@ -124,8 +124,9 @@ def finish(
         shaded(comparison)
         spent = clock.seconds()
         film = comparison.film
-        groups = {light.group for light in comparison.extraction.lights if light.group}
-        reserve = (LAST_SECONDS + GROUP_SECONDS * len(groups)) * film.width * film.height / 1e6
+        reserve = (
+            (LAST_SECONDS + MORE_SECONDS * (_denoisings(comparison.extraction) - 1)) * film.width * film.height / 1e6
+        )
         seconds = None if options.budget is None else max(options.budget - spent - reserve, 0.0)
         width, height = options.resolution or (None, None)
         job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)
@@ -160,6 +161,12 @@ def finish(
     layers, channels = _layers(comparison, ours), _replaced(cycles, ours, rests)
     taken = {name: part.share.astype(np.float32) for name, part in ours.items()}
     return Finished(combined, rest, rests, layers, channels, report, seconds, taken, comparison, cycles)
+
+
+def _denoisings(extraction) -> int:
+    """How many pictures `_rest` denoises: one for each way to take passes, and one for each light group."""
+    ways = np.unique([mask.ravel() for mask in extraction.kept.by_pass.values()], axis=1)
+    return ways.shape[1] + len({light.group for light in extraction.lights if light.group})
 
 
 class _ProcessorClock:

@@ -73,6 +73,7 @@ SHARP_REFLECTION = 0.2
 # Fields of `Extraction` that are those of the manifest.
 UNCHANGED = (
     "blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter", "light_settings",
+    "has_lens",
 )  # fmt: skip
 
 
@@ -183,7 +184,6 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
             processor_seconds=manifest["processor_seconds"],
-            has_lens=manifest["has_lens"],
         )
 
 

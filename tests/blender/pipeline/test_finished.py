@@ -180,7 +180,12 @@ def test_depth_of_field_is_that_of_cycles_where_points_are_few_and_shade_has_it_
     reason = "depth of field of camera 'Camera' with fewer than 32 points per pixel (--aa)"
     assert report["finished"]["all_by_cycles"] == [reason]
     assert not any("switched off" in line and "depth" in line for line in report["warnings"])
-    ours = render.finish(RenderOptions(path, output=out, sub_samples=POINTS, cycles_samples=2)).ours
+    kept = RenderOptions(path, output=out, sub_samples=POINTS, cycles_samples=2, keep_visibility=True)
+    render.make_finished(kept)
+    ours = imaging.read_layers(out / "render.exr")
+    # The denoiser saw the light that is taken away now, grain and all.
+    found = relight(out, [LightChange("Light", muted=True)], out / "muted")
+    assert any("shows its grain" in line for line in found["warnings"])
     options = PictureOptions(path, output=out, techniques=("ltsh4",), sub_samples=POINTS)
     assert not any("depth of field" in line for line in shade_scene(options)["warnings"])
     layers = imaging.read_layers(out / "shade.exr")

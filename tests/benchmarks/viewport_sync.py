@@ -1,6 +1,7 @@
 """What keeping the viewport in step costs: `python tests/benchmarks/viewport_sync.py [TRIANGLES OBJECTS LIGHTS]`.
 
-Needs Blender 5.2, where a script without a window may use the graphics card. Printed are medians in ms.
+Needs Blender 5.2, where a script without a window may use the graphics card. Printed are medians in ms; then how long
+all shadows of one moved light take, without the drawing, and by how much the thread of the window is late meanwhile.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import statistics
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -15,9 +17,14 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import bpy
 import numpy as np
 
+from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.viewport.mirror import SceneMirror
+from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.shadows import LiveShadows
+from ltsh_addon.blender.viewport.still import view_of_camera
 
 REPEATS = 9
+SIZE, NAP = (960, 540), 0.005
 
 
 def build(triangles: int, objects: int, lights: int):
@@ -88,6 +95,67 @@ def measure(scene) -> dict[str, tuple[float, float]]:
     return result
 
 
+def measure_shadows(scene) -> tuple[float, float, float]:
+    """Seconds until all pixels have the shadows of one light that has moved, by the clock and of both processes, and
+    the most by which this thread woke up late.
+
+    Every seventh object is raised: it throws shadows. There are two lights: one that stays costs nothing but at first.
+    """
+    import gpu
+
+    for number, ob in enumerate(scene.objects):
+        ob.location.z += 0.6 if ob.type == "MESH" and number % 7 == 0 else 0.0
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    scene.collection.objects.link(camera)
+    camera.location, camera.rotation_euler = (5.0, -6.0, 7.0), (0.8, 0.0, 0.0)
+    scene.render.resolution_x, scene.render.resolution_y = SIZE
+    bpy.context.view_layer.update()
+    depsgraph, mirror, live, renderer = (
+        bpy.context.evaluated_depsgraph_get(),
+        SceneMirror(),
+        LiveShadows(),
+        ViewRenderer(),
+    )
+    mirror.sync(depsgraph)
+    view, renderer.shadows = view_of_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE), live
+    texture = gpu.types.GPUTexture(SIZE, format="RGBA32F")
+    buffer = gpu.types.GPUFrameBuffer(color_slots=[texture])
+    shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, True)
+
+    def draw():
+        live.follow((0,), lambda: collect_occluders(depsgraph, None, lambda text: None))
+        renderer.draw(mirror, view, SIZE, shown, buffer)
+        buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+
+    first, *others = mirror.lights[:2]
+    try:
+        for step in range(3):  # at first all is traced, then a process starts: the last one counts
+            mirror.lights = (replace(first, center=first.center + [0.1 * step, 0.0, 0.0]), *others)
+            draw()
+            start, late = (time.perf_counter(), _processor(live)), 0.0
+            while live.is_busy:
+                while not live.has_news:
+                    before = time.perf_counter()
+                    time.sleep(NAP)
+                    late = max(late, time.perf_counter() - before - NAP)
+                end = time.perf_counter(), _processor(live)
+                draw()
+        return end[0] - start[0], end[1] - start[1], late
+    finally:
+        live.stop()
+        renderer.free()
+
+
+def _processor(live) -> float:
+    """Processor seconds of this process and of the one that traces with it (Linux)."""
+    mate = live._followed.tracing.mate
+    child = None if mate is None else mate._child
+    if child is None:
+        return time.process_time()
+    fields = Path(f"/proc/{child._process.pid}/stat").read_text().rpartition(")")[2].split()
+    return time.process_time() + (int(fields[11]) + int(fields[12])) / 100.0
+
+
 def _seconds(work) -> tuple[float, float]:
     start = time.perf_counter(), time.process_time()
     work()
@@ -111,6 +179,9 @@ def main(arguments: list[str]) -> int:
     print(f"{'':<42}{'clock':>10}{'processor':>13}")
     for name, (clock, processor) in measure(scene).items():
         print(f"{name:<42}{1000.0 * clock:10.1f} ms{1000.0 * processor:10.1f} ms")
+    clock, processor, late = measure_shadows(scene)
+    print(f"{'shadows of one moved light':<42}{1000.0 * clock:10.1f} ms{1000.0 * processor:10.1f} ms, "
+          f"this thread at most {1000.0 * late:.0f} ms late")  # fmt: skip
     return 0
 
 

@@ -94,23 +94,26 @@ vec3 ltsh_rough_sky(vec4 mean)
     vec2 all_of_it = vec2(LTSH_PI * terms.x + terms.y * rough_slope(ltsh_rough_view.x),
                           LTSH_PI * (1.0 - LTSH_PI * terms.x - 2.0 * terms.y * ltsh_mean_slope_above(0.0)));
     bool other = terms.y > 0.0;
+    float lambert = 1.0;
 #ifdef LTSH_VELVET
-    /* There the rebound is the albedo. */
+    /* There the rebound is the albedo. Nothing is like Lambert's: it is taken away whole. */
     other = other || ltsh_velvet > 0.0;
+    lambert = ltsh_velvet > 0.0 ? 0.0 : 1.0;
     all_of_it = ltsh_velvet > 0.0 ? vec2(0.0, 1.0) : all_of_it;
 #endif
-    vec3 radiance = mean.rgb * (all_of_it.x + all_of_it.y * ltsh_rebound - 1.0);
+    vec3 radiance = mean.rgb * (all_of_it.x + all_of_it.y * ltsh_rebound - lambert);
     int count = other && mean.w > 0.0 ? LTSH_SKY_POINTS : 0;
     for (int k = 0; k < count; ++k) {
         float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
         float angle = 2.3999632 * float(k) + jitter.y;
-        float height = sqrt(1.0 - squared);
-        vec3 local = vec3(sqrt(squared) * vec2(cos(angle), sin(angle)), height);
+        /* Velvet reflects most at grazing angles. */
+        float height = lambert > 0.0 ? sqrt(1.0 - squared) : 1.0 - squared;
+        vec3 local = vec3(sqrt(1.0 - height * height) * vec2(cos(angle), sin(angle)), height);
         vec3 direction = local.x * ltsh_rough_x + local.y * ltsh_rough_y + height * ltsh_rough_z;
-        float solid_angle = LTSH_PI / (float(LTSH_SKY_POINTS) * height);
+        float solid_angle = LTSH_PI / float(LTSH_SKY_POINTS) * (lambert > 0.0 ? 1.0 / height : 2.0);
         vec2 factors = solid_angle * ltsh_diffuse_factors(height * LTSH_ONE_OVER_PI, -ltsh_diffuse_spot(direction));
         vec3 picture = ltsh_sky_around(direction, solid_angle, fract(0.618034 * float(k) + jitter.x));
-        vec3 more = factors.x + factors.y * ltsh_rebound - 1.0 / float(LTSH_SKY_POINTS);
+        vec3 more = factors.x + factors.y * ltsh_rebound - lambert / float(LTSH_SKY_POINTS);
         radiance += more * (picture - mean.rgb);
     }
     return other ? radiance : vec3(0.0);
@@ -128,6 +131,9 @@ vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
         light = ltsh_sky_at(lobe.plane_0, ivec2(0, LTSH_SKY_SIZE + 3), LTSH_IRRADIANCE_SIZE);
     }
 #ifdef LTSH_ROUGH
+#ifdef LTSH_VELVET
+    light = ltsh_velvet > 0.0 ? vec3(0.0) : light;
+#endif
     light += ltsh_rough_sky(mean);
 #endif
     return light * diffuse_form_factor(lobe, sum);

@@ -38,7 +38,6 @@ def main(rig):
     yield from quad_view(rig)
     yield from resized(rig, whole)
     yield from with_an_error(rig)
-    settings().shadows = True
     yield from beside_cycles(rig)
     yield from stopped_by_escape(rig)
 
@@ -155,7 +154,6 @@ def beside_cycles(rig):
     pixels = yield from eyes.settled(rig, "views_8_no_cycles.png")
     rig.check(is_picture(pixels), "without a Cycles picture the technique is seen")
     settings().techniques, settings().cycles_samples, settings().anti_aliasing = {"ltsh4"}, 64, 1
-    settings().shadows = False  # as in the view
     editor_for_results(rig)
     operate(rig, bpy.ops.ltsh.compare, "INVOKE_DEFAULT")
     yield from wait_for_job(rig, 900)

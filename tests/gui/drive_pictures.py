@@ -11,7 +11,7 @@ from hands import editor_for_results, operate, select, settings
 SECONDS = 1200
 SIZE = "1280x760"
 # A view at rest is smooth by then, on a busy machine without a graphics card too.
-REST_SECONDS = 100
+REST_SECONDS = 200
 
 
 def main(rig):

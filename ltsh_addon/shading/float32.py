@@ -71,7 +71,8 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
                 integrate = ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
                 at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
             colors = _columns(samples.diffuse_albedo, index)[None]
-            lighting.add(Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0))
+            others = (samples.bump_alpha2[index],) if is_bumped else ()
+            lighting.add(Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
     lighting.finish(leftovers)
 
 
@@ -115,7 +116,8 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
         limits = TailLimits.of(axes, samples.roughness[index], second, 1 in vectors, ior)
     at_point = small_lights.LobeAtPoint(rows, weights, table, limits)
     sharpest = small_lights.SharpestLobes(*axes, width)
-    return Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest)
+    others = samples.roughness[index], samples.ior[index]
+    return Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest, others=others)
 
 
 def specular_in_float64(table):
@@ -145,6 +147,15 @@ class Lobes:
     limits: TailLimits | None = None
     sharpest: small_lights.SharpestLobes | None = None  # of specular lobes
     only_tails: bool = False  # elsewhere single precision does not suffice
+    others: tuple = ()  # (Q,) each: what they hang on but for rows and widths
+
+    @cached_property
+    def shape(self) -> np.ndarray:
+        """What the lobes hang on (S, Q), by the lengths over which they change."""
+        rows = [self.rows[row] / self.lengths[row] for row in self.clip_rows]
+        if self.sharpest is not None:
+            rows += [self.sharpest.mirrored / self.sharpest.width, np.log(self.sharpest.width)[None]]
+        return np.concatenate([*rows, *(other[None].astype(np.float32) for other in self.others)])
 
     @cached_property
     def lengths(self) -> dict[int, np.ndarray]:

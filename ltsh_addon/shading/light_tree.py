@@ -26,7 +26,7 @@ from .tails import NEAR_RADII
 FEWEST = 64
 # Size of a node by the length over which the integrand changes: up to SMALL whatever its light is; up to LARGEST where
 # its error is at most ERROR of the light of a group that a tile gets, of diffuse and of specular lobes.
-SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 6e-4)
+SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 5e-4)
 # Size of the nodes that tell how much light that is.
 COARSE = 0.6
 # Smaller ones are one point, others four.
@@ -37,8 +37,16 @@ FOURTH_ORDER = 1.0
 SHARP_TAIL = 0.05
 # Leaves whose error is larger are shaded as polygons.
 LEAF_ERROR = 1e-3
+# What a tile gets of a node is interpolated between ten of its samples where it is so small, as seen from there, that
+# the error of cubics, INTERPOLATED times the fourth power of that size, is at most ERROR.
+INTERPOLATED = 0.5
+# How far all that lobes hang on may be off such cubics, by the lengths over which lobes change; and how much the
+# weights of the ten may be together.
+ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
+# Lengths in m and cosines that are divided by are not less.
+LEAST = np.float32(1e-12)
 # Samples of a tile, and pairs of a sample and a node that are shaded at a time.
-TILE, PAIRS = 96, 32768
+TILE, PAIRS = (400, 200), 32768
 # Of nodes that swing by less of their light the lights are taken as parallel.
 TURNED = 1e-6
 # Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
@@ -60,7 +68,7 @@ class LightTree:
     reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness from there; half the diagonal of a square
     axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness, a standard deviation long; the first is the axis
     axis: np.ndarray  # (N, 3) mean direction to which the lights shine
-    cone: np.ndarray  # (N,) rad: no direction is farther from that
+    cone: np.ndarray  # (N,) rad: no direction is farther from that; reach, axis and cone in single precision
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     color: np.ndarray  # (3, N) of the light, 1 on average
@@ -101,6 +109,7 @@ class LightTree:
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
+        reach, axis, cone = (values.astype(np.float32) for values in (reach, axis, cone))
         return cls(middle + origin, reach, axes, axis, cone, vector, swing, color, total, diagonal, children, number)
 
     @cached_property
@@ -223,11 +232,13 @@ class Tiles:
 
     columns: list[np.ndarray]
     center: np.ndarray  # (T, 3) m
-    half: np.ndarray  # (T, 3) m: half the box around the samples
+    half: np.ndarray  # (T, 3) m: half the box around the samples; this and what follows in single precision
+    radius: np.ndarray  # (T,) m: half the diagonal of the box
     horizons: list[tuple[np.ndarray, np.ndarray]]  # axes (T, 3) and angles (T,) of cones of normals
     mirrored: tuple[np.ndarray, np.ndarray] | None  # the same of the mirrored views; None for diffuse lobes
     width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
     only_tails: bool  # nodes must be in the tails of the lobes, `SHARP_TAIL` from their peaks
+    cubics: Cubics
 
     @classmethod
     def of(cls, lobes, position, chosen) -> Tiles:
@@ -237,24 +248,72 @@ class Tiles:
         extent = np.ptp(place, axis=1)
         weight = 4.0 / max(np.sqrt(extent @ extent), 1e-30)
         keys = np.concatenate([weight * (place - place.mean(axis=1, keepdims=True)), direction[:, chosen]])
-        columns = [chosen[part] for part in _halves(keys.astype(np.float32), np.arange(len(chosen)))]
+        keys = keys.astype(np.float32)
+        parts = _halves(keys, np.arange(len(chosen)), TILE[lobes.sharpest is not None])
+        columns = [chosen[part] for part in parts]
         low, high = (np.array([end(position[:, part], axis=1) for part in columns]) for end in (np.min, np.max))
         horizons = [_cones_of(lobes.rows[row], columns) for row in lobes.clip_rows]
         mirrored = width = None
         if lobes.sharpest is not None:
             mirrored = _cones_of(lobes.sharpest.mirrored, columns)
-            width = np.array([lobes.sharpest.width[part].min() for part in columns], dtype=float)
-        return cls(columns, 0.5 * (low + high), 0.5 * (high - low), horizons, mirrored, width, lobes.only_tails)
+            width = np.array([lobes.sharpest.width[part].min() for part in columns])
+        cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
+        half = (0.5 * (high - low)).astype(np.float32)
+        return cls(columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails, cubics)
 
 
-def _halves(keys, part):
-    """Parts of about TILE columns each, neighbors in keys (D, Q)."""
-    if len(part) <= TILE:
+@dataclass(frozen=True)
+class Cubics:
+    """Ten samples of each of T tiles, between which the others are interpolated: cubics of two coordinates."""
+
+    anchors: np.ndarray  # (T, 10) places in the tile
+    weights: np.ndarray  # (T, R, 10) for the at most R samples of a tile
+    are_smooth: np.ndarray  # (T,) whether all that the lobes hang on is such a cubic
+
+    @classmethod
+    def of(cls, parts, keys, shape) -> Cubics:
+        """Those of tiles of the samples `parts`, with keys (D, Q) that tell them apart; shape (S, Q): what their lobes
+        hang on, by the lengths over which they change."""
+        count = max(map(len, parts))
+        index = np.stack([np.resize(part, count) for part in parts])
+        own = np.moveaxis(keys[:, index], 0, -1)
+        own -= own.mean(axis=1, keepdims=True)
+        size = np.maximum(np.abs(own[..., :3]).max(axis=(1, 2)), 1e-30)[:, None]
+        _, axes = np.linalg.eigh(own.transpose(0, 2, 1) @ own)
+        u, v = np.moveaxis(own @ axes[:, :, :-3:-1], -1, 0)
+        u, v = (one / np.maximum(np.abs(one).max(axis=1, keepdims=True), 1e-30) for one in (u, v))
+        one = np.ones_like(u)
+        powers = [one, u, u * u, u * u * u, v, v * u, v * u * u, v * v, v * v * u, v * v * v]
+        values = np.stack(powers, axis=-1)
+        # The samples that tell most about cubics, one after another: a Cholesky decomposition with pivots.
+        tile, left = np.arange(len(parts)), (values * values).sum(axis=2)
+        found, anchors, least = np.zeros_like(values), np.zeros((len(parts), len(powers)), int), np.inf
+        for step in range(len(powers)):
+            place = left.argmax(axis=1)
+            most = left[tile, place]
+            column = values @ values[tile, place][:, :, None] - found @ found[tile, place][:, :, None]
+            found[:, :, step] = column[..., 0] / np.sqrt(np.maximum(most, 1e-30))[:, None]
+            left -= found[:, :, step] ** 2
+            anchors[:, step], least = place, np.minimum(least, most)
+        are_smooth = least > 1e-4
+        chosen = found[tile[:, None], anchors].astype(np.float64)
+        chosen[~are_smooth] = np.eye(len(powers))
+        weights = (found @ np.linalg.inv(chosen)).astype(np.float32)
+        are_smooth &= np.abs(weights).sum(axis=2).max(axis=1) < LARGEST_WEIGHTS
+        shape = np.concatenate([own[..., :3] / size[..., None], np.moveaxis(shape[:, index], 0, -1)], axis=2)
+        off = np.abs(weights @ shape[tile[:, None], anchors] - shape).max(axis=(1, 2))
+        return cls(anchors, weights, are_smooth & (off < ROUGHEST))
+
+
+def _halves(keys, part, most):
+    """Parts of at most so many columns each, neighbors in keys (D, Q)."""
+    if len(part) <= most:
         return [part]
     own = keys[:, part]
     along = own[np.argmax(np.ptp(own, axis=1))]
     order = np.argpartition(along, len(part) // 2)
-    return [*_halves(keys, part[order[: len(part) // 2]]), *_halves(keys, part[order[len(part) // 2 :]])]
+    half = len(part) // 2
+    return [*_halves(keys, part[order[:half]], most), *_halves(keys, part[order[half:]], most)]
 
 
 def _cones_of(vectors, columns):
@@ -267,12 +326,31 @@ def _cones_of(vectors, columns):
         axis /= max(np.sqrt(axis @ axis), 1e-30)
         axes.append(axis)
         angles.append(np.arccos(np.clip((axis @ own).min(), -1.0, 1.0)))
-    return np.array(axes), np.array(angles)
+    return np.array(axes, np.float32), np.array(angles, np.float32)
 
 
 def _angles(offset, distance, axis):
     """Angles (K,) between vectors (K, 3) of a length (K,) and unit vectors (K, 3)."""
-    return np.arccos(np.clip((offset * axis).sum(axis=1) / distance, -1.0, 1.0))
+    return np.arccos(np.clip(_products(offset, axis) / distance, -1.0, 1.0))
+
+
+def _products(one, two):
+    """Products (K,) of vectors (K, 3)."""
+    return np.einsum("ki,ki->k", one, two)
+
+
+def _lengths(vectors):
+    """Lengths (K,) of vectors (K, 3)."""
+    return np.sqrt(_products(vectors, vectors))
+
+
+def _heights(ranges, offset, axis, cone):
+    """Heights (K,) of nodes at an offset (K, 3) over planes through tiles with normals `axis` (K, 3), and by how much
+    these may differ within the ranges: the reach (K,) of a node, half the box (K, 3) of a tile, the largest distance
+    (K,); and where normals are in cones (K,) in rad."""
+    reach, half, farthest = ranges
+    slack = reach + _products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
+    return _products(offset, axis), slack
 
 
 class _Pairs:
@@ -280,39 +358,48 @@ class _Pairs:
 
     def __init__(self, tree: LightTree, tiles: Tiles, tile, node):
         self.tile, self.node, self.are_leaves = tile, node, tree.number[node] >= 0
-        offset = tree.center[node] - tiles.center[tile]
+        offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         gap = np.maximum(np.abs(offset) - tiles.half[tile], 0.0)
         reach = tree.reach[node]
-        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
-        nearest = np.maximum(np.linalg.norm(gap, axis=1), 1e-30)
+        distance, nearest = (np.maximum(_lengths(vectors), LEAST) for vectors in (offset, gap))
         size = reach / nearest
         # By how much directions differ between points of the tile and of the node.
-        extent = np.linalg.norm(tiles.half[tile], axis=1) + reach
-        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.pi)
+        radius = tiles.radius[tile]
+        extent = radius + reach
+        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.float32(np.pi))
         angle, cone = _angles(-offset, distance, tree.axis[node]), tree.cone[node]
         shining = np.cos(np.clip(angle - cone - parallax, 0.0, 0.5 * np.pi))
-        self.light = tree.power[node] * shining / np.maximum(nearest, reach) ** 2
+        power = tree.power[node]
+        self.light = power * shining / np.maximum(nearest, reach) ** 2
         # What is crossed is near the horizon or the plane of the light: the share of it in the light.
         rim = np.minimum(2.0 * size, 1.0)
-        swing = tree.swing[node] / tree.power[node]
-        plane = np.where(angle + cone + parallax > 0.5 * np.pi, np.minimum(SWUNG * swing + CROSSED * rim, 1.0), 0.0)
-        crossed = np.minimum(plane / np.maximum(shining, 1e-30), 1.0)
-        self.is_dark = angle - cone - parallax > 0.5 * np.pi
+        swing = tree.swing[node] / power
+        ranges = reach, tiles.half[tile], distance + extent
+        height, slack = _heights(ranges, -offset, tree.axis[node], cone)
+        plane = np.where(height < slack, np.minimum(SWUNG * swing + CROSSED * rim, 1.0), 0.0)
+        crossed = np.minimum(plane / np.maximum(shining, LEAST), 1.0)
+        self.is_dark = height < -slack
         self.are_crossed = np.zeros(len(node), bool)
         for number, (axes, cones) in enumerate(tiles.horizons):
+            turn = cones[tile]
             angle = _angles(offset, distance, axes[tile])
             steepest = np.clip(angle - cones[tile] - parallax, 0.0, 0.5 * np.pi)
-            self.is_dark |= angle - cones[tile] - parallax > 0.5 * np.pi
-            is_crossed = angle + cones[tile] + parallax > 0.5 * np.pi
+            height, slack = _heights(ranges, offset, axes[tile], cones[tile])
+            self.is_dark |= height < -slack
+            is_crossed = height < slack
             self.are_crossed |= is_crossed
             if tiles.mirrored is None and number == len(tiles.horizons) - 1:
                 self.light *= np.cos(steepest)
-                is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), 1e-30), 1.0)
+                is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), LEAST), 1.0)
             crossed += CROSSED * is_crossed
+        # A light alone is dark behind its plane; where many are turned differently, they are so one after another.
+        self.is_smooth = tiles.cubics.are_smooth[tile] & ~self.are_crossed & ((plane == 0.0) | tree.is_turned[node])
+        seen = radius / nearest
         self.are_in_tail = np.zeros(len(node), bool)
         self.is_wrong = np.zeros(len(node), bool)
         if tiles.mirrored is not None:
             axes, cones = tiles.mirrored
+            turn = cones[tile]
             away = np.maximum(_angles(offset, distance, axes[tile]) - cones[tile] - parallax, 0.0)
             width = tiles.width[tile]
             # As `TailLimits` has it, for each of the lights.
@@ -323,8 +410,10 @@ class _Pairs:
                 self.are_in_tail &= away > SHARP_TAIL
                 self.is_wrong = ~self.are_in_tail
             self.light *= (width**2 / (width**2 + away**2)) ** 2
-            size = size / np.minimum(width + away, 1.0)
+            length = np.minimum(width + away, 1.0)
+            size, seen, turn = size / length, seen / length, turn / length
         self.size = size
+        self.change = seen + turn
         self.are_points = size < POINT
         self.light[self.is_dark] = 0.0
         self.crossed = self.light * crossed
@@ -371,6 +460,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int,
     light = np.bincount(coarse.tile, coarse.light, len(tiles.columns))
     most = ERROR[lobes.sharpest is not None] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
+    pairs.is_smooth &= INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
     near = pairs.are_leaves & ~pairs.are_fine(LEAF_ERROR * light[pairs.tile])
     left: dict[int, list] = {}
     for own, number in zip(pairs.tile[near], tree.number[pairs.node[near]], strict=True):
@@ -378,26 +468,35 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int,
     pairs = pairs.take(~near)
     pairs = pairs.take(np.argsort(pairs.tile, kind="stable"))
     bounds = np.searchsorted(pairs.tile, np.arange(len(tiles.columns) + 1))
-    for columns, first, end in zip(tiles.columns, bounds, bounds[1:], strict=False):
-        _add_points(tree, lobes, position, (columns, pairs.take(slice(first, end))), total)
+    for number, columns in enumerate(tiles.columns):
+        own = pairs.take(slice(bounds[number], bounds[number + 1]))
+        few = columns[tiles.cubics.anchors[number]]
+        smooth = own.is_smooth
+        if smooth.any():
+            weights = tiles.cubics.weights[number, : len(columns)].T
+            total[:, :, columns] += _light_of(tree, lobes, position[:, few], (few, own.take(smooth))) @ weights
+            own = own.take(~smooth)
+        if not smooth.all():
+            total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
     return {number: np.sort(np.concatenate(parts)) for number, parts in left.items()}
 
 
 @dataclass(frozen=True)
 class _Fan:
-    """As `small_lights.Rays`, (K, Q), from the Q samples of a tile to K points."""
+    """As `small_lights.Rays`, (Q, K), from Q samples of a tile to K points."""
 
-    ends: np.ndarray  # (K, 4): offsets of the points from the middle of the tile, and 1
+    ends: np.ndarray  # (4, K): offsets of the points from the middle of the tile, and 1
     place: np.ndarray  # (4, Q): those of the samples, and 1
     squares: np.ndarray
     distance: np.ndarray
     flux: np.ndarray
-    diagonal: np.ndarray  # (K, 1)
+    diagonal: np.ndarray  # (K,)
     slack: None = None
 
     def heights(self, vectors) -> np.ndarray:
-        """Products (K, Q) of the offsets with vectors (3, Q)."""
-        return self.ends @ np.concatenate([vectors, -dot(vectors, self.place)[None]])
+        """Products (Q, K) of the offsets with vectors (3, Q, 1)."""
+        vectors = vectors[..., 0]
+        return np.concatenate([vectors, -dot(vectors, self.place)[None]]).T @ self.ends
 
 
 class _Points:
@@ -419,24 +518,24 @@ class _Points:
         self.is_crossed, self.is_turned = np.repeat(crossed[order], count), np.repeat(turned[order], count)
         self.colors = tree.color[:, node] / np.repeat(count, count).astype(np.float32)
         self.squared, vector = (points * points).sum(axis=1), tree.vector[node]
-        self.ends, self.from_squares, self.from_plane = np.ones((3, len(node), 4), np.float32)
-        self.ends[:, :3] = points
-        self.from_squares[:, :3], self.from_squares[:, 3] = -2.0 * points, self.squared
-        self.from_plane[:, :3], self.from_plane[:, 3] = vector, -(vector * points).sum(axis=1)
-        self.swing, self.diagonal = tree.swing[node][:, None], tree.diagonal[node][:, None]
+        self.ends, self.from_squares, self.from_plane = np.ones((3, 4, len(node)), np.float32)
+        self.ends[:3] = points.T
+        self.from_squares[:3], self.from_squares[3] = -2.0 * points.T, self.squared
+        self.from_plane[:3], self.from_plane[3] = vector.T, -(vector * points).sum(axis=1)
+        self.swing, self.diagonal = tree.swing[node], tree.diagonal[node]
 
     def fan(self, part, place) -> _Fan:
         """Rays to the points `part`, a slice, from the places (4, Q)."""
-        ends, size = self.ends[part], dot(place, place)
+        ends, size = self.ends[:, part], dot(place, place)
         # In products of matrices squares lose digits where points are near, by the size of the tile.
         if self.squared[part].min() > 4.0 * size.max():
-            squares = self.from_squares[part] @ place
-            squares += size
+            squares = place.T @ self.from_squares[:, part]
+            squares += size[:, None]
         else:
-            offset = ends[:, :3].T[:, :, None] - place[:3, None]
+            offset = ends[:3, None] - place[:3, :, None]
             squares = dot(offset, offset)
         distance = np.sqrt(squares)
-        flux = self.from_plane[part] @ place
+        flux = place.T @ self.from_plane[:, part]
         if self.is_turned[part].any():
             flux = _mean_above_zero(flux, self.swing[part] * distance)
         else:
@@ -444,20 +543,23 @@ class _Points:
         return _Fan(ends, place, squares, distance, flux, self.diagonal[part])
 
 
-def _add_points(tree, lobes, position, tile, total):
-    """Add the light of nodes to total (F, 3, Q); tile: its columns (Q',) and `_Pairs` with the nodes."""
+def _light_of(tree, lobes, position, tile) -> np.ndarray:
+    """The light (F, 3, Q) of nodes; tile: its columns (Q,), at x, y, z in `position` (3, Q), and `_Pairs` with the
+    nodes."""
     columns, pairs = tile
-    middle = position[:, columns].mean(axis=1)
+    middle = position.mean(axis=1)
     place = np.ones((4, len(columns)), np.float32)
-    place[:3] = position[:, columns] - middle[:, None]
+    place[:3] = position - middle[:, None]
     clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
+    # Samples come first, so that what the same samples are for many points is read once.
+    columns = columns[:, None]
     horizons = [lobes.rows[row][:, columns] for row in clipped]
-    sums = np.zeros((total.shape[0], 3, len(columns)), np.float32)
+    sums = np.zeros((len(lobes.colors), 3, len(columns)), np.float32)
     step = max(PAIRS // len(columns), 1)
     for is_tail in (True, False):
         exact = is_tail and lobes.limits is not None
         points = _Points(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
-        for first in range(0, len(points.ends), step):
+        for first in range(0, len(points.squared), step):
             part = slice(first, first + step)
             fan = points.fan(part, place)
             if points.is_crossed[part].any():
@@ -465,8 +567,8 @@ def _add_points(tree, lobes, position, tile, total):
                     fan.flux[fan.heights(normal) <= 0.0] = 0.0
             values = lobes.limits.at_centers(columns, fan, len(sums)) if exact else lobes.at_point(columns, fan)
             for own, value in zip(sums, values, strict=True):
-                own += points.colors[:, part] @ value
-    total[:, :, columns] += sums
+                own += points.colors[:, part] @ value.T
+    return sums
 
 
 def _mean_above_zero(mean, swing):

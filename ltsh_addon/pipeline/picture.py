@@ -374,7 +374,7 @@ class Comparison:
             "sub_samples": self.film.sub_samples,
             "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
-            "lights": [_light_report(light) for light in extraction.lights],
+            "lights": _light_reports(extraction.lights),
             "versions": versions(extraction.blender_version),
             "tables": {name: _described(given) for name, given in technique_names(options.techniques).items()},
             "reference": self._reference_facts(),
@@ -591,15 +591,21 @@ def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:
     return {**statistics.to_dict(), "flip": imaging.mean_flip(rec709(mean), rec709(shaded), mask)}
 
 
-def _light_report(light) -> dict:
-    """What report.json says about `light`; `radiance` is the mean of its patches."""
-    return {
-        "name": light.name,
-        "shape": light.shape,
-        "group": light.group,
-        "radiance": light.radiance.tolist(),
-        "patches": len(light.patches),
-    }
+def _light_reports(lights) -> list[dict]:
+    """What report.json says about `lights`, once about all faces of a lamp; `radiance` is the mean of the patches."""
+    found = []
+    for kind, own in itertools.groupby(lights, lambda light: (light.name, light.shape, light.group)):
+        own = list(own)
+        # Faces are polygons; several other lights of one name are instances.
+        for part in [own] if kind[1] == "POLYGON" else [[light] for light in own]:
+            radiance = part[0].radiance
+            if len(part) > 1:
+                areas = np.array([np.linalg.norm(light.area_vector) for light in part])
+                radiance = areas @ np.array([light.radiance for light in part]) / areas.sum()
+            patches = sum(len(light.patches) for light in part)
+            found.append(dict(zip(("name", "shape", "group"), kind, strict=True)))
+            found[-1] |= {"radiance": radiance.tolist(), "patches": patches}
+    return found
 
 
 def _described(given) -> str:

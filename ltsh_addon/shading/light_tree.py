@@ -7,7 +7,8 @@ taken as uniform around their mean. The error is estimated as the light of the n
 by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for
 the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail
 of an "ltsh" lobe get its true value there, as `tails` has it. Lights that are leaves and yet too large go the way of
-all lights. (Walter et al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
+all lights. On smooth surfaces ten samples of a tile tell what the others get, but of nodes that are near. (Walter et
+al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ POINT = 0.08
 FOURTH_ORDER = 1.0
 # Angle in rad from the peak of a sharp lobe beyond which single precision tells its tail to 2e-4.
 SHARP_TAIL = 0.05
-# Leaves whose error is larger are shaded as polygons.
-LEAF_ERROR = 1e-3
+# Leaves whose error or size is larger are shaded as polygons.
+LEAF_ERROR, LEAF_SIZE = 2e-3, 1.0
 # What a tile gets of a node is interpolated between ten of its samples where it is so small, as seen from there, that
 # the error of cubics, INTERPOLATED times the fourth power of that size, is at most ERROR.
-INTERPOLATED = 0.5
+INTERPOLATED = 0.3
 # How far all that lobes hang on may be off such cubics, by the lengths over which lobes change; and how much the
 # weights of the ten may be together.
 ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
 # Lengths in m and cosines that are divided by are not less.
 LEAST = np.float32(1e-12)
-# Samples of a tile, and pairs of a sample and a node that are shaded at a time.
+# Samples of a tile, for diffuse and specular lobes, and pairs of a sample and a node that are shaded at a time.
 TILE, PAIRS = (400, 200), 32768
 # Of nodes that swing by less of their light the lights are taken as parallel.
 TURNED = 1e-6
@@ -259,7 +260,9 @@ class Tiles:
             width = np.array([lobes.sharpest.width[part].min() for part in columns])
         cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
         half = (0.5 * (high - low)).astype(np.float32)
-        return cls(columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails, cubics)
+        return cls(
+            columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails, cubics
+        )
 
 
 @dataclass(frozen=True)
@@ -413,11 +416,11 @@ class _Pairs:
             length = np.minimum(width + away, 1.0)
             size, seen, turn = size / length, seen / length, turn / length
         self.size = size
-        self.change = seen + turn
+        self.change = np.minimum(seen + turn, 1.0)
         self.are_points = size < POINT
         self.light[self.is_dark] = 0.0
         self.crossed = self.light * crossed
-        self.error = self.light * np.minimum(FOURTH_ORDER * size**4, 1.0) + self.crossed
+        self.error = self.light * FOURTH_ORDER * np.minimum(size, 1.0) ** 4 + self.crossed
 
     def are_fine(self, most) -> np.ndarray:
         """Mask (K,) of those whose error is at most so much (K,)."""
@@ -461,7 +464,8 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int,
     most = ERROR[lobes.sharpest is not None] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
     pairs.is_smooth &= INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
-    near = pairs.are_leaves & ~pairs.are_fine(LEAF_ERROR * light[pairs.tile])
+    are_points = pairs.are_fine(LEAF_ERROR * light[pairs.tile]) & (pairs.size < LEAF_SIZE)
+    near = pairs.are_leaves & ~are_points
     left: dict[int, list] = {}
     for own, number in zip(pairs.tile[near], tree.number[pairs.node[near]], strict=True):
         left.setdefault(int(number), []).append(tiles.columns[own])

@@ -214,6 +214,17 @@ def test_the_report_has_its_schema_and_is_the_file(child, tmp_path):
     assert (asked.frame, asked.camera, asked.sub_samples, asked.cycles_samples) == (3, "Side", 2, 64)
 
 
+def test_the_report_names_a_lamp_of_many_faces_once():
+    whole = fake_scene.lights()[0]
+    lamp = replace(whole, name="Lamp", shape="POLYGON", corners=whole.polygon(), group="Lamps")
+    dark = replace(lamp, radiance=np.zeros(3))
+    found = picture._light_reports([whole, lamp, dark, lamp, replace(lamp, name="Other")])
+    assert [(one["name"], one["patches"]) for one in found] == [(whole.name, 1), ("Lamp", 3), ("Other", 1)]
+    assert np.allclose(found[1]["radiance"], lamp.radiance * 2.0 / 3.0)
+    # Two lights of one name that are no faces are two.
+    assert len(picture._light_reports([whole, whole])) == 2
+
+
 def test_figures_against_cycles_are_those_of_the_known_noise(child, tmp_path):
     """T = R, A = (1 + n) R, B = (1 - n) R: noise n, e^2 = -n^2 / (1 - n^2), no error against the mean."""
     report = compare_scene(options(tmp_path))

@@ -74,6 +74,57 @@ def test_every_technique_takes_many_lights(name):
     assert relative_error(found, expected) < 0.02
 
 
+def smooth_samples(side):
+    """side x side dielectric samples of even roughness on waves, 6 m wide."""
+    x, y = (values.ravel() for values in np.meshgrid(*[np.linspace(-3.0, 3.0, side)] * 2))
+    normal = unit(np.stack([0.05 * np.sin(0.5 * x), 0.05 * np.cos(0.5 * y), np.ones(side**2)], axis=1))
+    samples = replace(random_samples(side**2, 2, 0.4), roughness=np.full(side**2, 0.4), ior=np.full(side**2, 1.5))
+    position = np.stack([x, y, np.zeros(side**2)], axis=1)
+    normals = dict.fromkeys(("normal", "diffuse_normal", "geometric_normal", "smooth_normal"), normal)
+    return replace(samples, position=position, view=unit([0.0, -9.0, 4.0] - position), **normals)
+
+
+def test_light_is_interpolated_on_smooth_surfaces(monkeypatch):
+    """Of all nodes that no horizon crosses ten samples of a tile tell what the others get."""
+    samples, lights = smooth_samples(60), many_lights(500)
+    counts, light_of = [], light_tree._light_of
+
+    def counting(tree, lobes, position, tile):
+        counts.append((len(tile[0]), len(tile[1].node)))
+        return light_of(tree, lobes, position, tile)
+
+    monkeypatch.setattr(light_tree, "_light_of", counting)
+    found = shading.shade(samples, lights, "ltsh4", workers=1)
+    few = sum(nodes for columns, nodes in counts if columns == 10)
+    assert few > 0.5 * sum(nodes for _, nodes in counts)
+    some = np.arange(0, len(samples), 91)
+    exact = shading.shade(samples.take(some), lights, "ltsh4", passes=["diffuse"], workers=1, dtype=np.float64)
+    assert relative_error(found.diffuse[:, some], exact.diffuse) < OFF
+    truth = shading.shade(samples.take(some), lights, shading.REFERENCE, passes=["specular"], workers=1).specular
+    own = shading.shade(samples.take(some), lights, "ltsh4", passes=["specular"], workers=1, dtype=np.float64).specular
+    assert relative_error(found.specular[:, some], truth) < relative_error(own, truth) + OFF
+
+
+def test_cubics_of_two_coordinates_are_interpolated_and_nothing_else():
+    generator = np.random.default_rng(1)
+    u, v = generator.uniform(-1.0, 1.0, (2, 180)).astype(np.float32)
+    parts = [np.arange(90), np.arange(90, 180)]
+    keys = np.stack([2.0 * u + v, u - 2.0 * v, 0.0 * u])
+    for shape, is_cubic in (
+        (u**3 - 2.0 * u * v * v + v, True),
+        (np.exp(u), False),
+        (0.01 * generator.normal(size=180), False),
+    ):
+        cubics = light_tree.Cubics.of(parts, keys, shape[None].astype(np.float32))
+        assert (cubics.are_smooth == is_cubic).all()
+        for part, anchors, weights in zip(parts, cubics.anchors, cubics.weights, strict=True):
+            exact = (u - v) ** 3 + 1.0
+            assert np.allclose(weights @ exact[part][anchors], exact[part], atol=2e-5)
+    # Samples in a line, and all in one place, have no two coordinates.
+    for keys in (np.stack([u, u, 0.0 * u]), np.zeros((3, 180), np.float32)):
+        assert not light_tree.Cubics.of(parts, keys, u[None]).are_smooth.any()
+
+
 @pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
 def test_a_ball_of_many_faces_shines_as_the_ball(name):
     """Unit radiance; half of the faces look away. Diffuse: cos r^2 / d^2 of the whole ball above the horizon."""

@@ -39,6 +39,8 @@ REFINEMENTS = 64
 REST_SECONDS, LONGEST_REST = 0.25, 1.0
 QUICK_SECONDS = 0.03
 LOOK_SECONDS = 0.05
+# After so long without new shadows the processes end that help to trace them.
+IDLE_SECONDS = 60.0
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
@@ -412,8 +414,17 @@ def _look_for_shadows() -> float | None:
         if time.monotonic() - _drawn[0] < REST_SECONDS:
             return LOOK_SECONDS
         _tag_views()
+        if bpy.app.timers.is_registered(_let_rest):
+            bpy.app.timers.unregister(_let_rest)
+        bpy.app.timers.register(_let_rest, first_interval=IDLE_SECONDS)
         return None
     return LOOK_SECONDS if any(shadows.is_busy for shadows in _at_work) else None
+
+
+def _let_rest() -> None:
+    """End the processes that help to trace shadows."""
+    for shadows in list(_at_work):
+        shadows.rest()
 
 
 def _look_at_worlds() -> float | None:
@@ -618,7 +629,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Remove it."""
-    for timer in (_redraw, _look_for_shadows, _look_at_worlds):
+    for timer in (_redraw, _look_for_shadows, _let_rest, _look_at_worlds):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     for shadows in _at_work:

@@ -324,6 +324,10 @@ class LiveShadows:
         for one in self._both:
             one._is_left = True
             one._stop.set()
+        self.rest()
+
+    def rest(self) -> None:
+        """End what helps the thread, unless that works: it is started again where it is worth it."""
         if all(one._thread is None or not one._thread.is_alive() for one in self._both):
             self._followed.close()
 

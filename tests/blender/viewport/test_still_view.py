@@ -4,8 +4,10 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -394,6 +396,21 @@ def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
     counts = [count for version, count in versions if version == 2]
     assert versions[-1][0] == 2 and counts == sorted(counts)
     assert relative(live, exact) < 0.02
+
+
+def test_what_helps_to_trace_ends_at_rest_but_not_at_work():
+    live, closed, going = LiveShadows(), [], threading.Event()
+    live._followed.tracing = SimpleNamespace(close=lambda: closed.append(True))
+    live.of_glass._thread = threading.Thread(target=going.wait)
+    live.of_glass._thread.start()
+    try:
+        live.rest()
+        assert not closed
+    finally:
+        going.set()
+        live.of_glass._thread.join()
+    live.rest()
+    assert closed
 
 
 def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):

@@ -9,6 +9,9 @@ With depth of field, of which few points of the lens leave noise in ours too, th
 
 Ours, a specular and a diffuse picture, takes the place of Cycles' direct light pixel by pixel. Where something is not
 shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
+
+What shines in sight, lamps and the world, has no noise but that of jagged edges, of which a denoiser makes nothing
+better. It stays out of it, and is rendered apart, with many samples where it has edges.
 """
 
 from __future__ import annotations
@@ -133,7 +136,7 @@ def finish(
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles, options.denoise == "on")
-        rest, rests, denoiser, problems = _rest(cycles, ours, comparison.extraction.has_lens, options.denoise, progress)
+        rest, rests, denoiser, problems = _rest(cycles, ours, comparison.extraction, options.denoise, progress)
         combined = rest.copy()
         for part in ours.values():
             combined[..., :3] += part.image
@@ -310,7 +313,7 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
 
 
 def _rest(
-    cycles, ours: dict[str, _Part], is_noisy: bool, denoise: str, progress
+    cycles, ours: dict[str, _Part], extraction, denoise: str, progress
 ) -> tuple[np.ndarray, dict[str, np.ndarray], str, list[str]]:
     """What is not ours (H, W, 4), denoised; the same by light group, and by "" of what is in none; the name of the
     denoiser ("" for none), and what was wrong with it."""
@@ -318,14 +321,15 @@ def _rest(
 
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
-    rest = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64)
-    taken = np.stack([part.is_taken for part in ours.values()], axis=-1)
+    rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.has_lens
+    shining = _shining(cycles, extraction)
+    taken = np.stack([*(part.is_taken for part in ours.values()), shining.is_taken], axis=-1)
     ways, way = np.unique(taken.reshape(-1, taken.shape[-1]), axis=0, return_inverse=True)
     groups = sorted(
         {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
     )
     # Each way to take passes for the whole picture: denoised together, one would bleed into another at its borders.
-    found = [_without_taken(rest[..., :3], ours, one, is_noisy) for one in ways]
+    found = [_without_taken(rest[..., :3], [*ours.values(), shining], one, is_noisy) for one in ways]
     found += [_rest_of_group(cycles, ours, group) for group in groups]
     name, problems = "", []
     if denoise == "on":
@@ -335,18 +339,31 @@ def _rest(
                 found, name = denoiser.all_denoised(found, *guides), denoiser.name
         except NoDenoiser as error:
             problems = [f"{error}; the picture is not denoised"]
-    rest[..., :3] = np.choose(way.reshape(taken.shape[:2])[..., None], found[: len(ways)])
+    rest[..., :3] = np.choose(way.reshape(taken.shape[:2])[..., None], found[: len(ways)]) + shining.image
     # What of ours went through the denoiser too.
     rest[..., :3] -= sum(part.image for part in ours.values()) if is_noisy else 0.0
     of_groups = dict(zip(groups, found[len(ways) :], strict=True))
     return rest, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
 
 
-def _without_taken(combined: np.ndarray, ours: dict[str, _Part], way: np.ndarray, is_noisy: bool) -> np.ndarray:
-    """Cycles' picture (H, W, 3) without its direct light of the passes that are taken one `way`, on all pixels; with
+def _shining(cycles, extraction) -> _Part:
+    """What shines in sight, where no noise is in the way of it: that of surfaces that some light passes."""
+    names = {key: cycles.names[key] for key in cycles.shining}
+    own = sum((read_layer(cycles.channels, name, "RGB") for name in names.values()), np.zeros((1, 1, 3)))
+    kept = extraction.kept
+    is_hidden = np.logical_and.reduce([*kept.by_pass.values()])
+    if not names or extraction.has_lens or cycles.everything or kept.everything:
+        is_hidden = np.ones_like(is_hidden)
+    image = sum(cycles.shining.values(), np.zeros_like(own))
+    image = np.where(is_hidden[..., None], 0.0, image)
+    return _Part(image, {}, ~is_hidden, np.ones(is_hidden.shape), own, np.ones(3))
+
+
+def _without_taken(combined: np.ndarray, parts: list[_Part], way: np.ndarray, is_noisy: bool) -> np.ndarray:
+    """Cycles' picture (H, W, 3) without its light of the `parts` that are taken one `way`, on all pixels; with
     ours in its place, where that is noisy and there."""
     left = combined.copy()
-    for part, is_taken in zip(ours.values(), way, strict=True):
+    for part, is_taken in zip(parts, way, strict=True):
         if is_taken and is_noisy:
             left += np.where(part.is_taken[..., None], part.image - part.direct, 0.0)
         elif is_taken:

@@ -10,9 +10,11 @@ import numpy as np
 
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES
-from ..materials.graph import tree_in_use
-from ..render_settings import render_exr, working_space
-from .pixels import open_scene, scene_named
+from ..materials.aovs import give_default_material, objects_without_material
+from ..materials.bsdfs import emits, is_emission
+from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
+from ..render_settings import enable_passes, render_exr, working_space
+from .pixels import REST_PASSES, open_scene, scene_named
 
 # Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
 # the others.
@@ -26,6 +28,11 @@ LIGHT_PASSES = tuple(
 PASSES = (*LIGHT_PASSES, "emit", "environment")
 GUIDES = ("Denoising Albedo", "Denoising Normal")
 NOT_WRITTEN = (*GUIDES, "Denoising Depth", "Denoising Specular Albedo", "Denoising Roughness")
+# What shines in sight is rendered apart: a pixel takes more than the fewest samples where it is at an edge, up to the
+# most, until its noise is below the limit. Processor seconds that it takes for a million pixels.
+EDGES, EDGE_SAMPLES, EDGE_LIMIT, EDGE_SECONDS = "edges.exr", (16, 512), 0.003, 12.0
+# Inputs of nodes that also shine which make them reflect.
+REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmission Weight", "Subsurface Weight")
 
 
 def render_finished(job: dict, folder: Path, progress) -> dict:
@@ -41,7 +48,13 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     everything = _kept_by_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
-    files = _render_chunks(scene, layer, folder, job, progress)
+    has_edges = not (everything or camera.data.dof.use_dof)
+    seconds = job["seconds"]
+    if seconds is not None and has_edges:
+        seconds = max(seconds - EDGE_SECONDS * width * height / 1e6, 0.0)
+    files = _render_chunks(scene, layer, folder, {**job, "seconds": seconds}, progress)
+    if has_edges:
+        _render_edges(scene, layer, folder, progress)
     border = render_settings.render_border(scene)
     return {
         "blender_version": bpy.app.version_string,
@@ -56,6 +69,8 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
         "color_space": working_space(),
         "layer": layer.name,
         "files": files,
+        "edges": [EDGES, EDGE_SAMPLES[1]] if has_edges else None,
+        "film_transparent": scene.render.film_transparent,
         "dropped": dropped,
         "passes": render_settings.pass_names(),
         "everything": everything,
@@ -148,3 +163,39 @@ def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list
             chunks = min(MOST_CHUNKS, max(1, round(each * (samples - done) / CHUNK_SECONDS)))
             chunk = max(1, min(-(-(samples - done) // chunks), samples - done))
     return files
+
+
+def _render_edges(scene, layer, folder: Path, progress) -> None:
+    """Render EDGES, what shines in sight and nothing else: surfaces that only reflect are black from now on."""
+    progress("edges", 0.0)
+    bare = [ob for ob in bpy.data.objects if ob.type in SURFACE_TYPES and ob.data.library is None]
+    give_default_material(objects_without_material(bare))
+    for material in bpy.data.materials:
+        if not material.is_grease_pencil:
+            ensure_nodes(material)
+            _only_shine(material)
+    cycles = scene.cycles
+    enable_passes(layer, ("combined", *REST_PASSES))
+    layer.cycles.denoising_store_passes = False
+    layer.cycles.pass_debug_sample_count = True
+    layer.samples, cycles.max_bounces, cycles.time_limit, cycles.use_sample_subset = 0, 0, 0.0, False
+    cycles.use_adaptive_sampling, cycles.adaptive_threshold = True, EDGE_LIMIT
+    cycles.adaptive_min_samples, cycles.samples = EDGE_SAMPLES
+    render_exr(scene, folder / EDGES)
+
+
+def _only_shine(material) -> None:
+    """Let the surface of a material reflect nothing."""
+    output = material_output(material.node_tree)
+    if output is None:
+        return
+    shaders = shaders_behind(output.inputs["Surface"])
+    if is_seen_through(output, shaders):
+        return
+    nodes = [leaf.node for leaf in shaders.leaves]
+    if not any(is_emission(node) or emits(node) for node in nodes):
+        cut(output.inputs["Surface"])
+    for socket in (node.inputs.get(name) for node in nodes if not is_emission(node) for name in REFLECTING):
+        if socket is not None:
+            cut(socket)
+            socket.default_value = 0.0 if socket.type == "VALUE" else (0.0, 0.0, 0.0, 1.0)

@@ -369,6 +369,7 @@ class CyclesPicture:
     guides: dict[str, np.ndarray]  # for the denoiser
     names: dict[str, str]  # of passes, as `pass_names` has them
     samples: int
+    shining: dict[str, np.ndarray]  # (H, W, 3) what shines in sight, by the key of its pass, with few jagged edges
     everything: tuple[str, ...]  # why all direct light is to be that of Cycles
     warnings: tuple[str, ...]
     camera: str
@@ -383,18 +384,35 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
     manifest = run_child({"task": "finished", **asdict(job), "scene": str(scene)}, folder, progress)
     channels = _mean_of_chunks(manifest, folder)
     guides = {name: plane for name, plane in channels.items() if name.startswith("Denoising ")}
+    samples = sum(count for _, count in manifest["files"])
     dropped = tuple(f"{name}." for name in manifest["dropped"])
     return CyclesPicture(
         channels={name: plane for name, plane in channels.items() if not name.startswith(dropped)},
         guides=guides,
         names=manifest["passes"],
-        samples=sum(count for _, count in manifest["files"]),
+        samples=samples,
+        shining=_shining(manifest, folder, channels, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
         camera=manifest["camera"],
         frame=manifest["frame"],
         processor_seconds=manifest["processor_seconds"],
     )
+
+
+def _shining(manifest: dict, folder: Path, channels: dict[str, np.ndarray], samples: int) -> dict[str, np.ndarray]:
+    """The means of the samples of the whole scene and of those that show nothing else, {} without the latter."""
+    if manifest["edges"] is None:
+        return {}
+    name, most = manifest["edges"]
+    prefix = f"{manifest['layer']}."
+    found = {key.removeprefix(prefix): plane for key, plane in _rendered(folder / name).items()}
+    count = most * found["Debug Sample Count.X"][..., None]
+    names = {key: manifest["passes"][key] for key in ("emission", "background")}
+    if manifest["film_transparent"]:
+        del names["background"]
+    own, other = ({key: lobes.read_layer(one, name, "RGB") for key, name in names.items()} for one in (found, channels))
+    return {key: (count * own[key] + samples * other[key]) / (count + samples) for key in names}
 
 
 def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:

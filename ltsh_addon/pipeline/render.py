@@ -50,6 +50,9 @@ SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
 # Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
 # from so many pixels around each.
 MOST_NOISE, AROUND = 0.06, 4
+# At edges of diffuse light, which our few points and the samples of Cycles place apart from each other, half of each is
+# nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge; the mean around.
+EDGE_ERROR, AROUND_EDGE = 0.2, 1
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -250,11 +253,12 @@ class _Part:
     certain: np.ndarray  # (H, W) smooth share of Cycles' direct light that it takes the place of there
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
+    weight: np.ndarray | float = 1.0  # (H, W) beside the picture with Cycles' direct light in its place, denoised
 
     @property
     def share(self) -> np.ndarray:
         """What share (H, W) of Cycles' direct light it takes the place of."""
-        return np.where(self.is_taken, self.certain, 0.0)
+        return np.where(self.is_taken, self.certain * self.weight, 0.0)
 
     @property
     def direct(self) -> np.ndarray:
@@ -265,6 +269,10 @@ class _Part:
     def replaced(self) -> np.ndarray:
         """What of Cycles (H, W, 3) it takes the place of."""
         return np.where(self.is_taken[..., None], self.direct, 0.0)
+
+    def share_of_group(self, group: str) -> np.ndarray:
+        """What share (H, W, 3) of it is the light of a light group."""
+        return np.divide(self.groups[group], self.image, out=np.zeros_like(self.image), where=self.image != 0.0)
 
 
 def _share_of(share: np.ndarray, image: np.ndarray) -> np.ndarray:
@@ -279,12 +287,25 @@ def _certain(shadows: lighting.Shadows, name: str) -> np.ndarray:
     return _around(np.clip(2.0 - noise / MOST_NOISE, 0.0, 1.0))
 
 
-def _around(image: np.ndarray) -> np.ndarray:
-    """Means (H, W) over squares of 2 AROUND + 1 pixels."""
-    side = 2 * AROUND + 1
-    sums = np.pad(image, ((AROUND + 1, AROUND), (AROUND + 1, AROUND)), mode="edge").cumsum(axis=0).cumsum(axis=1)
+def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
+    """Means (H, W) over squares of 2 `around` + 1 pixels."""
+    side = 2 * around + 1
+    sums = np.pad(image, ((around + 1, around), (around + 1, around)), mode="edge").cumsum(axis=0).cumsum(axis=1)
     whole = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     return np.maximum(whole, 0.0) / side**2
+
+
+def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
+    """The weight (H, W) of a pass of ours (H, W, 3) beside Cycles' own: half of it at edges, but where much more than
+    those is between both, which is noise of Cycles."""
+    light = ours.mean(axis=-1)
+    grid, (height, width) = np.pad(light, 1, mode="edge"), light.shape
+    rows = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    # Opposite neighbors of the nine.
+    bend = np.max([np.abs(one + other - 2.0 * light) for one, other in zip(rows[:4], rows[:4:-1], strict=True)], axis=0)
+    between = _around(np.square((ours - direct).mean(axis=-1)), AROUND_EDGE)
+    edge = _around(np.square(EDGE_ERROR * bend), AROUND_EDGE)
+    return 1.0 - 0.5 * np.minimum(np.divide(edge, between, out=np.zeros_like(edge), where=between > 0.0), 1.0)
 
 
 def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[str, _Part]:
@@ -295,20 +316,22 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
     result = next(iter(comparison.results.values()), None)
     for name, (light, color) in DIRECT.items():
         image, groups = np.zeros((*shape, 3)), {}
-        is_taken, certain = np.zeros(shape, bool), np.ones(shape)
+        is_taken, certain, weight = np.zeros(shape, bool), np.ones(shape), 1.0
+        light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
         if result is not None and not keeps_all:
             is_taken = ~kept.by_pass[name]
             # With depth of field ours is denoised as well.
             if is_denoised and not comparison.extraction.has_lens:
                 certain = _certain(comparison.shadows, name)
-            share = np.where(is_taken, certain, 0.0)
             image = comparison.images[next(iter(comparison.results)), name]
+            if is_denoised and not comparison.extraction.has_lens and name == "diffuse":
+                weight = _beside(certain[..., None] * image, _share_of(certain, light.astype(np.float64) * color))
+            share = np.where(is_taken, certain * weight, 0.0)
             values = comparison.extraction.exposure * getattr(result.shading, name)
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)
             groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, own, strict=True)}
             image = _share_of(share, image)
-        light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
-        found[name] = _Part(image, groups, is_taken, certain, light, color)
+        found[name] = _Part(image, groups, is_taken, certain, light, color, weight)
     return found
 
 
@@ -323,7 +346,9 @@ def _rest(
         raise Cancelled("stopped before the picture was denoised")
     rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.has_lens
     shining = _shining(cycles, extraction)
-    taken = np.stack([*(part.is_taken for part in ours.values()), shining.is_taken], axis=-1)
+    # Second, with the diffuse light of Cycles, of which edges have a part.
+    taken = np.stack([ours["specular"].is_taken, ours["diffuse"].is_taken, shining.is_taken], axis=-1)
+    taken = np.stack([taken, taken & [True, np.ndim(ours["diffuse"].weight) == 0, True]])
     ways, way = np.unique(taken.reshape(-1, taken.shape[-1]), axis=0, return_inverse=True)
     groups = sorted(
         {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
@@ -339,10 +364,14 @@ def _rest(
                 found, name = denoiser.all_denoised(found, *guides), denoiser.name
         except NoDenoiser as error:
             problems = [f"{error}; the picture is not denoised"]
-    rest[..., :3] = np.choose(way.reshape(taken.shape[:2])[..., None], found[: len(ways)]) + shining.image
+    without, within = np.choose(way.reshape(taken.shape[:3])[..., None], found[: len(ways)])
+    left = (1.0 - np.broadcast_to(ours["diffuse"].weight, without.shape[:2]))[..., None] * (within - without)
+    rest[..., :3] = without + left + shining.image
     # What of ours went through the denoiser too.
     rest[..., :3] -= sum(part.image for part in ours.values()) if is_noisy else 0.0
     of_groups = dict(zip(groups, found[len(ways) :], strict=True))
+    for group in of_groups.keys() & ours["diffuse"].groups.keys():
+        of_groups[group] = of_groups[group] + ours["diffuse"].share_of_group(group) * left
     return rest, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
 
 
@@ -376,8 +405,7 @@ def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:
     found = read_layer(cycles.channels, f"{OF_GROUP}{group}", "RGB").astype(np.float64)
     for part in ours.values():
         if group in part.groups:
-            share = np.divide(part.groups[group], part.image, out=np.zeros_like(part.image), where=part.image != 0.0)
-            found -= share * part.replaced
+            found -= part.share_of_group(group) * part.replaced
     return found
 
 

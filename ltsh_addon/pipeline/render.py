@@ -170,9 +170,9 @@ def finish(
 
 
 def _denoisings(extraction) -> int:
-    """How many pictures `_rest` denoises: one for each way to take passes, and one for each light group."""
+    """How many pictures `_rest` denoises at most: two for each way to take passes, and one for each light group."""
     ways = np.unique([mask.ravel() for mask in extraction.kept.by_pass.values()], axis=1)
-    return ways.shape[1] + len({light.group for light in extraction.lights if light.group})
+    return 2 * ways.shape[1] + len({light.group for light in extraction.lights if light.group})
 
 
 class _ProcessorClock:
@@ -471,7 +471,9 @@ def _report(comparison: picture.Comparison, cycles, ours: dict[str, _Part], prob
         "problems": [],
         "warnings": list(dict.fromkeys(warnings)),
         "finished": {
-            "share_of_ours": {name: float(part.share.mean()) for name, part in ours.items()},
+            "share_of_ours": {
+                name: float(np.where(part.is_taken, part.certain, 0.0).mean()) for name, part in ours.items()
+            },
             "all_by_cycles": everything,
             "materials_by_cycles": list(kept.materials),
         },

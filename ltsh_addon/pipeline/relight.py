@@ -124,7 +124,7 @@ class _Finished(picture.Comparison):
             technique, _, part = name.partition(".")
             pass_name = part.partition("@")[0]
             if technique in self.results and pass_name in self.options.passes:
-                found[name] = pixels * self.kept.taken[pass_name][..., None]
+                found[name] = pixels * self.kept.shown(pass_name)
         combined = self.rest.copy()
         for pass_name in self.options.passes:
             combined[..., :3] += found[f"{technique_of(self.kept)}.{pass_name}"]
@@ -157,7 +157,7 @@ def _light_of_group(kept: KeptPicture, shaded, group: str) -> np.ndarray:
     """The light (3,) of a light group in the whole picture."""
     number, film = shaded.groups.index(group), kept.extraction.film
     images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
-    return sum((kept.taken[name][..., None] * image).sum(axis=(0, 1)) for name, image in images.items())
+    return sum((kept.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
 def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
@@ -399,7 +399,7 @@ def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.nd
     for name in passes:
         for group, values in zip(lit.groups, getattr(lit, name), strict=True):
             image = extraction.film.image(extraction.exposure * values)
-            layers[int(group)] += image if name not in kept.taken else kept.taken[name][..., None] * image
+            layers[int(group)] += kept.shown(name) * image
     return layers
 
 
@@ -539,9 +539,7 @@ class MovedLights:
         for name in kept.options["passes"]:
             own = np.zeros((len(film.pixel), 3), np.float32)
             own[self._order] = np.concatenate([radiance[name] for radiance in found])
-            image += film.image(kept.extraction.exposure * own) * (
-                kept.taken[name][..., None] if name in kept.taken else 1.0
-            )
+            image += kept.shown(name, moved=True) * film.image(kept.extraction.exposure * own)
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:

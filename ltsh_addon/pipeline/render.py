@@ -54,6 +54,7 @@ MOST_NOISE, AROUND = 0.06, 4
 # nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge, where that is more
 # than a share of the light; the mean of so many pixels around each.
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
+MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
 NAMED = 8  # of what Cycles keeps, in a warning
 
@@ -64,12 +65,11 @@ class Finished:
 
     combined: np.ndarray  # (H, W, 4)
     rest: np.ndarray  # (H, W, 4), what is not ours
-    rests: dict[str, np.ndarray]  # the same (H, W, 3) of each light group of the view layer, by "" (H, W, 4) without
     ours: dict[str, np.ndarray]  # (H, W, 3) by layer: ltsh4.specular, ltsh4.specular@Key, ...
     channels: dict[str, np.ndarray]  # (H, W) of Cycles, with ours in place of its direct light
     report: dict
     seconds: dict[str, Any]
-    taken: dict[str, np.ndarray]  # (H, W) by pass: 1 where ours takes the place of Cycles' direct light
+    kept: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a KeptPicture
     comparison: picture.Comparison
     cycles: Any  # blender.process.client.CyclesPicture
 
@@ -106,7 +106,7 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> p
     if options.keep_visibility:
         path, parts = path.with_name(f"{path.stem}{lighting.KEPT_SUFFIX}"), made.comparison
         kept = parts.extraction, parts.shadows, parts.options, path
-        written = lighting.keep_picture(*kept, rest=made.rests, taken=made.taken)
+        written = lighting.keep_picture(*kept, **made.kept)
         files += [one.relative_to(options.output).as_posix() for one in written]
     return picture.TaskResult(made.report, made.seconds, tuple(files))
 
@@ -140,7 +140,9 @@ def finish(
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles, options.denoise == "on")
-        rest, rests, denoiser, problems = _rest(cycles, ours, comparison.extraction, options.denoise, progress)
+        rest, of_edges, rests, denoiser, problems = _rest(
+            cycles, ours, comparison.extraction, options.denoise, progress
+        )
         combined = rest.copy()
         for part in ours.values():
             combined[..., :3] += part.image
@@ -166,8 +168,8 @@ def finish(
         if comparison.shadows is not None:
             seconds["shadows"] = comparison.shadows.seconds
     layers, channels = _layers(comparison, ours), _replaced(cycles, ours, rests)
-    taken = {name: part.share.astype(np.float32) for name, part in ours.items()}
-    return Finished(combined, rest, rests, layers, channels, report, seconds, taken, comparison, cycles)
+    kept = _kept(ours, rests, of_edges)
+    return Finished(combined, rest, layers, channels, report, seconds, kept, comparison, cycles)
 
 
 def _denoisings(extraction) -> int:
@@ -339,9 +341,9 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
 
 def _rest(
     cycles, ours: dict[str, _Part], extraction, denoise: str, progress
-) -> tuple[np.ndarray, dict[str, np.ndarray], str, list[str]]:
-    """What is not ours (H, W, 4), denoised; the same by light group, and by "" of what is in none; the name of the
-    denoiser ("" for none), and what was wrong with it."""
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], str, list[str]]:
+    """What is not ours (H, W, 4), denoised; of that Cycles' diffuse light at edges (H, W, 3); all of it by light group,
+    and by "" of what is in none; the name of the denoiser ("" for none), and what was wrong with it."""
     from ..blender.process.blender_process import denoiser_libraries
 
     if progress is not None and progress("denoise", 0.0) is False:
@@ -374,7 +376,7 @@ def _rest(
     of_groups = dict(zip(groups, found[len(ways) :], strict=True))
     for group in of_groups.keys() & ours["diffuse"].groups.keys():
         of_groups[group] = of_groups[group] + ours["diffuse"].share_of_group(group) * left
-    return rest, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
+    return rest, left, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
 
 
 def _shining(cycles, extraction) -> _Part:
@@ -420,6 +422,25 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
     for one in groups.values():
         left[..., :3] -= one
     return {"": left, **groups}
+
+
+def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.ndarray) -> dict:
+    """`rest`, `taken` and `edges` of a KeptPicture: Cycles' part of an edge hangs on the lights as ours does."""
+    taken = {name: np.where(part.is_taken, part.certain, 0.0) for name, part in ours.items()}
+    part = ours["diffuse"]
+    if np.ndim(part.weight) == 0:
+        return {"rest": rests, "taken": taken, "edges": {}}
+    light = part.image.mean(axis=-1)
+    more = np.divide(of_edges.mean(axis=-1), light, out=np.zeros_like(light), where=light > 0.0)
+    more = np.clip(more, 0.0, MOST_OF_EDGE)
+    # What is left in the rest stays as it is: of other colors, or where ours is dark.
+    of_lights, rest = more[..., None] * part.image, {group: one.copy() for group, one in rests.items()}
+    for group in rest.keys() & part.groups.keys() - {""}:
+        own = part.share_of_group(group) * of_lights
+        rest[group] -= own
+        rest[""][..., :3] += own
+    rest[""][..., :3] -= of_lights
+    return {"rest": rest, "taken": taken, "edges": {"diffuse": part.weight * (1.0 + more)}}
 
 
 def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str, np.ndarray]:

@@ -395,7 +395,7 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     passes = {name: inside_border(image, border) for name, image in passes.items()}
     lights, kept, ours = None, None, made.comparison
     if job.keeps_lights:
-        kept = KeptPicture(ours.extraction, ours.shadows, _kept_options(job, PASSES), False, made.rests, made.taken)
+        kept = KeptPicture(ours.extraction, ours.shadows, _kept_options(job, PASSES), False, **made.kept)
         lights = light_pictures(kept, progress)
     warnings = tuple(made.report["warnings"])
     return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights, kept=kept)

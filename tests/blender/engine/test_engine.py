@@ -476,9 +476,10 @@ def test_a_light_that_moved_since_a_render_is_shaded_where_it_is(scene, monkeypa
     found = results.mixed_pixels(scene)[..., :3].copy()
     assert results.end_processes in later
     expected = rendered()
-    size = np.linalg.norm(expected)
-    # Noise at the edges of shadows is of other rays.
-    assert np.linalg.norm(found - expected) < 0.02 * size < 0.2 * np.linalg.norm(before - expected)
+    scene.cycles.seed = 1
+    # Noise at the edges of shadows is of other rays; of what is complete Cycles has a part there.
+    limit = 0.02 * np.linalg.norm(expected) + np.linalg.norm(rendered() - expected)
+    assert np.linalg.norm(found - expected) < limit < 0.2 * np.linalg.norm(before - expected)
     results.forget_renders()
 
 

@@ -95,6 +95,7 @@ def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.n
 
 # Of the map of directions of a point or spot light: rows, and points along each side of the six views it is made of.
 PATTERN_ROWS, VIEW_PIXELS = 64, 192
+SMALL_RADIUS = 1e-3  # in place of none: m
 # Colors of a pattern that differ by more, as a share of the light, are said to be lost.
 PATTERN_COLORS = 0.05
 
@@ -110,9 +111,10 @@ def point_factor(is_distant: bool, source: UnseenLight, studio: Studio) -> tuple
                 image = studio.look(np.zeros(3), 0.5 * _AXES[0], 0.5 * _AXES[1], -_AXES[2], 8)[0]
             factor = image.mean(axis=(0, 1), keepdims=True)
         else:
-            data = _white(data, "POINT", {"shadow_soft_size": 1.0, "use_soft_falloff": False})
+            radius = 1.0 if source.by_ray else max(data.shadow_soft_size, SMALL_RADIUS)
+            data = _white(data, "POINT", {"shadow_soft_size": radius, "use_soft_falloff": False})
             with _in_the_middle(data, studio):
-                factor = _seen_from_all_sides(studio, source.by_ray)
+                factor = _seen_from_all_sides(studio, source.by_ray, radius)
     finally:
         bpy.data.lights.remove(data)
     factor = factor / (_WHITE["energy"] / np.pi)
@@ -143,8 +145,8 @@ def _in_the_middle(data, studio):
         yield
 
 
-def _seen_from_all_sides(studio, by_ray: bool) -> np.ndarray:
-    """The map (H, W, 3) of a ball of radius 1: from six sides, or from within, where rays go against its normals."""
+def _seen_from_all_sides(studio, by_ray: bool, radius: float) -> np.ndarray:
+    """The map (H, W, 3) of a ball: from six sides, or from within, where rays go against its normals."""
     rows, columns = PATTERN_ROWS, 2 * PATTERN_ROWS
     polar = (np.arange(rows) + 0.5)[:, None] * (np.pi / rows)
     around = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
@@ -160,7 +162,7 @@ def _seen_from_all_sides(studio, by_ray: bool) -> np.ndarray:
             image, up, depth = studio.look_around(-out, right, VIEW_PIXELS), np.cross(right, -out), -facing
         else:
             up = np.cross(out, right)
-            image = studio.look(np.zeros(3), right, up, out, VIEW_PIXELS, 1.0)[0]
+            image = studio.look(np.zeros(3), radius * right, radius * up, out, VIEW_PIXELS, 1.0)[0]
         depth = np.where(better & (depth != 0.0), depth, 1.0)
         row, column = (
             np.clip((normal @ axis / depth + 1.0) * 0.5 * VIEW_PIXELS, 0, VIEW_PIXELS - 1).astype(int)
@@ -184,7 +186,9 @@ def with_pattern(light: AreaLight, factor: np.ndarray, source: UnseenLight, warn
     if apart > PATTERN_COLORS:
         warn(f"light {light.name!r}: the colors of its pattern are shaded as their mean, {100.0 * apart:.0f} % off")
     axes = np.linalg.inv(source.matrix[:3, :3] / np.linalg.norm(source.matrix[:3, :3], axis=0))
-    return [replace(light, pattern=Pattern(axes, values, source.by_ray))]
+    # A light without a radius shines everywhere with the normal that goes there.
+    by_ray = source.by_ray or source.data.shadow_soft_size == 0.0
+    return [replace(light, pattern=Pattern(axes, values, by_ray))]
 
 
 def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn) -> list[AreaLight]:

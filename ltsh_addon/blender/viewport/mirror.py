@@ -176,7 +176,8 @@ class LiveLamps:
 
     def _state(self, data, source: UnseenLight) -> tuple:
         text = nodes_as_text(data)
-        return source.varies, source.by_ray, data.type == "SUN", text, self._images if "image: " in text else 0
+        radius = 0.0 if data.type == "SUN" or source.by_ray else data.shadow_soft_size
+        return source.varies, source.by_ray, data.type == "SUN", radius, text, self._images if "image: " in text else 0
 
     def note_images(self) -> None:
         """Lights with images are looked at again."""

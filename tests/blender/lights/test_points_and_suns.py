@@ -138,6 +138,28 @@ def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
             assert abs(quadrature.bias(values, halves[lobe])) < limit, (technique, lobe)
 
 
+def by_place(tree):
+    """By the place on the light: with a radius of 20 cm from 0.1 to 1.9."""
+    coordinates, separate, slope = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
+    slope.operation, slope.inputs[1].default_value, slope.inputs[2].default_value = "MULTIPLY_ADD", 4.5, 1.0
+    tree.links.new(coordinates.outputs["Object"], separate.inputs[0])
+    tree.links.new(separate.outputs["X"], slope.inputs[0])
+    return slope.outputs[0]
+
+
+@pytest.mark.parametrize("nodes, radius", [(by_place, 0.2), (by_place, 0.0), (stripes, 0.0)])
+def test_patterns_go_with_the_radius_as_in_cycles(tmp_path, nodes, radius):
+    """A light without one emits as at its middle, with the normal that points where it shines."""
+    plane_scene()
+    with_nodes("POINT", nodes, shadow_soft_size=radius)
+    lights, warnings, surface, halves = rendered(tmp_path)
+    assert len(lights) == 1 and warnings == []
+    found = shading.shade(surface, lights, "reference", workers=1)
+    for lobe in ("diffuse", "specular"):
+        values = getattr(found, lobe)[0].astype(np.float64)
+        assert quadrature.relative_l2(values, halves[lobe]) < 6e-3, lobe
+
+
 def random_scene(seed):
     """A plane and a ball under one to five lights of all kinds."""
     random = np.random.default_rng(seed)

@@ -17,6 +17,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextvars import ContextVar
@@ -72,6 +73,9 @@ def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda
     def listen():
         for line in iter(sys.stdin.buffer.readline, b""):
             take(line.decode("utf-8", "surrogateescape").removesuffix("\n"))
+        # A Blender that is just starting would make the folders again.
+        for child in list(_started):
+            _kill(child)
         for _ in range(DELETIONS):  # what still writes there can keep a folder from being empty
             for folder in temporary:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -81,6 +85,20 @@ def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda
         os._exit(3)
 
     threading.Thread(target=listen, name=LISTENER, daemon=True).start()
+
+
+_started: weakref.WeakSet[subprocess.Popen] = weakref.WeakSet()
+
+
+def _kill(child: subprocess.Popen) -> None:
+    """End `child` and what it has started, and wait for it."""
+    if child.poll() is None:
+        if hasattr(os, "killpg"):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+        else:
+            child.kill()
+        child.wait()
 
 
 def child_command(job: Path, script: Path = WORKER) -> list[str]:
@@ -160,6 +178,7 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
         process_group=0,
         creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0) if background else 0,
     )
+    _started.add(process)
     if background and hasattr(os, "setpriority"):
         os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
     return process
@@ -214,12 +233,7 @@ class BlenderProcess:
         child, self._child = self._child, None
         if child is None:
             return
-        if child.poll() is None:
-            if hasattr(os, "killpg"):
-                os.killpg(child.pid, signal.SIGKILL)
-            else:
-                child.kill()
-            child.wait()
+        _kill(child)
         with contextlib.suppress(OSError):  # what was not handed over yet
             child.stdin.close()
         child.stdout.close()

@@ -416,7 +416,6 @@ class Job:
         """As `cancel`, for a Blender that is about to quit: everything is gone on return."""
         if not self.finished:
             self.finished = self.cancelled = True
-            self._process.kill()
             self._end()
 
     def remove_folder(self) -> None:

@@ -90,6 +90,15 @@ def light_tree(light):
     return data.node_tree, next(node for node in data.node_tree.nodes if node.bl_idname == "ShaderNodeEmission")
 
 
+def along_x(tree, coordinate, slope):
+    """The output of nodes that give 1 + `slope` times the x of a texture coordinate."""
+    coordinates, separate, line = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
+    line.operation, line.inputs[1].default_value, line.inputs[2].default_value = "MULTIPLY_ADD", slope, 1.0
+    tree.links.new(coordinates.outputs[coordinate], separate.inputs[0])
+    tree.links.new(separate.outputs["X"], line.inputs[0])
+    return line.outputs[0]
+
+
 def add_image(tree, pixels, interpolation="Closest"):
     """An Image Texture node over UV with float `pixels` (H, W, 3), row 0 at the bottom; the node."""
     height, width, _ = pixels.shape

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from lit_plane import light_tree
+from lit_plane import along_x, light_tree
 
 from ltsh_addon import shading
 
@@ -98,11 +98,7 @@ def falloff(tree):
 
 def stripes(tree):
     """Bright and dark by the direction in the frame of the light."""
-    coordinates, separate, wave = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
-    wave.operation, wave.inputs[1].default_value, wave.inputs[2].default_value = "MULTIPLY_ADD", 0.9, 1.0
-    tree.links.new(coordinates.outputs["Normal"], separate.inputs[0])
-    tree.links.new(separate.outputs["X"], wave.inputs[0])
-    return wave.outputs[0]
+    return along_x(tree, "Normal", 0.9)
 
 
 def lamp_of_files(tree):
@@ -140,11 +136,7 @@ def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
 
 def by_place(tree):
     """By the place on the light: with a radius of 20 cm from 0.1 to 1.9."""
-    coordinates, separate, slope = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
-    slope.operation, slope.inputs[1].default_value, slope.inputs[2].default_value = "MULTIPLY_ADD", 4.5, 1.0
-    tree.links.new(coordinates.outputs["Object"], separate.inputs[0])
-    tree.links.new(separate.outputs["X"], slope.inputs[0])
-    return slope.outputs[0]
+    return along_x(tree, "Object", 4.5)
 
 
 @pytest.mark.parametrize("nodes, radius", [(by_place, 0.2), (by_place, 0.0), (stripes, 0.0)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
-from lit_plane import add_image, add_lamp_plane, light_tree
+from lit_plane import add_image, add_lamp_plane, along_x, light_tree
 from view_pictures import SIZE, viewport_picture
 
 from ltsh_addon import shading
@@ -142,11 +142,7 @@ def add_bulb(name, kind, make):
 
 def stripes(tree):
     """1 + 0.9 x of the direction in the frame of the light."""
-    coordinates, separate, wave = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("TexCoord", "SeparateXYZ", "Math"))
-    wave.operation, wave.inputs[1].default_value, wave.inputs[2].default_value = "MULTIPLY_ADD", 0.9, 1.0
-    tree.links.new(coordinates.outputs["Normal"], separate.inputs[0])
-    tree.links.new(separate.outputs["X"], wave.inputs[0])
-    return wave.outputs[0]
+    return along_x(tree, "Normal", 0.9)
 
 
 def beam(tree):

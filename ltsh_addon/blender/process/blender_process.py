@@ -118,37 +118,28 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
     return [sys.executable, str(script), str(job)]
 
 
-# Where Blender and pip's bpy have Embree: on Linux, Windows, macOS; beside the binary or the module.
-EMBREE_PLACES = ("lib/libembree4*", "blender.shared/embree4*.dll", "embree4*.dll", "../Resources/lib/libembree4*")
-
-
-DENOISER_PLACES = tuple(
-    f"{folder}{name}"
-    for folder, name in (
-        ("lib/", "libOpenImageDenoise.so*"), ("blender.shared/", "OpenImageDenoise.dll"), ("", "OpenImageDenoise.dll"),
-        ("../Resources/lib/", "libOpenImageDenoise*"), ("lib/", "libOpenImageDenoise*.dylib"),
-    )
-)  # fmt: skip
+# Where Blender and pip's bpy have libraries: on Linux, Windows, macOS; beside the binary or the module.
+LIBRARY_PLACES = ("lib/lib{}*", "blender.shared/{}*.dll", "{}*.dll", "../Resources/lib/lib{}*")
 
 
 def embree_libraries() -> list[Path]:
     """Files of Embree 4 that this Blender, or pip's bpy, has brought along; none where the system has it."""
-    return _brought_along(EMBREE_PLACES)
+    return _brought_along("embree4")
 
 
 def denoiser_libraries() -> list[Path]:
-    """The same of Open Image Denoise 2."""
-    return _brought_along(DENOISER_PLACES)
+    """The same of Open Image Denoise 2, first the one to call: the names of its parts are longer."""
+    return _brought_along("OpenImageDenoise")
 
 
-def _brought_along(places) -> list[Path]:
+def _brought_along(name: str) -> list[Path]:
     bpy = sys.modules.get("bpy")
     own = bpy.app.binary_path if bpy is not None else ""
     if not own:
         spec = importlib.util.find_spec("bpy")
         own = spec.origin if spec is not None and spec.origin else ""
-    folder = Path(own).parent
-    return [path for place in places for path in sorted(folder.glob(place))] if own else []
+    folder, patterns = Path(own).parent, (place.format(name) for place in LIBRARY_PLACES)
+    return [path for pattern in patterns for path in sorted(folder.glob(pattern))] if own else []
 
 
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
@@ -188,8 +179,7 @@ class BlenderProcess:
     """A Blender that runs worker.py, from the first job on; `folder` takes all that Blender writes on its own."""
 
     def __init__(self, folder: Path):
-        self._folder = folder
-        self.temporary = [folder]  # what it deletes where this process is gone
+        self.temporary = [folder]  # what it deletes where this process is gone, first the folder that it writes to
         self._child: subprocess.Popen | None = None
 
     def do(self, job: dict, folder: Path, progress: Progress | None) -> dict:
@@ -214,7 +204,7 @@ class BlenderProcess:
                 return
             except OSError:  # it is gone
                 self.end()
-        self._child = start(child_command(job_path), self._folder)
+        self._child = start(child_command(job_path), self.temporary[0])
 
     def _follow(self, progress) -> None:
         """Report progress until the job is done. Raises SceneError, and Cancelled where `progress` returns False."""

@@ -6,6 +6,7 @@ import itertools
 import platform
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -160,18 +161,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     Raises as `shade_scene` does.
     """
-    if with_cycles:
-        return _made(options, True, None, progress)
     from ..blender.process.blender_process import kept_blender
-
-    # It shows the picture, too.
-    with temporary_folder() as folder, kept_blender(folder):
-        return _made(options, False, folder, progress)
-
-
-def _made(options: PictureOptions, with_cycles: bool, folder: Path | None, progress) -> TaskResult:
-    """As `make_picture`; temporary files of what is shown go to `folder`."""
-    from ..blender.process import client
 
     if with_cycles and options.cycles_samples < 2:
         raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
@@ -179,38 +169,55 @@ def _made(options: PictureOptions, with_cycles: bool, folder: Path | None, progr
         check_named(options.techniques, "with keep_visibility, relight")
     start = time.perf_counter()
     tables = prepare(options)
-    width, height = options.resolution or (None, None)
-    samples = options.cycles_samples if with_cycles else 0
-    size = {"width": width, "height": height}
-    rest = set(PASSES) <= set(options.passes)
-    job = child_job(client.ExtractOptions, options, **size, cycles_samples=samples, rest=rest)
-    extraction = client.extract(job, progress=progress)
-    shadows = None
-    if extraction.occluders is not None:
-        shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
-    results = evaluated(tables, extraction, shadows, options, progress)
-
-    comparison = Comparison(options, extraction, results, shadows)
-    report = comparison.report()
-    output, shown = Path(options.output), None
-    if folder is not None:
-        save_array(folder / client.PICTURE, comparison.whole(most_accurate(results)).astype(np.float32))
-        client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
-        shown = (folder / SHOWN).read_bytes()
+    with ExitStack() as stack:
+        folder = None
+        if not with_cycles:
+            # The Blender that finds the samples shows the picture, too.
+            folder = stack.enter_context(temporary_folder())
+            stack.enter_context(kept_blender(folder))
+        extraction = _extracted(options, with_cycles, progress)
+        shadows = None
+        if extraction.occluders is not None:
+            shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
+        results = evaluated(tables, extraction, shadows, options, progress)
+        comparison = Comparison(options, extraction, results, shadows)
+        shown = None if folder is None else _shown(comparison, folder, progress)
+    report, output = comparison.report(), Path(options.output)
     files = comparison.write(output, report, with_cycles, progress)
     if shown is not None:
         files.append(Path(files[0]).with_suffix(".png").as_posix())
         write_bytes(output / files[-1], shown)
     if options.keep_visibility:
-        kept = lighting.keep_picture(
-            extraction, shadows, options, (output / files[0]).with_suffix(lighting.KEPT_SUFFIX)
-        )
+        path = (output / files[0]).with_suffix(lighting.KEPT_SUFFIX)
+        kept = lighting.keep_picture(extraction, shadows, options, path)
         files += [path.relative_to(output).as_posix() for path in kept]
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
     if shadows is not None:
         seconds["shadows"] = shadows.seconds
     return TaskResult(report, seconds, tuple(files))
+
+
+def _extracted(options: PictureOptions, with_cycles: bool, progress):
+    """The samples and lights of a scene, and what Cycles makes of them where asked for."""
+    from ..blender.process import client
+
+    width, height = options.resolution or (None, None)
+    samples = options.cycles_samples if with_cycles else 0
+    rest = set(PASSES) <= set(options.passes)
+    job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples, rest=rest)
+    return client.extract(job, progress=progress)
+
+
+def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
+    """The PNG of the most accurate picture, through the view transform of its scene; `folder` is a temporary one."""
+    from ..blender.process import client
+
+    options = comparison.options
+    pixels = comparison.whole(most_accurate(comparison.results))
+    save_array(folder / client.PICTURE, pixels.astype(np.float32))
+    client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
+    return (folder / SHOWN).read_bytes()
 
 
 @dataclass(frozen=True)

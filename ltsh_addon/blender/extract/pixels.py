@@ -260,58 +260,50 @@ def extract(job: dict, folder: Path, progress) -> dict:
     """Do the `job` (see `client.extract`), write EXRs into `folder`; the manifest as a dictionary."""
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job.get("scripts", False))
-    scene = scene_named(job.get("scene_name"))
+    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    scene = scene_named(job["scene_name"])
     render_settings.go_to_frame(scene, job["frame"])
     camera = render_settings.choose_camera(scene, job["camera"])
-    view_layer = render_settings.choose_view_layer(scene, warnings, job.get("view_layer"))
-    picture = _picture(scene, job)
-    has_shadows = job.get("shadows") == "on"
-    for_finished = job.get("for_finished", False)
+    view_layer = render_settings.choose_view_layer(scene, warnings, job["view_layer"])
+    picture, for_finished = _picture(scene, job), job["for_finished"]
     # By the points of the pixels; those of the reference are others.
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
     has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
-    count, budget, pixels = job["sub_samples"], job.get("seconds"), picture["width"] * picture["height"]
-    if budget is not None and not affordable_points(budget, pixels, 1):
-        # Nothing is looked at in vain.
-        count, has_shadows, inventory = 0, False, LightInventory()
-    else:
+    budget, pixels = job["seconds"], picture["width"] * picture["height"]
+    inventory, count = LightInventory(), 0
+    if budget is None or affordable_points(budget, pixels, 1):  # else nothing is looked at in vain
+        with_occluders, count = job["shadows"] == "on", job["sub_samples"]
         inventory = prepare_scene(
-            scene, view_layer, camera, warnings, with_occluders=has_shadows, for_finished=for_finished
+            scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
         )
-    lens.use_dof = has_lens
+        if budget is not None and not has_lens:
+            count = min(affordable_points(budget, pixels, len(inventory.lights)), count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")
-    seconds["start"] = time.monotonic() - started
-
-    if has_shadows:
-        inventory.occluders.save(folder / OCCLUDERS)
-
-    started = time.monotonic()
-    has_rest = job.get("rest", False)
-    if budget is not None and not has_lens:
-        count = min(affordable_points(budget, pixels, len(inventory.lights)), count)
     if count == 0:
         inventory.kept.everything.append(f"{TOO_SMALL}, {budget:g} s")
+    has_shadows = inventory.occluders is not None
+    if has_shadows:
+        inventory.occluders.save(folder / OCCLUDERS)
+    seconds["start"] = time.monotonic() - started
+
+    started = time.monotonic()
+    lens.use_dof = has_lens
     offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
-    with world_behind(scene, inventory.behind if has_rest and not picture["film_transparent"] else None):
-        passes = (*(REST_PASSES if has_rest else ()), *job.get("indices", ()))
+    with world_behind(scene, inventory.behind if job["rest"] and not picture["film_transparent"] else None):
+        passes = (*(REST_PASSES if job["rest"] else ()), *job["indices"])
         # Lights in sight are part of the rest.
-        with nullcontext() if has_rest else without_lights(scene):
+        with nullcontext() if job["rest"] else without_lights(scene):
             samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None
     if job["cycles_samples"] > 0:
-        if has_shadows:
-            let_shadow_rays_through(inventory.made_opaque)
-        else:
-            remove_occlusion(scene)
-        scene.world = inventory.world
+        _prepare_reference(scene, inventory)
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
     # The picture may be shown next, as the file says.
@@ -335,6 +327,15 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "passes": render_settings.pass_names(),
         "seconds": seconds,
     }
+
+
+def _prepare_reference(scene, inventory: LightInventory) -> None:
+    """Let Cycles light the scene as the techniques do."""
+    if inventory.occluders is None:
+        remove_occlusion(scene)
+    else:
+        let_shadow_rays_through(inventory.made_opaque)
+    scene.world = inventory.world
 
 
 def scene_named(name: str | None):

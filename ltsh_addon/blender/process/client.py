@@ -209,7 +209,7 @@ def _read_samples(
     """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded;
     `look` gets the channels of each render."""
     width, height = manifest["width"], manifest["height"]
-    materials = manifest.get("unshaded", [])
+    materials = manifest["unshaded"]
     renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
     for name in manifest["samples"]:
         channels = _rendered(folder / name)
@@ -221,7 +221,7 @@ def _read_samples(
         unshaded += gbuffer.unshaded_hits(channels, len(materials))
         look(channels)
     samples, film = gbuffer.join(renders, width, height)
-    if manifest.get("weights"):
+    if manifest["weights"]:
         numbers = np.repeat(np.arange(len(renders)), [len(pixel) for _, pixel in renders])
         film = film.shared(np.array(manifest["weights"]), numbers, _rendered_pixels(manifest))
     if not renders:
@@ -333,8 +333,7 @@ def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None
             for lobe, image in sums.items():
                 light = lobes.read_layer(channels, passes[f"{lobe}_light"], "RGB").astype(np.float64)
                 image[half] += count / total * light * lobes.read_layer(channels, passes[f"{lobe}_color"], "RGB")
-    exposure = manifest.get("exposure", 1.0)
-    return {lobe: (exposure * image).astype(np.float32) for lobe, image in sums.items()}
+    return {lobe: (manifest["exposure"] * image).astype(np.float32) for lobe, image in sums.items()}
 
 
 def _rendered(path: Path) -> dict[str, np.ndarray]:

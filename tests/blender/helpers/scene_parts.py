@@ -258,6 +258,7 @@ def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
         "passes": render_settings.pass_names(),
         "width": scene.render.resolution_x,
         "height": scene.render.resolution_y,
+        "exposure": 1.0,
     }
     return client.read_reference(manifest, folder)
 

@@ -297,13 +297,11 @@ def _work(task, samples, queue, progress):
             raise Cancelled("shading was stopped")
 
 
-class _Queue:
-    """The blocks that are left, for several threads; after the last one the pairs."""
+class Queue:
+    """What is left to do, for several threads."""
 
-    def __init__(self, blocks, result):
-        self._result = result
-        self._left, self._total, self._done = deque(blocks), len(blocks), 0
-        self._blocks = len(blocks)
+    def __init__(self, work):
+        self._left = deque(work)
         self._changed = threading.Condition()
         self.stopped = False
 
@@ -312,16 +310,32 @@ class _Queue:
         with self._changed:
             return self._left.popleft() if self._left and not self.stopped else None
 
-    def next_of_all(self):
-        """As `next`, but None only at the end."""
-        while (work := self.next()) is None and not self.stopped and not self.finished():
-            self.wait(PATIENCE_SECONDS)
-        return work
+    def next_for_child(self):
+        """As `next`; after None a child is not needed any more."""
+        return self.next()
 
     def give_back(self, work):
         with self._changed:
             self._left.append(work)
             self._changed.notify_all()
+
+    def stop(self):
+        with self._changed:
+            self.stopped = True
+
+
+class _Queue(Queue):
+    """The blocks, and after the last one the pairs that they leave."""
+
+    def __init__(self, blocks, result):
+        super().__init__(blocks)
+        self._result, self._done = result, 0
+        self._blocks = self._total = len(blocks)
+
+    def next_for_child(self):
+        while (work := self.next()) is None and not self.stopped and not self.finished():
+            self.wait(PATIENCE_SECONDS)
+        return work
 
     def done(self, work, *found):
         (self._result.keep_pairs if isinstance(work, Pairs) else self._result.keep)(work, *found)
@@ -338,10 +352,6 @@ class _Queue:
         with self._changed:
             if not self._left and self._done < self._total:
                 self._changed.wait(seconds)
-
-    def stop(self):
-        with self._changed:
-            self.stopped = True
 
     def share(self) -> float:
         """Of the blocks: what they leave takes little time."""
@@ -426,21 +436,23 @@ class Child:
                     pass  # what could not be sent any more
 
 
-class _Shader(Child):
-    """A child that shades blocks and pairs of `samples`."""
+class Helper(Child):
+    """A child that takes work from a `queue`, which gets what `_do` returns; `first` is what `begin` takes."""
 
-    side = "shading.parallel.ChildSide"
-
-    def __init__(self, task: bytes, side: ParentSide, queue):
-        self._task, self._side, self._queue, self._work = task, side, queue, None
-        super().__init__(self._side.memory.inherited)
+    def __init__(self, queue, first: tuple, inherited: tuple[int, ...] = ()):
+        self._queue, self._first, self._work = queue, first, None
+        super().__init__(inherited)
 
     def _feed(self):
-        self.begin(self._task, self._side.memory.handle, self._side.size)
-        while (work := self._queue.next_of_all()) is not None:
+        self.begin(*self._first)
+        while (work := self._queue.next_for_child()) is not None:
             self._work = work
-            self._queue.done(work, *self._side.take(work, self.ask(self._side.put(work))))
+            self._queue.done(work, *self._do(work))
             self._work = None
+
+    def _do(self, work) -> tuple:
+        """Let the child do some work."""
+        raise NotImplementedError
 
     def _is_unwanted(self):
         return self._queue.stopped
@@ -448,6 +460,19 @@ class _Shader(Child):
     def _give_back(self):
         if self._work is not None:
             self._queue.give_back(self._work)
+
+
+class _Shader(Helper):
+    """A child that shades blocks and pairs of `samples`."""
+
+    side = "shading.parallel.ChildSide"
+
+    def __init__(self, task: bytes, side: ParentSide, queue):
+        self._side = side
+        super().__init__(queue, (task, side.memory.handle, side.size), side.memory.inherited)
+
+    def _do(self, work):
+        return self._side.take(work, self.ask(self._side.put(work)))
 
     def end(self):
         super().end()

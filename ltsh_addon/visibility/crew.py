@@ -52,12 +52,12 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
     wanted = min(parallel.cores() if workers is None else workers, len(blocks)) - 1
     if parallel.interpreter() is None or getattr(tracer, "library", None) is None:
         wanted = 0
-    queue = _Queue(blocks)
+    queue = _Queue(len(blocks))
     with parallel.helpers(queue) as children:
         # By this thread: it will keep more in the task while it traces.
         errand = worker.packed(Errand(task, tracer.occluders, tracer.library)) if wanted > 0 else b""
         for _ in range(wanted):
-            children.append(_Tracing(errand, queue))
+            children.append(_Tracing(errand, blocks, queue))
         yielded = 0
         while yielded < len(blocks):
             if progress is not None and progress(_STAGE, yielded / len(blocks)) is False:
@@ -70,24 +70,12 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
                 yielded += 1
 
 
-class _Queue:
-    """The blocks that are left, and what was found, for several threads."""
+class _Queue(parallel.Queue):
+    """The numbers of the blocks that are left, and what was found in others."""
 
-    def __init__(self, blocks):
-        self.blocks = blocks
-        self._left, self._found = deque(range(len(blocks))), deque()
-        self._changed = threading.Condition()
-        self.stopped = False
-
-    def next(self):
-        """The number of a block that nobody works on, or None."""
-        with self._changed:
-            return self._left.popleft() if self._left and not self.stopped else None
-
-    def give_back(self, number):
-        with self._changed:
-            self._left.append(number)
-            self._changed.notify_all()
+    def __init__(self, count: int):
+        super().__init__(range(count))
+        self._found = []
 
     def done(self, number, found):
         with self._changed:
@@ -99,37 +87,21 @@ class _Queue:
         with self._changed:
             if wait and not self._found and not self._left:
                 self._changed.wait(parallel.PATIENCE_SECONDS)
-            found = list(self._found)
-            self._found.clear()
+            found, self._found = self._found, []
             return found
 
-    def stop(self):
-        with self._changed:
-            self.stopped = True
 
-
-class _Tracing(parallel.Child):
+class _Tracing(parallel.Helper):
     """A child that finds shares for blocks."""
 
     side = "visibility.crew.ChildSide"
 
-    def __init__(self, errand: bytes, queue: _Queue):
-        self._errand, self._queue, self._number = errand, queue, None
-        super().__init__()
+    def __init__(self, errand: bytes, blocks: Sequence, queue: _Queue):
+        self._blocks = blocks
+        super().__init__(queue, (errand,))
 
-    def _feed(self):
-        self.begin(self._errand)
-        while (number := self._queue.next()) is not None:
-            self._number = number
-            self._queue.done(number, self.ask(self._queue.blocks[number]))
-            self._number = None
-
-    def _is_unwanted(self):
-        return self._queue.stopped
-
-    def _give_back(self):
-        if self._number is not None:
-            self._queue.give_back(self._number)
+    def _do(self, number):
+        return (self.ask(self._blocks[number]),)
 
 
 # -- processes that stay ----------------------------------------------------------------------------------------------

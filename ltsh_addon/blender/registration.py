@@ -19,7 +19,6 @@ PARTS = (
     "ui.preview",
     "ui.operators",
     "ui.preflight",
-    "ui.view_operators",
     "ui.comparison",
     "ui.panels",
     "ui.mixer",

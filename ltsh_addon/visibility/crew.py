@@ -8,7 +8,6 @@ takes blocks as those of `run` do, and keeps them from one picture to the next.
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -23,7 +23,7 @@ from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
-from ..ui.drawing import PLATE, draw_rectangle
+from ..ui.comparison import PLATE, draw_rectangle
 from ..ui.job import output_folder
 from ..ui.preview import ENGINE
 from ..viewport.mirror import LiveLamps, SceneMirror

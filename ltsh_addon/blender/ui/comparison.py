@@ -5,14 +5,17 @@ from __future__ import annotations
 import contextlib
 import logging
 
+import blf
 import bpy
+import gpu
 import numpy as np
+from gpu_extras.batch import batch_for_shader
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.lighting import KeptPicture
 from ...pipeline.relight import LightPictures
 from ...scene import error_line
-from . import drawing, results
+from . import results
 
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
@@ -359,6 +362,58 @@ class LTSH_OT_probe(bpy.types.Operator):
         return outcome
 
 
+# Over an image, in pixels of the region, at the interface's scale.
+FONT = 0
+TEXT_SIZE = 11.0
+# Readable on any picture and in any theme. Blender blends linear colors: a thinner plate is pale on a white picture.
+INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
+PAPER, LINE = (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
+
+
+def draw_rectangle(left: float, bottom: float, right: float, top: float, color) -> None:
+    """A filled rectangle."""
+    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
+    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
+    batch = batch_for_shader(shader, "TRIS", {"pos": corners}, indices=[(0, 1, 2), (0, 2, 3)])
+    gpu.state.blend_set("ALPHA")
+    shader.uniform_float("color", color)
+    batch.draw(shader)
+    gpu.state.blend_set("NONE")
+
+
+def draw_gradient(left: float, bottom: float, right: float, top: float, colors) -> None:
+    """Colors (N, 3) in display values from left to right."""
+    count = len(colors)
+    steps = [left + (right - left) * index / (count - 1) for index in range(count)]
+    positions = [(x, y) for x in steps for y in (bottom, top)]
+    values = [(*map(float, color), 1.0) for color in colors for _ in range(2)]
+    shader = gpu.shader.from_builtin("SMOOTH_COLOR")
+    batch_for_shader(shader, "TRI_STRIP", {"pos": positions, "color": values}).draw(shader)
+
+
+def text_width(text: str, scale: float) -> float:
+    """Pixels that `text` takes."""
+    blf.size(FONT, TEXT_SIZE * scale)
+    return blf.dimensions(FONT, text)[0]
+
+
+def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
+    """`text` from the left end of its base line."""
+    blf.size(FONT, TEXT_SIZE * scale)
+    blf.color(FONT, *color)
+    blf.position(FONT, x, y, 0.0)
+    blf.draw(FONT, text)
+
+
+def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) -> None:
+    """`text` on a dark plate whose left (`align` 0) or right (1) lower corner is at (x, y)."""
+    pad, height = 6.0 * scale, 20.0 * scale
+    width = text_width(text, scale) + 2.0 * pad
+    left = x - align * width
+    draw_rectangle(left, y, left + width, y + height, PLATE)
+    draw_text(left + pad, y + 6.0 * scale, text, scale)
+
+
 def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple[str, tuple[float, ...]]]]:
     """The pixel (column, row from below) at `point` in [0, 1]^2, and (label, RGB) of every picture there."""
     group = result.groups[choice.group]
@@ -386,27 +441,27 @@ def draw_probe(context, result, choice, corners) -> None:
     y = bottom + scene.ltsh.probe[1] * (top - bottom)
     half, arm, gap = 0.75 * scale, 9.0 * scale, 3.0 * scale
     for a, b in ((gap, arm), (-arm, -gap)):
-        drawing.draw_rectangle(x + a, y - half, x + b, y + half, drawing.LINE)
-        drawing.draw_rectangle(x - half, y + a, x + half, y + b, drawing.LINE)
+        draw_rectangle(x + a, y - half, x + b, y + half, LINE)
+        draw_rectangle(x - half, y + a, x + half, y + b, LINE)
     _draw_values(f"{column}, {row}", rows, x + 14.0 * scale, y - 14.0 * scale, scale)
 
 
 def _draw_values(title: str, rows, x: float, top: float, scale: float) -> None:
     line, pad = 17.0 * scale, 8.0 * scale
-    label = max([drawing.text_width(name, scale) for name, _ in rows] + [drawing.text_width(title, scale)])
-    number = drawing.text_width("0000.0000", scale)
+    label = max([text_width(name, scale) for name, _ in rows] + [text_width(title, scale)])
+    number = text_width("0000.0000", scale)
     width = 2.0 * pad + label + 3.0 * (number + 4.0 * scale)
     bottom = top - line * (len(rows) + 1) - pad
-    drawing.draw_rectangle(x, bottom, x + width, top, (0.0, 0.0, 0.0, 0.75))
+    draw_rectangle(x, bottom, x + width, top, (0.0, 0.0, 0.0, 0.75))
     y = top - line
-    drawing.draw_text(x + pad, y, title, scale, (0.75, 0.75, 0.75, 1.0))
+    draw_text(x + pad, y, title, scale, (0.75, 0.75, 0.75, 1.0))
     for name, values in rows:
         y -= line
-        drawing.draw_text(x + pad, y, name, scale)
+        draw_text(x + pad, y, name, scale)
         for index, value in enumerate(values):
             text = f"{value:.4f}"
             right = x + pad + label + (index + 1) * (number + 4.0 * scale)
-            drawing.draw_text(right - drawing.text_width(text, scale), y, text, scale)
+            draw_text(right - text_width(text, scale), y, text, scale)
 
 
 def _compared_in(context):
@@ -486,44 +541,42 @@ def _draw() -> None:
     below, gap = bottom - 26.0 * scale, 6.0 * scale
     if settings.mode == "WIPE":
         _draw_line(line_position(context), bottom, top, scale)
-        drawing.draw_label(left, below, first, scale)
-        drawing.draw_label(right, below, second, scale, align=1.0)
+        draw_label(left, below, first, scale)
+        draw_label(right, below, second, scale, align=1.0)
     elif settings.mode == "SIDE":
-        drawing.draw_label(left, below, first, scale)
-        drawing.draw_label((left + right) / 2.0, below, second, scale)
+        draw_label(left, below, first, scale)
+        draw_label((left + right) / 2.0, below, second, scale)
     elif settings.mode == "MIX":
-        drawing.draw_label(left, below, results.mix_label(context.scene), scale)
+        draw_label(left, below, results.mix_label(context.scene), scale)
     elif settings.mode == "A":
-        drawing.draw_label(left, below, first, scale)
+        draw_label(left, below, first, scale)
     else:
-        drawing.draw_label(left, below, f"{first} \u2212 {second}", scale)
+        draw_label(left, below, f"{first} \u2212 {second}", scale)
         limit = error_scale(settings, result.groups[choice.group], choice)
         _draw_legend(left, below - 26.0 * scale, limit, scale)
     if result.partial:
-        drawing.draw_label(left, top + gap, result.partial, scale)
+        draw_label(left, top + gap, result.partial, scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
 
 
 def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
     half, handle = 0.75 * scale, HANDLE_PIXELS * scale
-    drawing.draw_rectangle(x - 2.0 * half, bottom, x + 2.0 * half, top, drawing.PAPER)
-    drawing.draw_rectangle(x - half, bottom, x + half, top, drawing.LINE)
+    draw_rectangle(x - 2.0 * half, bottom, x + 2.0 * half, top, PAPER)
+    draw_rectangle(x - half, bottom, x + half, top, LINE)
     middle = (bottom + top) / 2.0
-    drawing.draw_rectangle(x - handle, middle - handle, x + handle, middle + handle, drawing.PAPER)
+    draw_rectangle(x - handle, middle - handle, x + handle, middle + handle, PAPER)
     for offset in (-3.0 * scale, 3.0 * scale):
-        drawing.draw_rectangle(
-            x + offset - half, middle - 0.6 * handle, x + offset + half, middle + 0.6 * handle, drawing.LINE
-        )
+        draw_rectangle(x + offset - half, middle - 0.6 * handle, x + offset + half, middle + 0.6 * handle, LINE)
 
 
 def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     """The colors of the difference between their ends, from `left` on."""
     width, height, gap = 160.0 * scale, 20.0 * scale, 12.0 * scale
     start, end = f"too dark \u2212{limit:g}", f"+{limit:g} too bright"
-    drawing.draw_label(left, below, start, scale)
-    bar = left + drawing.text_width(start, scale) + gap
-    drawing.draw_gradient(bar, below, bar + width, below + height, color_bar(65, 1)[0])
-    drawing.draw_label(bar + width, below, end, scale)
+    draw_label(left, below, start, scale)
+    bar = left + text_width(start, scale) + gap
+    draw_gradient(bar, below, bar + width, below + height, color_bar(65, 1)[0])
+    draw_label(bar + width, below, end, scale)
 
 
 _add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe))

@@ -9,10 +9,10 @@ from bpy.app.translations import pgettext_iface as translated
 
 from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
+from .operators import COMMANDS
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
 from .preview import ENGINE, is_previewing
 from .settings import active_light
-from .view_operators import COMMANDS
 
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
 MARGIN_PIXELS = 70.0  # icon, scroll bar and borders

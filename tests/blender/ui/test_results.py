@@ -12,9 +12,9 @@ from job_window import image_pixels
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.engine import view
-from ltsh_addon.blender.ui import comparison, results, view_operators
+from ltsh_addon.blender.ui import comparison, operators, results
 from ltsh_addon.blender.ui import settings as settings_module
-from ltsh_addon.blender.ui.drawing import INK, PLATE
+from ltsh_addon.blender.ui.comparison import INK, PLATE
 from ltsh_addon.imaging.color import signed_error_colors
 
 HEIGHT, WIDTH = 6, 10
@@ -261,7 +261,7 @@ def test_every_setting_of_a_job_is_part_of_presets(scene):
 
 def test_the_manual_names_what_the_panels_show(scene, tmp_path, monkeypatch):
     """Every button and every setting, by the words on it; a manual that is missing is told."""
-    text = view_operators.PICTURE_LINE.sub("", view_operators.MANUAL.read_text(encoding="utf-8"))
+    text = operators.PICTURE_LINE.sub("", operators.MANUAL.read_text(encoding="utf-8"))
     assert "![" not in text and "\n\n\n" not in text
     buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Pixel Probe", "Open in Image Editor",
                "Cancel", "Esc")  # fmt: skip
@@ -270,7 +270,7 @@ def test_the_manual_names_what_the_panels_show(scene, tmp_path, monkeypatch):
     skipped = {"A", "B", "groups", "View", "Pass", "Object"}
     assert [word for word in (*buttons, *names) if word not in text and word not in skipped] == []
     assert len(text.splitlines()) < 150 and max(map(len, text.splitlines())) <= 120
-    monkeypatch.setattr(view_operators, "MANUAL", tmp_path / "manual.md")
+    monkeypatch.setattr(operators, "MANUAL", tmp_path / "manual.md")
     with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
         bpy.ops.ltsh.manual()
 

@@ -137,8 +137,8 @@ def fit(family: Family, size: int = 64, *, model: Brdf = GGX, progress=None, che
     """
     curves, weights = fresnel_basis()
     roughness, cosine = _nodes(size)
-    nodes = _fitted_nodes(family, model, roughness, cosine, curves, progress or (lambda fraction: None), checkpoint)
-    warp, coefficients, errors = nodes
+    progress = progress or (lambda fraction: None)
+    warp, coefficients, errors = _fitted_nodes(family, model, (roughness, cosine), curves, progress, checkpoint)
     arrays = {
         "warp": warp.astype(np.float32),
         "coefficients": (coefficients @ family.span).astype(np.float32),
@@ -157,8 +157,9 @@ def _nodes(size):
     return roughness, np.maximum(np.cos(theta_nodes(size)), GRAZING_COSINE)
 
 
-def _fitted_nodes(family, model, roughness, cosine, curves, progress, checkpoint):
-    """Warp (R, T, n), coefficients (R, T, F, size) and errors (R, T) of the nodes."""
+def _fitted_nodes(family, model, nodes, curves, progress, checkpoint):
+    """Warp (R, T, n), coefficients (R, T, F, size) and errors (R, T) of nodes at (roughness (R,), cosine (T,))."""
+    roughness, cosine = nodes
     saved = checkpoint.load() if checkpoint else {}
 
     def keep(**arrays):

@@ -146,6 +146,8 @@ def _functionals(points):
 
 ITERATIONS = 3
 FIRST_DAMPING = 1e-3
+# Of conjugate gradients: the residual, relative to the first one, at which they end, and the most steps.
+SOLVED, MOST_STEPS = 1e-6, 400
 
 
 @dataclass(frozen=True)
@@ -217,7 +219,7 @@ def free_entries(family, model, shape) -> np.ndarray:
     return free
 
 
-def _solve(cells, matrices, right, free, damping, *, tie_round_warp=False, tolerance=1e-6, most=400):
+def _solve(cells, matrices, right, free, damping, *, tie_round_warp=False):
     """The change (R, T, d) of the nodes that solves the damped normal equations, by conjugate gradients."""
     blocks = cells.node_blocks(matrices)
     diagonal = np.einsum("ijkk->ijk", blocks)
@@ -230,8 +232,8 @@ def _solve(cells, matrices, right, free, damping, *, tie_round_warp=False, toler
     residual = _admissible(cells.distribute(right), free, tie_round_warp)
     change, direction = np.zeros_like(residual), precondition(residual)
     size = (residual * direction).sum()
-    enough = tolerance**2 * size
-    for _ in range(most):
+    enough = SOLVED**2 * size
+    for _ in range(MOST_STEPS):
         if size <= enough:
             break
         bent = np.matmul(matrices, cells.interpolate(direction)[..., None])[..., 0]

@@ -30,6 +30,7 @@ class TexelMesh:
     material: np.ndarray  # (T,) number of the material
     vertices: np.ndarray  # (T, 3) numbers in the mesh
     mirrored: bool | np.ndarray = False  # the transform turns right hands into left ones
+    receiver: int | np.ndarray = 0  # of `SurfaceSamples`
 
     def true_normals(self) -> np.ndarray:
         """Unit normals (T, 3) of the faces. Smooth normals may point to the other side of a face, as where a quad is
@@ -107,7 +108,6 @@ def texel_samples(
     read_map,
     view: BakeView,
     lights: tuple[AreaLight, ...],
-    receiver: int = 0,
 ) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (S) of texels (Q) and the texel (S,), 0 to Q - 1, of each; those of a texel follow one another.
 
@@ -130,7 +130,7 @@ def texel_samples(
             smooth_normal=smooth_normal,
             true_normal=true_normal,
             corrected=corrected[number],
-            receiver=np.full(len(position), receiver),
+            receiver=np.full(len(position), mesh.receiver),
             diffuse_albedo=None,
         )
         of_block = {name: values[block] for name, values in maps.items()}

@@ -76,7 +76,7 @@ def write_channels(path: str | os.PathLike, channels: Mapping[str, np.ndarray], 
     height, width = next(iter(planes.values())).shape
     # A block at a time, so that a signal need not wait for a large file.
     rows = max(1, _BLOCK_VALUES // (width * len(planes)) // _ZIP_ROWS) * _ZIP_ROWS
-    with writing_rows(path, list(planes), width, height, *header) as writer:
+    with writing_rows(path, list(planes), (width, height), *header) as writer:
         for first in range(0, height, rows):
             writer.write({name: plane[first : first + rows] for name, plane in planes.items()})
 
@@ -85,13 +85,12 @@ def write_channels(path: str | os.PathLike, channels: Mapping[str, np.ndarray], 
 def writing_rows(
     path: str | os.PathLike,
     names: Sequence[str],
-    width: int,
-    height: int,
+    size: tuple[int, int],
     metadata: Mapping[str, str] | None = None,
     chromaticities: Sequence[float] | None = None,
     pixel_aspect: float = 1.0,
 ) -> Iterator[RowWriter]:
-    """Meanwhile a RowWriter for a file with the channels `names`; else as `write_layers`.
+    """Meanwhile a RowWriter for a file of `size` (width, height) with the channels `names`; else as `write_layers`.
 
     Raises ValueError also where rows are missing at the end of the block.
     """
@@ -99,6 +98,7 @@ def writing_rows(
     metadata = {str(key): str(value) for key, value in (metadata or {}).items()}
     if clash := _OF_THE_FORMAT & metadata.keys():
         raise ValueError(f"metadata {min(clash)!r}: that name belongs to the EXR format itself, use another one")
+    width, height = size
     header = OpenEXR.Header(width, height)
     header["channels"] = dict.fromkeys(names, header["channels"]["R"])
     header |= {"type": b"scanlineimage", "pixelAspectRatio": float(pixel_aspect)}

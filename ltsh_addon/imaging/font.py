@@ -146,13 +146,14 @@ def text_size(text: str, size: float = 14.0, *, bold: bool = False) -> tuple[int
 
 
 def draw_text(
-    image: np.ndarray, x: int, y: int, text: str, color=(0, 0, 0), size: float = 14.0, *, bold: bool = False
+    image: np.ndarray, corner: tuple[int, int], text: str, color=(0, 0, 0), size: float = 14.0, *, bold: bool = False
 ) -> int:
     """Draw one line of `text` into `image` (H, W, 3) uint8 and return the x where it ends.
 
-    (x, y) is the top left corner of the box of `text_size`; whatever falls outside of the image is cut off. Accents
+    `corner` (x, y) is the top left one of the box of `text_size`; what falls outside of the image is cut off. Accents
     are dropped, characters without a glyph become a crossed box.
     """
+    x, y = corner
     for character in _drawable(text):
         coverage, advance = _glyph(character, size, bold)
         _blend(image, int(x), int(y), coverage, color)

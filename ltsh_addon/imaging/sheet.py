@@ -152,7 +152,7 @@ class _Sheet:
         page_height = self.top + sum(self.heights) + _MARGIN - 18
         self.pixels = np.full((page_height, page_width, 3), _PAPER, dtype=np.uint8)
         for number, text in enumerate(heading):
-            draw_text(self.pixels, _MARGIN, _MARGIN + number * title_line, text, _INK, _TITLE, bold=True)
+            draw_text(self.pixels, (_MARGIN, _MARGIN + number * title_line), text, _INK, _TITLE, bold=True)
 
     def _corner(self, index: int) -> tuple[int, int]:
         row, column = divmod(index, self.columns)
@@ -161,7 +161,7 @@ class _Sheet:
     def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
         """Put label, picture, error and caption into cell `index`."""
         x, y = self._corner(index)
-        draw_text(self.pixels, x, y, shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)
+        draw_text(self.pixels, (x, y), shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)
         y += self.label_height
         self._picture(x, y, picture)
         y += self.height + 10
@@ -169,7 +169,7 @@ class _Sheet:
             self._picture(x, y, error)
         y += self.height + 8
         for line in caption:
-            draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
+            draw_text(self.pixels, (x, y), line, _FAINT, _TEXT)
             y += self.line
 
     def _picture(self, x: int, y: int, picture: np.ndarray) -> None:
@@ -185,8 +185,8 @@ class _Sheet:
         y += _BAR + 6
         for text, align in ((f"\u2212{scale:g}", 0.0), ("0", 0.5), (f"+{scale:g}", 1.0)):
             width = text_size(text, _TEXT)[0]
-            draw_text(self.pixels, x + round(align * (self.width - width)), y, text, _INK, _TEXT)
+            draw_text(self.pixels, (x + round(align * (self.width - width)), y), text, _INK, _TEXT)
         y += self.line + 6
         for line in lines:
-            draw_text(self.pixels, x, y, line, _FAINT, _TEXT)
+            draw_text(self.pixels, (x, y), line, _FAINT, _TEXT)
             y += self.line

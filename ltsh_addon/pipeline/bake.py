@@ -16,6 +16,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from .. import imaging
+from ..cycles import uv
+from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
@@ -148,12 +150,9 @@ class ObjectBaker:
     """Bakes the tiles of one object, `record` of the `manifest`, block of rows by block of rows from the top."""
 
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
-        from ..cycles import uv
-        from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
-
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = TexelMesh.load(folder / "mesh.npz")
+        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
@@ -162,7 +161,6 @@ class ObjectBaker:
         self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
         if not options.error:
             self.compared = ()
-        self._sample, self._seams = texel_samples, uv.UvSeams.of
 
     def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
         """Write the files of `tiles` (empty: of all) that are not finished according to `records`.
@@ -214,7 +212,7 @@ class ObjectBaker:
     def _planes(self, tile) -> Planes:
         options, seams = self.options, None
         if options.margin_type == "adjacent" and options.margin > 0:
-            seams = self._seams(self.mesh.uv, self.mesh.vertices, *options.size, _place(tile))
+            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _place(tile))
         return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
@@ -272,8 +270,7 @@ class ObjectBaker:
         def read_map(number):
             return maps[number].reshape(-1, 3)[texels.index]
 
-        receiver = self.record["receiver"]
-        samples, texel = self._sample(self.mesh, self.materials, texels, read_map, self.view, self.lights, receiver)
+        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
         layers, shadows = {}, None
         if self.tracer is not None:
             options = self.options
@@ -352,11 +349,9 @@ class TilePoints:
     """The points of the texels of a tile: of `UvTriangles.spread`, or where there are maps, those that they show."""
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
-        from ..cycles import uv
-
         options = baker.options
         self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
-        self._width, self._weights = baker.manifest["sampled_texels"], uv.PointWeights.of
+        self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
         # Points of one block follow one another.
@@ -393,7 +388,7 @@ class TilePoints:
         texels, points = self.texels(first), range(self._options.sub_samples)
         maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
         places = (self._places(texels, of_point, first, point) for of_point, point in maps)
-        return self._weights(self._triangles, texels, places, self._width)
+        return uv.PointWeights.of(self._triangles, texels, places, self._width)
 
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:

@@ -77,10 +77,10 @@ class Planes:
             file.flush()
         with ExitStack() as files:
             # The last to be entered is the first to take its name: with the large file the tile counts as finished.
-            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], width, height, metadata))
+            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], (width, height), metadata))
             small = None
             if texture is not None:
-                small = files.enter_context(writing_rows(texture[0], "RGB", width, height, metadata))
+                small = files.enter_context(writing_rows(texture[0], "RGB", (width, height), metadata))
             for top in range(height, 0, -rows):
                 bottom = max(top - rows, 0)
                 block = self._filled(bottom, top, margin)

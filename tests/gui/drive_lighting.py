@@ -38,7 +38,7 @@ def main(rig):
                 lights = [random_surfaces.light(kind, number, random) for number in range(3)]
                 drawing.set_lights(lights)
                 gbuffer = textures.upload_samples(samples, WIDTH)
-                drawing.draw(gbuffer, buffer, "combined", view_position=random_surfaces.EYE)
+                drawing.draw(gbuffer, buffer, "combined", view=(*random_surfaces.EYE, 1.0))
                 values = target.read()
                 values.dimensions = WIDTH * HEIGHT * 4
                 found = np.array(values, np.float64).reshape(-1, 4)[:, :3]

@@ -97,7 +97,7 @@ NAMES = ("ltsh4.specular.R", "ltsh4.specular.G", "coverage.hit.V")
 
 def write(path, image, blocks, **options):
     height, width = next(iter(image.values())).shape
-    with writing_rows(path, NAMES, width, height, **options) as writer:
+    with writing_rows(path, NAMES, (width, height), **options) as writer:
         for start, stop in zip(blocks[:-1], blocks[1:], strict=True):
             writer.write({name: plane[start:stop] for name, plane in image.items()})
 
@@ -122,7 +122,7 @@ def test_rows_read_back_bit_for_bit_and_the_bytes_do_not_depend_on_the_blocks(tm
 
 
 def test_wrong_rows_are_refused(tmp_path, image):
-    with writing_rows(tmp_path / "a.exr", NAMES, 33, 70) as writer:
+    with writing_rows(tmp_path / "a.exr", NAMES, (33, 70)) as writer:
         with pytest.raises(ValueError, match=r"channels \['coverage.hit.V'\], expected"):
             writer.write({NAMES[2]: image[NAMES[2]]})
         with pytest.raises(ValueError, match=r"shape \(70, 32\), expected \(70, 33\)"):
@@ -149,7 +149,7 @@ def test_no_part_of_a_file_is_taken_for_the_whole(tmp_path, image):
 def test_what_a_killed_writer_leaves_is_not_taken_for_the_whole(tmp_path, image, rows):
     """The table that says where lines are is written last; a reader puts it together from the lines that are there.
     Where those are not all, it is told."""
-    with writing_rows(tmp_path / "a.exr", NAMES, 33, 70) as writer:
+    with writing_rows(tmp_path / "a.exr", NAMES, (33, 70)) as writer:
         if rows:
             writer.write({name: plane[:rows] for name, plane in image.items()})
         (half,) = tmp_path.glob(".a.exr.*.tmp")

@@ -125,11 +125,11 @@ def test_every_word_of_the_legend_and_of_captions_stands_on_small_sheets(monkeyp
     drawn = []
     draw = sheet.draw_text
 
-    def watch(image, x, y, text, color, size, **more):
-        box = font.text_size(text, size, bold=more.get("bold", False))
+    def watch(image, corner, text, color, size, **more):
+        (x, y), box = corner, font.text_size(text, size, bold=more.get("bold", False))
         assert 0 <= x and 0 <= y and x + box[0] <= image.shape[1] + 2 and y + box[1] <= image.shape[0], text
         drawn.append(text)
-        return draw(image, x, y, text, color, size, **more)
+        return draw(image, corner, text, color, size, **more)
 
     monkeypatch.setattr(sheet, "draw_text", watch)
     image, notes = (
@@ -159,7 +159,7 @@ def test_text_stays_in_its_box_and_draws_ink():
     for size in (14.0, 26.0):
         width, height = font.text_size("Agjy|_{}", size)
         image = np.full((height + 40, width + 40, 3), 255, dtype=np.uint8)
-        font.draw_text(image, 20, 20, "Agjy|_{}", (0, 0, 0), size)
+        font.draw_text(image, (20, 20), "Agjy|_{}", (0, 0, 0), size)
         rows, columns = np.nonzero(image.min(axis=-1) < 255)
         assert rows.size > 50
         assert rows.min() >= 20 and rows.max() < 20 + height and columns.min() >= 20 and columns.max() < 20 + width
@@ -169,7 +169,7 @@ def test_every_printable_character_looks_different():
     looks = {}
     for character in string.printable[:95].replace(" ", ""):
         image = np.full((40, 40, 3), 255, dtype=np.uint8)
-        font.draw_text(image, 4, 4, character, (0, 0, 0), 28.0)
+        font.draw_text(image, (4, 4), character, (0, 0, 0), 28.0)
         looks.setdefault(image.tobytes(), []).append(character)
     assert [group for group in looks.values() if len(group) > 1] == []
 

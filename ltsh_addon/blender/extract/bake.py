@@ -513,13 +513,14 @@ def _object(opened, name, images, job, folder, progress) -> dict:
         save_array(folder / file, read.uv_map(uv_name))
     record["maps"] = any(plan.count for plan in distinct)
     if record["maps"] or job["cycles_samples"]:
-        _bake(opened.scene, ob, read, distinct, job, record["maps"], folder, progress)
+        _bake(opened, ob, distinct, job, folder, progress)
     return record
 
 
-def _bake(scene, ob, read, plans, job, with_maps, folder, progress) -> None:
+def _bake(opened, ob, plans, job, folder, progress) -> None:
     """Write the maps and Cycles' bake of the tiles of an object that are wanted and not finished."""
-    bake = ObjectBake(scene, ob, read.uv_name, plans)
+    read, points = opened.meshes[ob.name], job["sub_samples"] if any(plan.count for plan in plans) else 0
+    bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
     try:
         with np.load(read.mesh) as data:
             blocks = blocks_of(data["uv"], job["width"], job["height"], job["block_rows"])
@@ -529,8 +530,8 @@ def _bake(scene, ob, read, plans, job, with_maps, folder, progress) -> None:
             blocks = [block for block in blocks if block.tile == job["tile"]]
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
-            for point in range(job["sub_samples"]) if with_maps else ():
-                save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, job["sub_samples"]))
+            for point in range(points):
+                save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
             if job["cycles_samples"]:
                 for kind in job["passes"]:
                     halves = bake.radiance(block, kind, max(1, job["cycles_samples"] // 2))

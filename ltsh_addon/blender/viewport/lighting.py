@@ -148,24 +148,20 @@ class LightingPass:
         target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer | None,
         passes: str = "combined",
         *,
-        view_position: Sequence[float] | None = None,
-        view_direction: Sequence[float] | None = None,
+        view: Sequence[float],
         rect: tuple[int, int, int, int] | None = None,
         blend: str = "NONE",
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is "specular", "diffuse" or "combined". Give the camera's place, or for orthographic cameras the unit
-        direction toward it. `rect` (x, y, width, height) is where the lower left of the G-buffer comes to lie in
-        `target` (None: what is bound), left out: (0, 0, its size). `blend` is "NONE", or "ADDITIVE" to add the
-        radiance to what is there (a further lobe of the same surfaces), or "ADDITIVE_PREMULT" to add the alpha too.
+        `passes` is "specular", "diffuse" or "combined", `view` as of `HorizonPass.draw`. `rect` (x, y, width, height)
+        is where the lower left of the G-buffer comes to lie in `target` (None: what is bound), left out: (0, 0, its
+        size). `blend` is "NONE", or "ADDITIVE" to add the radiance to what is there (a further lobe of the same
+        surfaces), or "ADDITIVE_PREMULT" to add the alpha too.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
-        if (view_position is None) == (view_direction is None):
-            raise ValueError("lighting pass: give either view_position or view_direction")
         x, y, width, height = rect or (0, 0, *gbuffer.size)
-        view = (*view_position, 1.0) if view_direction is None else (*view_direction, 0.0)
         features = Features(
             specular=passes != "diffuse",
             diffuse=passes != "specular",

@@ -317,7 +317,6 @@ class ViewRenderer:
         view; surfaces of a lobe are those of all."""
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
-        place = {"view_direction" if view.is_parallel else "view_position": tuple(view.eye)}
         for lighting in lightings:
             lighting.number = self.samples
         traces = self.shadows is not None and self.shadows.traces_lobes
@@ -326,7 +325,9 @@ class ViewRenderer:
             shares = self._shares(layer, gbuffer, mirror, view) if traces else layer.shares
             gbuffer = replace(gbuffer, shares=shares)
             for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
-                lighting.draw(gbuffer, buffer, passes, **place, blend=first if number == 0 else "ADDITIVE")
+                lighting.draw(
+                    gbuffer, buffer, passes, view=view.homogeneous_eye, blend=first if number == 0 else "ADDITIVE"
+                )
 
     def _add_emission(self, layer: _Layer, wanted, buffers, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen

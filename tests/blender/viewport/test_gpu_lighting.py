@@ -30,7 +30,7 @@ RELATIVE_OF_CAPS = 6e-3
 def drawn(lighting, samples, canvas, passes, **placement):
     """Radiance (P, 3) of `samples` (P)."""
     gbuffer = upload_samples(samples, WIDTH)
-    lighting.draw(gbuffer, canvas.buffer, passes, view_position=EYE, **placement)
+    lighting.draw(gbuffer, canvas.buffer, passes, view=(*EYE, 1.0), **placement)
     return canvas.read()[..., :3].reshape(-1, 3)
 
 
@@ -387,8 +387,8 @@ def test_a_pass_draws_where_it_is_told_and_adds_to_what_is_there():
         large.fill(7.0)
         gbuffer = upload_samples(samples, WIDTH)
         rect = (5, 3, WIDTH, HEIGHT)
-        lighting.draw(gbuffer, large.buffer, "specular", view_position=EYE, rect=rect)
-        lighting.draw(gbuffer, large.buffer, "diffuse", view_position=EYE, rect=rect, blend="ADDITIVE")
+        lighting.draw(gbuffer, large.buffer, "specular", view=(*EYE, 1.0), rect=rect)
+        lighting.draw(gbuffer, large.buffer, "diffuse", view=(*EYE, 1.0), rect=rect, blend="ADDITIVE")
         return parts, large.read()
 
     parts, picture = with_graphics(draw)
@@ -418,7 +418,7 @@ def test_pixels_without_a_surface_stay_dark():
         canvas = Canvas(WIDTH, HEIGHT)
         pixel = np.arange(40) * 7
         pixel[-1] = WIDTH * HEIGHT - 1
-        lighting.draw(upload_samples(samples, WIDTH, pixel), canvas.buffer, view_position=EYE)
+        lighting.draw(upload_samples(samples, WIDTH, pixel), canvas.buffer, view=(*EYE, 1.0))
         return pixel, canvas.read().reshape(-1, 4)
 
     pixel, picture = with_graphics(draw)

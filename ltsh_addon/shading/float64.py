@@ -22,7 +22,7 @@ from .brdf import (
 )
 from .edge_integrals import vector_irradiance
 from .facing import FacingDisk
-from .light_polygons import PatchTree, has_lobe, light_view, local_frames, seen_parts, to_local
+from .light_polygons import Framed, PatchTree, has_lobe, light_view, seen_parts, to_local
 from .lobes import FLOAT64_CHUNK, LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
 from .lookup_table import MIN_ALPHA, Lobe, LookupTable
 from .polygon import dot
@@ -101,9 +101,9 @@ def _of(vector, index):
 
 def shade_diffuse(samples, lights, radiance):
     """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
-    frame = local_frames(samples.diffuse_normal, samples.view)
+    framed = Framed.of(samples, samples.diffuse_normal)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
-    kinds = list(_diffuse_kinds(samples, frame, lit))
+    kinds = list(_diffuse_kinds(framed, lit))
     is_plain = (samples.diffuse_normal[lit] == samples.smooth_normal[lit]).all(axis=1)
     is_plain &= (samples.sheen_a[lit] == 0.0) & (samples.diffuse_roughness[lit] == 0.0)
 
@@ -123,14 +123,16 @@ def shade_diffuse(samples, lights, radiance):
                 shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
             continue
         for candidates, second_normal, count, integral in kinds:
-            for index, polygon, effort in seen_parts(samples, frame, light, corners, candidates, 1.0, second_normal):
+            for part in seen_parts(framed, light, corners, candidates, 1.0, second_normal):
+                index, polygon, _ = part
                 if light.is_profiled:
-                    view = light_view(samples, frame, light, index, lambda vectors: vectors)
-                    irradiance = _profiled(light, view, effort, index, polygon, integral, count)
+                    view = light_view(framed, light, index, lambda vectors: vectors)
+                    irradiance = _profiled(light, view, part, integral, count)
                 else:
                     irradiance = integral(polygon, index)
                 if light.is_facing:
-                    irradiance = irradiance * _mean_emission(light, samples, index, facing.Lobe(frame[2][:, index]))
+                    own = facing.Lobe(framed.frame[2][:, index])
+                    irradiance = irradiance * _mean_emission(light, samples, index, own)
                 reflected = irradiance[0][:, None] * samples.diffuse_albedo[index]
                 if count > 1:
                     rebound = irradiance[1][:, None] * samples.diffuse_rebound[index]
@@ -138,9 +140,11 @@ def shade_diffuse(samples, lights, radiance):
                 radiance[group, index] += reflected * _of(light.radiance, index)
 
 
-def _diffuse_kinds(samples, frame, lit):
+def _diffuse_kinds(framed, lit):
     """Yield (candidates (Q,), second normal, count, integral) of the samples `lit` by their diffuse lobes:
     integral(polygon, index) is (count, Q)."""
+
+    samples = framed.samples
 
     def lambert(polygon, _):
         return np.abs(form_factor(polygon))[None]
@@ -157,7 +161,7 @@ def _diffuse_kinds(samples, frame, lit):
         return diffuse.rough_integrals(polygon, cosine, samples.diffuse_roughness[index])
 
     def shadowed(lobe):
-        return lambda polygon, index: lobe(polygon, index) * _bump_shadowing(samples, frame, index, polygon)
+        return lambda polygon, index: lobe(polygon, index) * _bump_shadowing(framed, index, polygon)
 
     bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
     shiny, soft = samples.sheen_a[lit] > 0.0, samples.sheen_a[lit] < 0.0
@@ -186,19 +190,20 @@ def lobe_width(samples, index) -> np.ndarray:
     return np.maximum(samples.sharpest_roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
-def _profiled(light, view, effort, index, polygon, integral, count):
-    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light; integral(polygons, index) is that
-    without it."""
+def _profiled(light, view, part, integral, count):
+    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light; `part` as of `seen_parts`, and
+    integral(polygons, index) is that without the profile."""
+    index, polygon, effort = part
     result = np.zeros((count, len(index)))
     for near, weights, corners in light_cone.layers(view, polygon[3:], light_cone.Profile.of(light), effort):
         result[:, near] += weights * integral(corners[3:], index[near])
     return result
 
 
-def _bump_shadowing(samples, frame, index, polygon):
+def _bump_shadowing(framed, index, polygon):
     """The bump shadowing (Q,) of `SurfaceSamples`, taken at the mean direction of the polygon."""
-    direction = -integrals_on_sphere(vector_irradiance, polygon)
-    smooth = to_local(frame[:, :, index], samples.smooth_normal[index].T)
+    samples, direction = framed.samples, -integrals_on_sphere(vector_irradiance, polygon)
+    smooth = to_local(framed.frame[:, :, index], samples.smooth_normal[index].T)
     along = (direction * smooth).sum(axis=0)
     tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
     shadowing = 2.0 / (1.0 + np.sqrt(1.0 + samples.bump_alpha2[index] * np.maximum(tangent2, 0.0)))
@@ -208,13 +213,13 @@ def _bump_shadowing(samples, frame, index, polygon):
 def shade_specular(samples, lights, table, radiance, error=None):
     """As `shade_diffuse` for the specular lobes; `table` or REFERENCE, which adds its estimates to error (P,)."""
     cosine = (samples.normal * samples.view).sum(axis=1)
-    frame = local_frames(samples.normal, samples.view)
+    framed = Framed.of(samples, samples.normal)
     lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
     cosine = np.clip(cosine, 0.0, 1.0)
     lobe, bent = None, np.zeros(len(samples), bool)
     is_anisotropic = samples.anisotropy[lit] != 0.0
     anisotropic = lit[is_anisotropic]
-    halves = HalfVectors.of(samples, frame, cosine) if table != REFERENCE and len(anisotropic) else None
+    halves = HalfVectors.of(samples, framed.frame, cosine) if table != REFERENCE and len(anisotropic) else None
     if table != REFERENCE and len(lit):
         bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
@@ -235,20 +240,17 @@ def shade_specular(samples, lights, table, radiance, error=None):
                 shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
             continue
         if table == REFERENCE:
-            parts = reference_integrals(samples, cosine, frame, light, corners, lit, error)
+            parts = reference_integrals(framed, cosine, light, corners, lit, error)
         else:
             plain = lit[~is_anisotropic]
             width = lobe_width(samples, plain)
-            visible = seen_parts(samples, frame, light, corners, plain, width, samples.geometric_normal)
-            parts = (
-                (index, _table_integrals(table, lobe, samples, frame, light, effort, index, polygon))
-                for index, polygon, effort in visible
-            )
+            visible = seen_parts(framed, light, corners, plain, width, samples.geometric_normal)
+            parts = ((part[0], _table_integrals(table, lobe, framed, light, part)) for part in visible)
             if light.is_profiled and light.shape == "POLYGON":
                 parts = _joined(parts, len(samples))
             parts = _finished(parts, table, samples, light)
             if len(anisotropic):
-                others = anisotropic_integrals(samples, halves, frame, light, corners, anisotropic)
+                others = anisotropic_integrals(framed, halves, light, corners, anisotropic)
                 parts = chain(parts, others)
         for index, integrals in parts:
             plain, schlick, dip, dielectric = integrals[:4, :, None]
@@ -258,7 +260,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
             if len(integrals) > 4:
                 reflected += integrals[4:].T
             if (chosen := bent[index]).any():
-                mean = _bent_reflectance(samples, frame, light, corners, index[chosen])
+                mean = _bent_reflectance(framed, light, corners, index[chosen])
                 reflected[chosen] = plain[chosen] * mean
             radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
@@ -284,14 +286,14 @@ def has_bent_fresnel(samples) -> np.ndarray:
     return below | clipped_metals(samples)
 
 
-def _bent_reflectance(samples, frame, light, corners, at):
+def _bent_reflectance(framed, light, corners, at):
     """Mean Fresnel factor (Q, 3) of the samples `at` (Q,) over points of the light, by the lobe there."""
     center = light.center if light.center.ndim == 1 else light.center[at]
     places = [center] if light.is_facing else [
         center + fraction * ((corner if corner.ndim == 1 else corner[at]) - center)
         for corner in corners for fraction in POINTS_TO_CORNERS
     ]  # fmt: skip
-    samples, axes, direction = samples.take(at), frame[:, :, at], _of(light.direction, at)
+    samples, axes, direction = framed.samples.take(at), framed.frame[:, :, at], _of(light.direction, at)
     origin, is_clipped = light.origins(samples.position), clipped_metals(samples)[:, None]
     cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
     alpha, total, lobe = np.maximum(samples.roughness**2, MIN_ALPHA), 0.0, 1e-30
@@ -343,20 +345,22 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
     return lobe.with_coefficients(np.stack([*lobe.coefficients[:3], dielectric]))
 
 
-def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon):
-    """Integrals (4, Q), never negative; corners run counterclockwise as seen from the point (`AreaLight.polygon`)."""
+def _table_integrals(table, lobe, framed, light, part):
+    """Integrals (4, Q), never negative, over a `part` as of `seen_parts`, whose corners run counterclockwise as seen
+    from the point (`AreaLight.polygon`)."""
 
     # z / pi, of which the clamped cosine of mass 1 consists
     cosine = np.zeros((1, lobe.coefficients.shape[1], 1))
     cosine[0, 0 if table.family == "ltc" else coefficient_index(1, 0)] = 1.0 if table.family == "ltc" else _COSINE
 
     def integral(polygon, index):
-        part = lobe.take(index)
-        vectors = np.concatenate([part.coefficients, np.broadcast_to(cosine, part.coefficients[:1].shape)])
-        *values, plain = np.maximum(-polygon_integrals(table, part, polygon, vectors), 0.0)
+        own = lobe.take(index)
+        vectors = np.concatenate([own.coefficients, np.broadcast_to(cosine, own.coefficients[:1].shape)])
+        *values, plain = np.maximum(-polygon_integrals(table, own, polygon, vectors), 0.0)
         values[0] = np.maximum(values[0], LEAST_SHARE * plain)
         return np.stack(values)
 
+    index, polygon, _ = part
     if not light.is_profiled:
         return integral(polygon, index)
     own = lobe.take(index)
@@ -365,5 +369,5 @@ def _table_integrals(table, lobe, samples, frame, light, effort, index, polygon)
         warped = own.to_original_domain(vectors)
         return warped if own.tilt is None else tilted(warped, own.tilt)
 
-    view = light_view(samples, frame, light, index, to_lobe)
-    return _profiled(light, view, effort, index, polygon, integral, 4)
+    view = light_view(framed, light, index, to_lobe)
+    return _profiled(light, view, part, integral, 4)

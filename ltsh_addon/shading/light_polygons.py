@@ -268,17 +268,31 @@ def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bo
     return False
 
 
+@dataclass(frozen=True)
+class Framed:
+    """Samples (P) and their local frames (3, 3, P): rows tangent, bitangent, normal."""
+
+    samples: SurfaceSamples
+    frame: np.ndarray
+
+    @classmethod
+    def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> Framed:
+        """In the frames around the normals (P, 3) of one of their lobes."""
+        return cls(samples, local_frames(normal, samples.view))
+
+
 def to_local(axes, vectors):
     """World vectors (3, ..., P) in local frames (3, 3, P)."""
     return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])
 
 
-def visible_parts(samples, frame, light, corners, candidates, second_normal=None):
+def visible_parts(framed: Framed, light, corners, candidates, second_normal=None):
     """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on.
 
     Polygons are clipped at the shading horizon, and before that at the horizon of `second_normal` (P, 3). Those of a
     profiled light have two more coordinates, in the light's plane with the foot of the point as the origin.
     """
+    samples, frame = framed.samples, framed.frame
     index = in_front(samples, light, candidates)
     if len(index) == 0:
         return
@@ -302,20 +316,20 @@ def visible_parts(samples, frame, light, corners, candidates, second_normal=None
             yield index[outer][inner], clipped
 
 
-def seen_parts(samples, frame, light, corners, candidates, width, second_normal=None):
+def seen_parts(framed: Framed, light, corners, candidates, width, second_normal=None):
     """As `visible_parts`, (index, polygons, effort), with what lobes of `width` (Q,) or a number need of the light."""
-    position = samples.position[candidates].T
+    position = framed.samples.position[candidates].T
     for outline, effort, chosen in light_levels(light, corners, position, width):
         of_level = candidates if chosen is None else candidates[chosen]
-        for index, polygon in visible_parts(samples, frame, light, outline, of_level, second_normal):
+        for index, polygon in visible_parts(framed, light, outline, of_level, second_normal):
             yield index, polygon, effort
 
 
-def light_view(samples, frame, light, index, to_lobe) -> light_cone.LightView:
+def light_view(framed: Framed, light, index, to_lobe) -> light_cone.LightView:
     """The view of a profiled light from the points `index`; the first three coordinates are those of the lobe,
     to_lobe(vectors (3, Q)), the others local."""
-    axes = frame[:, :, index]
-    offset = (light.center - light.origins(samples.position[index])).T
+    axes = framed.frame[:, :, index]
+    offset = (light.center - light.origins(framed.samples.position[index])).T
 
     def along(vector):
         local = to_local(axes, np.broadcast_to(vector[:, None], offset.shape))

@@ -389,49 +389,48 @@ def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
     return values / ((warp.xx * warp.yy * warp.zz) * length**3), half, direction
 
 
-def reference_integrals(samples, cosine, frame, light, corners, candidates, error):
+def reference_integrals(framed, cosine, light, corners, candidates, error):
     """Yield (index, integrals (4, Q)) by quadrature; integrals of the same point add up. Adds to error (P,).
 
     Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
     """
-    is_anisotropic = samples.anisotropy[candidates] != 0.0
+    is_anisotropic = framed.samples.anisotropy[candidates] != 0.0
     for halves, chosen in ((False, candidates[~is_anisotropic]), (True, candidates[is_anisotropic])):
         if len(chosen):
-            halves = HalfVectors.of(samples, frame, cosine) if halves else None
-            for index, integrals, estimate in _integrals(
-                samples, (cosine, halves, False), frame, light, corners, chosen
-            ):
+            halves = HalfVectors.of(framed.samples, framed.frame, cosine) if halves else None
+            for index, integrals, estimate in _integrals(framed, (cosine, halves, False), light, corners, chosen):
                 error[index] += estimate
                 yield index, integrals
 
 
-def anisotropic_integrals(samples, halves, frame, light, corners, candidates):
+def anisotropic_integrals(framed, halves, light, corners, candidates):
     """As `reference_integrals` of anisotropic lobes, the HalfVectors of all samples, in the quick way."""
-    for index, integrals, _ in _integrals(samples, (halves.cosine, halves, True), frame, light, corners, candidates):
+    for index, integrals, _ in _integrals(framed, (halves.cosine, halves, True), light, corners, candidates):
         yield index, integrals
 
 
-def _integrals(samples, lobes, frame, light, corners, candidates):
+def _integrals(framed, lobes, light, corners, candidates):
     """Yield (index, integrals, error estimates (Q,)) for `lobes`: cosines (P,) of theta_o, the HalfVectors of
     anisotropic ones, and whether they are done in the quick way."""
+    samples, frame = framed.samples, framed.frame
     cosine, halves, quick = lobes
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
     clipped = brdf.clipped_metals(samples)
     if light.is_round:
         corners = light.polygon(QUICK_CORNERS if quick else EXACT.round_corners)
     if light.is_focused:
-        batches = _cone_parts(samples, cosine, frame, light, corners, candidates)
+        batches = _cone_parts(framed, cosine, light, corners, candidates)
     elif light.is_round and halves is None:
-        batches = _ellipses(samples, frame, light, corners, candidates)
+        batches = _ellipses(framed, light, corners, candidates)
     else:
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
-        batches = (batch for piece in pieces for batch in _polygons(samples, frame, light, piece, candidates))
+        batches = (batch for piece in pieces for batch in _polygons(framed, light, piece, candidates))
     profile = light_cone.Profile.of(light) if light.has_falloff else None
     for index, outline, cone in batches:
         if light.is_facing and not light.is_even:
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
         elif cone is None and light.has_falloff:
-            cone = _whole_cone(samples, frame, light, index, profile)
+            cone = _whole_cone(framed, light, index, profile)
         ior, metal = samples.ior[index], None
         if clipped[index].any():
             metal = [term[index] * clipped[index, None] for term in terms]
@@ -449,31 +448,32 @@ def _integrals(samples, lobes, frame, light, corners, candidates):
         yield index, integrals, estimate
 
 
-def _whole_cone(samples, frame, light, index, profile) -> Cone:
+def _whole_cone(framed, light, index, profile) -> Cone:
     """The falloff of a light without a spread, smooth all over it."""
-    axis = to_local(frame[:, :, index], -light.direction[:, None])
-    distance = ((samples.position[index] - light.center) * light.direction).sum(axis=1)
+    axis = to_local(framed.frame[:, :, index], -light.direction[:, None])
+    distance = ((framed.samples.position[index] - light.center) * light.direction).sum(axis=1)
     return Cone(axis, distance, profile, np.zeros(len(index), bool))
 
 
-def _polygons(samples, frame, light, corners, candidates):
+def _polygons(framed, light, corners, candidates):
     """Yield (index, polygons (3, V, Q) in local frames, None)."""
-    for index, polygon in visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
+    for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):
         yield index, polygon[:3], None
 
 
-def _ellipses(samples, frame, light, corners, candidates):
+def _ellipses(framed, light, corners, candidates):
     """As `_polygons`; where the geometric horizon does not cut them exact ellipses, as functions of a warp that make
     their boundaries."""
-    cut, whole, local = _uncut_ellipses(samples, frame, light, candidates)
+    cut, whole, local = _uncut_ellipses(framed, light, candidates)
     if len(whole):
         yield whole, lambda warp: EllipseBoundary.warped(warp, *local), None
-    yield from _polygons(samples, frame, light, corners, cut)
+    yield from _polygons(framed, light, corners, cut)
 
 
-def _uncut_ellipses(samples, frame, light, candidates):
+def _uncut_ellipses(framed, light, candidates):
     """Split the candidates: (those whose light is cut by the geometric horizon, the others that see it, for these the
     center and half axes in local frames)."""
+    samples, frame = framed.samples, framed.frame
     index = in_front(samples, light, candidates)
     offset = (light.center - light.origins(samples.position[index])).T
     half_u, half_v = light.half_u[:, None], light.half_v[:, None]
@@ -497,14 +497,14 @@ def _ellipse_extent(normal, ellipse):
     return dot(normal, offset), np.hypot(dot(normal, half_u), dot(normal, half_v))
 
 
-def _cone_parts(samples, cosine, frame, light, corners, candidates):
+def _cone_parts(framed, cosine, light, corners, candidates):
     """As `_polygons`, with the cone: the part of a light in the cone of each point, cut in two where both the foot, at
     which the factor has its tip, and the peak of the lobe lie in it."""
     profile = light_cone.Profile.of(light)
     tangent = profile.tangent
-    for index, polygon in visible_parts(samples, frame, light, corners, candidates, samples.geometric_normal):
-        warp = limit_warp(cosine[index], samples.roughness[index] ** 2)
-        view = light_view(samples, frame, light, index, warp.to_original_domain)
+    for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):
+        warp = limit_warp(cosine[index], framed.samples.roughness[index] ** 2)
+        view = light_view(framed, light, index, warp.to_original_domain)
         near = np.nonzero(light_cone.DiskParts(polygon[3:]).least < tangent * view.distance)[0]
         if len(near) == 0:
             continue

@@ -95,6 +95,10 @@ def f82_reflectance(cosine, f0, f90, dip):
     return f0 + schlick_curve(cosine) * (f90 - f0 - dip * cosine * (1.0 - cosine))
 
 
+# Of c (1 - c)^6 on [0, 1], rounded up.
+MOST_OF_DIP = 0.0567
+
+
 def clipped_metals(samples):
     """Mask (P,) of the samples that are F82 metals alone, and clipped at 0 where their reflectance falls below."""
     if not samples.specular_dip.any():
@@ -105,7 +109,9 @@ def clipped_metals(samples):
 def is_clipped(f0, f90, dip):
     """Where (P,) the reflectance of F82 metals, each (P, 3), falls below 0 at some angle."""
     found = np.zeros(len(f0), bool)
-    at = np.nonzero((dip > 0.0).any(axis=-1))[0]
+    # What the dip takes away can bring only these below 0: the angles of the others need not be tried.
+    may_fall = np.minimum(f0, f90) < MOST_OF_DIP * np.maximum(dip, 0.0)
+    at = np.nonzero((dip > 0.0).any(axis=-1) & may_fall.any(axis=-1))[0]
     cosines = np.linspace(0.0, 1.0, 33)[:, None, None]
     if len(at):
         found[at] = f82_reflectance(cosines, f0[at], f90[at], dip[at]).min(axis=(0, 2)) < 0.0

@@ -9,6 +9,7 @@ from surface_scenes import area_light, random_samples, single_sample, unit
 from test_single_precision import assert_close
 
 from ltsh_addon import shading
+from ltsh_addon.shading import brdf
 
 # Overhead, and low beyond the point: at grazing angles the terms differ most.
 LOW = {"center": (-1.6, 0.1, 0.35), "half_u": (0, 0.5, 0), "half_v": (0, 0, 0.25), "radiance": (1.0, 1.0, 1.0)}
@@ -132,3 +133,15 @@ def test_terms_that_cancel_leave_nothing_below_zero(technique, dtype):
     assert (found == 0.0).all(axis=2).any(), "nothing was clamped: the test shows nothing"
     bright = shading.shade(replace(samples, specular_dip=np.zeros((150, 3))), lights, technique, dtype=dtype).specular
     assert bright.max() > 0.0
+
+
+def test_metals_that_fall_below_black_are_found_among_all_and_others_are_not():
+    generator = np.random.default_rng(3)
+    f0 = generator.uniform(0.0, 1.0, (20_000, 3)) ** 3
+    dip = f82_dip(f0, generator.uniform(0.0, 1.2, f0.shape))
+    cosine = np.linspace(0.0, 1.0, 501)[:, None, None]
+    least = (f0 + (1.0 - f0) * (1.0 - cosine) ** 5 - dip * cosine * (1.0 - cosine) ** 6).min(axis=(0, 2))
+    found = brdf.is_clipped(f0, np.ones_like(f0), dip)
+    # The angles that are tried are 1/32 apart: next to them the reflectance differs by less than 0.01.
+    assert found[least < -0.01].all() and not found[least >= 0.0].any()
+    assert 0.02 < found.mean() < 0.98

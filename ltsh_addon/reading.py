@@ -106,7 +106,7 @@ def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.n
         raise Malformed(f"is no .npz: {error_line(error)}") from None
 
 
-# -- what a document must have --------------------------------------------------------------------------------------
+# What a document must have:
 
 
 def check(value: Any, shape: Any, place: str = "") -> None:
@@ -171,7 +171,7 @@ def _shown(value) -> str:
     return shortened(repr(value), 60)
 
 
-# -- what any file may hold -----------------------------------------------------------------------------------------
+# What any file may hold:
 
 
 def is_text(name: str | os.PathLike) -> bool:

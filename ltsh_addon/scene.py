@@ -64,7 +64,7 @@ TECHNIQUES = {
     "ltsh4": Technique(
         "LTSH 4",
         "LTSH N=4",
-        "Linearly transformed spherical harmonics of degree 4: accurate, 1.6 times the time of LTC",
+        "Linearly transformed spherical harmonics of degree 4: accurate, 1.5 to 2 times the time of LTC",
     ),
     "ltsh4c": Technique(
         "LTSH 4c",

@@ -340,7 +340,7 @@ def _disk_lights():
 
 def _integrals_over_disks(view, tangent, alphas):
     """Integrals (D,) of one anisotropic lobe: visible normals of GGX (Dupuy and Benyoub 2023), of which each stands for
-    as much, times what of them is masked."""
+    as much, times the share of them that is masked."""
     frame = np.stack([tangent, np.cross([0.0, 0.0, 1.0], tangent), [0.0, 0.0, 1.0]])
     own, stretch = frame @ view, np.array([*alphas, 1.0])
     axis = own * stretch / np.linalg.norm(own * stretch)

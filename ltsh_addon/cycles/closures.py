@@ -46,7 +46,7 @@ def glass_albedos(inside: bool) -> GlassAlbedos:
 
 
 def _visible_normals(alpha, cosine):
-    """Normals (N, C, 3) that are seen under `cosine` (C,), the view having y = 0, evenly by probability."""
+    """Visible normals (N, C, 3) for views with y = 0 and `cosine` (C,), each as probable as the others."""
     steps = (np.arange(NORMALS_PER_AXIS) + 0.5) / NORMALS_PER_AXIS
     radius, turn = np.meshgrid(np.sqrt(steps), 2.0 * np.pi * steps)
     s, t = (radius * np.cos(turn)).reshape(-1, 1), (radius * np.sin(turn)).reshape(-1, 1)

@@ -83,7 +83,7 @@ def end_at_horizons_of_cycles(
     is_baked: bool = False,
     is_quick: bool = False,
 ) -> tuple[SurfaceSamples, np.ndarray]:
-    """Samples (Q) whose specular lobes end where those of Cycles do, and of which of `samples` (P) each is, (Q,).
+    """Samples (Q) whose specular lobes end where those of Cycles do, and for each the index (Q,) of its sample (P).
 
     Between the horizons of the smooth normal and of the mesh Cycles counts directions that a light chose above the
     former, and directions that the surface chose above the latter, each with its weight of multiple importance
@@ -124,7 +124,8 @@ def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
 
 
 def _with_few_splits(share: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """The shares (P,) of `smooth_share`, of which as many are 0 or 1 as change UNSPLIT of what splitting changes."""
+    """The shares (P,) of `smooth_share`, rounded to 0 or 1 where splitting changes least: all these together change
+    UNSPLIT of what splitting every sample would."""
     changed = np.minimum(share, 1.0 - share) * excess
     order = np.argsort(changed)
     sums = np.cumsum(changed[order])
@@ -274,7 +275,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
-        """Those of the numbers, which are alike, and of which a `share` (L,) shines."""
+        """The lights of these numbers, which are of one kind; a `share` (L,) of each shines."""
         own = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)

@@ -225,7 +225,7 @@ class KeptPicture:
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
-    # (H, W, 3), or 4 with alpha, by light group: its bounced light; by "": what hangs on no light.
+    # (H, W, 3), or 4 with alpha, by light group: its bounced light; by "": what depends on no light.
     rest: dict[str, np.ndarray] = field(default_factory=dict)
     taken: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W) by pass; left out: 1
     # The same, of lights where they were: by what hard edges differ from those of the samples.

@@ -36,7 +36,7 @@ _FRAME_DIGITS = re.compile(r"0?(?:[1-9]\d?)?d?", re.ASCII)
 _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 
 
-# -- from text to values: each raises ValueError with what was found and what was expected --------------------------
+# From text to values: each raises ValueError with what was found and what was expected.
 
 
 def techniques(text: str) -> tuple[str, ...]:
@@ -243,7 +243,7 @@ def _name(pattern: str, known: tuple[str, ...]) -> str:
     return pattern
 
 
-# -- declaring options ----------------------------------------------------------------------------------------------
+# Declaring options:
 
 
 @dataclass(frozen=True)
@@ -471,7 +471,7 @@ class RenderOptions(CameraOptions):
     scripts: bool = _scripts()
 
 
-# -- what follows from the declarations -----------------------------------------------------------------------------
+# What follows from the declarations:
 
 
 def arguments_of(kind: type) -> dict[str, tuple[Any, tuple[Argument, ...]]]:

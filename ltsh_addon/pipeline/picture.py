@@ -363,7 +363,7 @@ class Comparison:
         """Pixels (H, W) that see a surface and, for a subset, were evaluated."""
         return self._film_of(result).coverage() > 0.0
 
-    # -- figures ------------------------------------------------------------------------------------------------------
+    # Figures:
 
     def report(self) -> dict:
         """The report as a JSON-able document."""
@@ -440,7 +440,7 @@ class Comparison:
             report[label] = imaging.error_statistics(values, truth, mask).to_dict()
         return report
 
-    # -- files --------------------------------------------------------------------------------------------------------
+    # Files:
 
     def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> list[str]:
         """Write all files into the folder `output`, once all that goes into them is there; their names."""

@@ -238,7 +238,7 @@ def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
     return replace(light, radiance=light.radiance * factor, detail=detail)
 
 
-# -- the mixer --------------------------------------------------------------------------------------------------------
+# The mixer:
 
 MIXER_FILE = "lights.npz"
 # Rows of a mixer, and of large pictures: of more lights the weakest are one. Values of all of its pictures.
@@ -477,8 +477,7 @@ class Mixer:
                     out[lines] += np.multiply(self._layers[row, lines], tile, out=term[: len(out[lines])])
 
 
-# -- lights that have moved -------------------------------------------------------------------------------------------
-
+# Lights that have moved:
 
 # So many, that all processes take about as long; with fewer samples a block costs more than they do.
 BLOCKS, FEWEST_OF_BLOCK = 16, 1 << 11

@@ -425,7 +425,7 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
 
 
 def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.ndarray) -> dict:
-    """`rest`, `taken` and `edges` of a KeptPicture: Cycles' part of an edge hangs on the lights as ours does."""
+    """`rest`, `taken` and `edges` of a KeptPicture: Cycles' part of an edge depends on the lights as ours does."""
     taken = {name: np.where(part.is_taken, part.certain, 0.0) for name, part in ours.items()}
     part = ours["diffuse"]
     if np.ndim(part.weight) == 0:

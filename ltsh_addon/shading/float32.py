@@ -147,11 +147,11 @@ class Lobes:
     limits: TailLimits | None = None
     sharpest: small_lights.SharpestLobes | None = None  # of specular lobes
     only_tails: bool = False  # elsewhere single precision does not suffice
-    others: tuple = ()  # (Q,) each: what they hang on but for rows and widths
+    others: tuple = ()  # (Q,) each: what they depend on beside rows and widths
 
     @cached_property
     def shape(self) -> np.ndarray:
-        """What the lobes hang on (S, Q), by the lengths over which they change."""
+        """What the lobes depend on (S, Q), by the lengths over which they change."""
         rows = [self.rows[row] / self.lengths[row] for row in self.clip_rows]
         if self.sharpest is not None:
             rows += [self.sharpest.mirrored / self.sharpest.width, np.log(self.sharpest.width)[None]]
@@ -419,7 +419,7 @@ class _Lighting:
 def shade_pairs(samples, members, number, lights, shade_in_float64):
     """Yield (pairs (Q,), radiance (Q, 3)) of samples `members` (N,) under the one light each that `number` (N,) says.
 
-    Lights with equally many corners make one batch, but for those whose corners hang on the sample.
+    Lights with equally many corners make one batch, but for those whose corners depend on the sample.
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):

@@ -284,7 +284,7 @@ class _Result:
         self._leftovers[block.start] = leftovers
 
     def pairs(self) -> list[parallel.Pairs]:
-        """What all blocks have left, in batches. Neither these nor the order in them hangs on which block was done
+        """What all blocks have left, in batches. Neither these nor the order in them depends on which block was done
         first, and all that is left of a block is in one of them."""
         found = []
         for name in self._task.passes:

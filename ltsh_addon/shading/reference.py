@@ -202,9 +202,7 @@ class Cone:
 
 def lobe_integrals(
     make_boundary,
-    cos_theta_o,
-    alpha,
-    ior,
+    setting: tuple[np.ndarray, np.ndarray, np.ndarray],
     *,
     effort: Effort = EXACT,
     cone: Cone | FacingEmission | None = None,
@@ -212,13 +210,14 @@ def lobe_integrals(
 ):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
-    `make_boundary(warp)` returns the boundary, warped, of the part with z >= 0 of each light in the local frame of
-    cos_theta_o (P,). The rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of a dielectric of relative
-    `ior` (P,). The order grows until two successive orders differ by less than the tolerance of the first row plus
-    1e-6; the estimate is the last difference, infinite after one order. Lights must be convex. With a `cone` the
-    integrand has its factor, too. With a `metal`, f0, f90 and dip (P, 3), come three rows more: what its reflectance
-    falls below 0.
+    `setting` are cos_theta_o, alpha and the relative ior of a dielectric, (P,) each. `make_boundary(warp)` returns the
+    boundary, warped, of the part with z >= 0 of each light in the local frame of cos_theta_o. The rows have the Fresnel
+    factors 1, (1 - c)^5, c (1 - c)^6 and that of the dielectric. The order grows until two successive orders differ by
+    less than the tolerance of the first row plus 1e-6; the estimate is the last difference, infinite after one order.
+    Lights must be convex. With a `cone` the integrand has its factor, too. With a `metal`, f0, f90 and dip (P, 3), come
+    three rows more: what its reflectance falls below 0.
     """
+    cos_theta_o, alpha, ior = setting
     warp = limit_warp(cos_theta_o, alpha)
     boundary = make_boundary(warp)
     apex = boundary.apex()
@@ -231,10 +230,10 @@ def lobe_integrals(
         batch = max(_BATCH // (boundary.pieces * order[0] * order[1]), 1)
         for start in range(0, len(open_points), batch):
             index = open_points[start : start + batch]
-            setting = (warp.take(index), cos_theta_o[index], np.maximum(alpha[index], MIN_ALPHA), ior[index])
+            here = (warp.take(index), cos_theta_o[index], np.maximum(alpha[index], MIN_ALPHA), ior[index])
             its_cone = None if cone is None else cone.take(index)
             its_metal = None if metal is None else [term[index] for term in metal]
-            value = _fixed_order(order, boundary.take(index), apex[:, index], setting, its_cone, its_metal)
+            value = _fixed_order(order, boundary.take(index), apex[:, index], here, its_cone, its_metal)
             if level > 0:
                 error[index] = np.abs(value - result[:, index]).max(axis=0)
             result[:, index] = value
@@ -285,7 +284,7 @@ def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal
 
 
 def _taken(part, index, dtype):
-    """Those of the points `index` of what is None, numbers (P, ...) or has `take`, in `dtype` but for cones."""
+    """The points `index` of `part`: None, an array (P, ...) or an object with `take`; in `dtype`, cones as they are."""
     if isinstance(part, HalfVectors):
         return part.take(index).astype(dtype)
     if isinstance(part, list):
@@ -442,7 +441,7 @@ def _integrals(framed, lobes, light, corners, candidates):
                 partial(PolygonBoundary.warped, polygon=outline) if isinstance(outline, np.ndarray) else outline
             )
             setting = (cosine[index], samples.roughness[index] ** 2, ior)
-            integrals, estimate = lobe_integrals(make_boundary, *setting, cone=cone, metal=metal)
+            integrals, estimate = lobe_integrals(make_boundary, setting, cone=cone, metal=metal)
         if light.is_facing:
             integrals *= FacingDisk.of(light, (light.center - samples.position[index]).T, frame[2][:, index]).gain
         yield index, integrals, estimate

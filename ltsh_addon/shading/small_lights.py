@@ -4,7 +4,7 @@ The integral is the lobe at the center times the solid angle. What that neglects
 by the length over which the integrand changes: the distance, and for specular lobes their width, or the angle from
 their peak where that is larger. For a cosine or the peak of GGX it is 2/3 LARGEST^2 = 0.2 % of the light, which has
 then 2 LARGEST^2 sr at most: 3e-6 per unit of radiance.
-Arrays broadcast over what stands for "...": lights, samples or both.
+The dots in shapes (...) stand for lights, samples or both, over which arrays broadcast.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class _Translation:
                 parts.append(self._take())
         return "".join(parts)
 
-    # -- tokens ---------------------------------------------------------------------------------------------------
+    # Tokens:
 
     def _take(self) -> str:
         self._at += 1
@@ -93,7 +93,7 @@ class _Translation:
             found.append(self._take())
         return "".join(found)
 
-    # -- declarations ---------------------------------------------------------------------------------------------
+    # Declarations:
 
     def _structure(self) -> str:
         self._word()
@@ -137,7 +137,7 @@ class _Translation:
         start = body.index("{") + 1
         return f"fn {name}({listed}){returned}{body[:start]}{''.join(copies)}{body[start:]}"
 
-    # -- statements -----------------------------------------------------------------------------------------------
+    # Statements:
 
     def _block(self) -> str:
         """Statements up to the closing brace, with what stands before the opening one."""
@@ -176,7 +176,7 @@ class _Translation:
                 target += f"{self._expression(']')}]"
         return f"{target} {self._word()} {self._expression(';')};"
 
-    # -- expressions ----------------------------------------------------------------------------------------------
+    # Expressions:
 
     def _expression(self, end: str) -> str:
         """An expression up to `end`, which is taken; several where commas are in it."""

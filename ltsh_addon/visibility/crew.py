@@ -103,7 +103,7 @@ class _Tracing(parallel.Helper):
         return (self.ask(self._blocks[number]),)
 
 
-# -- processes that stay ----------------------------------------------------------------------------------------------
+# Processes that stay:
 
 # Blocks that a mate has ahead: it need not wait for this process, and little is done in vain when a picture is stopped.
 AHEAD = 2

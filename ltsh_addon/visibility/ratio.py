@@ -6,7 +6,7 @@ light, w what the pass makes of the light along them, over the density of the ra
 
 A few probes go to every pair of a sample and a light. Those that all arrive, or are all blocked, settle it, unless a
 neighbor in the picture found otherwise. The pairs that are left take as many rays as they are worth by their light.
-Nothing hangs on where a sample stands in a picture or a block but which samples are its neighbors there.
+The place of a sample in a picture or a block decides nothing but which samples are its neighbors there.
 """
 
 from __future__ import annotations

@@ -284,7 +284,7 @@ class EmbreeCaster:
         return packets.get(FAR, count) < 0.0  # Embree writes -inf
 
     def closest(self, is_clear: bool, origins, directions, near, far, masks) -> Hits:
-        """What the rays meet first from `near` to `far` of what is transparent, or of what blocks."""
+        """The first hits of the rays from `near` to `far`: on transparent surfaces, or on those that block."""
         packets, count, scene = self._hits, len(origins), self._scenes[is_clear]
         for row, values in ((ORIGIN, origins), (NEAR, near), (DIRECTION, directions), (FAR, far), (MASK, masks)):
             packets.set(row, values)
@@ -384,7 +384,7 @@ class Tracer:
             return self._finder.starts(samples)
 
 
-# -- which library --------------------------------------------------------------------------------------------------
+# Which library:
 
 _trusted: dict[str, _Embree] = {}
 

@@ -166,9 +166,9 @@ class Starts:
     ) -> tuple[np.ndarray, ...]:
         """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
 
-        They end at `distances`, finite, along `directions` from the sample, wherever they start. What they are aimed at
-        may be met itself where it is `at_surface`: rays that start but the clearance above the sample would meet faces
-        that they graze too early.
+        They end at `distances`, finite, along `directions` from the sample, wherever they start. Rays that start only
+        the clearance above the sample keep their direction. Not so where they end on a face that is itself in the way
+        (`at_surface`), as those of lamps are: at a grazing angle they would meet it too early.
         """
         origins = self.origins_of_rows(index, directions)
         moved = origins - self.position[index].T[:, None]

@@ -66,7 +66,7 @@ QUICK = Settings(size=(128, 72), cycles_samples=128, most_rays=256)
 LARGE = Settings(size=(640, 360), cycles_samples=4096, most_rays=1024)
 
 
-# -- processes ---------------------------------------------------------------------------------------------------------
+# Processes:
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def rendered(path) -> np.ndarray:
     return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
 
 
-# -- errors ------------------------------------------------------------------------------------------------------------
+# Errors:
 
 
 @dataclass(frozen=True)
@@ -289,7 +289,7 @@ def errors(scene: Measured):
     return {name: 0.5 * (first[name] + second[name]) for name in PASSES}
 
 
-# -- equal time --------------------------------------------------------------------------------------------------------
+# Equal time:
 
 
 def equal_time(scene: Measured, path, folder):
@@ -332,7 +332,7 @@ def equal_time(scene: Measured, path, folder):
     return images
 
 
-# -- cost --------------------------------------------------------------------------------------------------------------
+# Cost:
 
 
 class TimedTracer:
@@ -445,7 +445,7 @@ def memory_and_cores(path, folder, settings):
           f"{os.getloadavg()[0]:.1f}")  # fmt: skip
 
 
-# -- pictures ----------------------------------------------------------------------------------------------------------
+# Pictures:
 
 
 def error_sheet(name, scene, ours, folder):

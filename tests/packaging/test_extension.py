@@ -42,7 +42,7 @@ def test_blender_accepts_the_manifest():
 
 @needs_tool
 def test_the_zip_holds_the_add_on_and_nothing_else(tmp_path):
-    """On a copy with one file of every kind, so that the answer does not hang on what lies in this clone."""
+    """On a copy with one file of every kind, so that the answer does not depend on what lies in this clone."""
     source = tmp_path / "source"
     kept = ["__init__.py", "LICENSE", "README.md", *MANUAL, "ltsh_addon/__init__.py", "ltsh_addon/blender/x.py",
             "ltsh_addon/blender/glsl/x.glsl", "ltsh_addon/shading/glsl/x.h", "tables/a.npz"]  # fmt: skip

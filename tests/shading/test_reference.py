@@ -73,7 +73,8 @@ def quadrature(light, round_light, **options):
             return EllipseBoundary.warped(warp, center[:, None], half_u[:, None], half_v[:, None])
         return PolygonBoundary.warped(warp, corners(center, half_u, half_v).T[:, :, None])
 
-    values, error = lobe_integrals(boundary, np.array([cosine]), np.array([roughness**2]), np.array([ior]), **options)
+    setting = np.array([cosine]), np.array([roughness**2]), np.array([ior])
+    values, error = lobe_integrals(boundary, setting, **options)
     return values[:, 0], error[0]
 
 

@@ -62,7 +62,7 @@ class Case:
     signal_after: tuple[int, float] | None = None  # a real process then, which gets this signal
 
 
-# -- what is damaged, and how; nothing may name a device, or a place outside of the folder of all cases --------------
+# What is damaged, and how; nothing may name a device, or a place outside of the folder of all cases:
 
 TEXTS = [
     "", " ", ".", "-", "--", "~", "\n", "a\nb", "\0", "\ufeff", "é" * 90, "x" * 300, "%s%n", "{}", "\\",
@@ -172,7 +172,7 @@ def replace_file(generator, path: Path) -> None:
         )
 
 
-# -- kinds of cases: each takes a generator and the folder, changes files there, and returns a Case ------------------
+# Kinds of cases: each takes a generator and the folder, changes files there, and returns a Case.
 
 
 def name_patterns(generator, folder):
@@ -429,7 +429,7 @@ KINDS = {
 SEQUENCE = [*KINDS.values(), merged, baselines, job_files, tables, merged]
 
 
-# -- the folder that cases begin with --------------------------------------------------------------------------------
+# The folder that cases begin with:
 
 
 def build(folder: Path) -> None:
@@ -496,7 +496,7 @@ def stand_in() -> None:
     ]
 
 
-# -- running ---------------------------------------------------------------------------------------------------------
+# Running:
 
 
 @dataclass(frozen=True)

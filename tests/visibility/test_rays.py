@@ -233,7 +233,7 @@ def test_what_is_no_mesh_is_refused():
         Occluders((OccluderMesh(np.zeros((3, 3)), [[0, 1, 2]]),), [1], np.zeros((1, 3, 4)))
 
 
-# -- where rays start --
+# Where rays start:
 
 
 def directions_around(normals, rng, per_sample):

@@ -71,7 +71,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     # With the GPU's context Blender's window would stand still during a final render.
     bl_use_gpu_context = False
 
-    # -- viewport -----------------------------------------------------------------------------------------------------
+    # Viewport:
 
     def view_update(self, context, depsgraph):
         """Take over what has changed in the scene."""
@@ -86,7 +86,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self._view = EngineView()
         return self._view
 
-    # -- final render -------------------------------------------------------------------------------------------------
+    # Final render:
 
     def __init__(self, *arguments, **keywords):
         super().__init__(*arguments, **keywords)

@@ -21,7 +21,7 @@ from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of,
 from ..materials.values import Value, combined, constant, is_gray, is_srgb, product, value_at
 from ..render_settings import cycles_setting
 
-# The place of what is not points.
+# Stands for the place of occluders that are not points.
 AS_IT_IS = np.eye(4)[None]
 # Names of a kind in a warning.
 NAMED = 3
@@ -63,7 +63,7 @@ class _Collector:
         self._there: dict[tuple, tuple[int, str]] = {}
         self._materials: dict[str, _Clear | None] = {}
         self._images: dict[tuple, np.ndarray] = {}
-        # Kinds of what is not as in Cycles, with names.
+        # Names of the objects that do not block as in Cycles, by kind.
         self._notes: dict[str, dict[str, None]] = {}
 
     def collect(self, warn) -> Occluders:
@@ -128,7 +128,7 @@ class _Collector:
         if first is not own and _is_same(mesh, self._meshes[first[0]]):
             self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
 
-    # -- surfaces --
+    # Surfaces:
 
     def _add(self, instance, matrix) -> None:
         ob = instance.object
@@ -207,7 +207,7 @@ class _Collector:
             self._images[key] = _shares_of_image(value)
         return self._images[key]
 
-    # -- hair of particle systems --
+    # Hair of particle systems:
 
     def _add_hair(self, instance) -> None:
         ob = instance.object
@@ -250,7 +250,7 @@ def _is_same(mesh, other):
     )
 
 
-# -- what materials let through ------------------------------------------------------------------------------------
+# What materials let through:
 
 
 @dataclass(frozen=True)
@@ -354,7 +354,7 @@ def _shape_key(ob) -> tuple:
     return owner, original, data.as_pointer(), len(data.vertices) if is_mesh else 0
 
 
-# -- shapes --------------------------------------------------------------------------------------------------------
+# Shapes:
 
 
 def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
@@ -533,6 +533,6 @@ def _ball():
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     triangles = np.array(triangles)
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    # The mean shadow of what is convex is a quarter of its surface.
+    # The mean shadow of a convex body is a quarter of its surface.
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     return vertices * math.sqrt(4.0 * math.pi / area), triangles

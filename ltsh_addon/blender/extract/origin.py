@@ -85,7 +85,7 @@ def _places(depsgraph) -> list[tuple]:
 
 
 def _moved(scene, origin: np.ndarray, places) -> list[str]:
-    """Move the scene by -origin; names of what did not follow, where all is as before."""
+    """Move the scene by -origin. Where something does not follow all is put back, and its names are returned."""
     roots = [ob for ob in scene.objects if ob.parent is None]
     collections = {collection for ob in scene.objects for collection in ob.users_collection}
     before = {ob: tuple(ob.delta_location) for ob in roots}
@@ -114,7 +114,7 @@ def _moved(scene, origin: np.ndarray, places) -> list[str]:
 
 
 def _lost(before, after, origin) -> list[str]:
-    """Names of what is not where it was less `origin`."""
+    """Names of the objects that have not moved by -origin."""
     if [key for key, _ in before] != [key for key, _ in after]:
         return [name for name, _ in dict.fromkeys(key for key, _ in before)]
     lost = {}

@@ -86,7 +86,7 @@ def affordable_points(seconds: float, pixels: int, lights: int) -> int:
     return max(int(POINTS_SHARE * seconds / each), 1) if DIRECT_SHARE * seconds > START_SECONDS + each else 0
 
 
-# Passes of Cycles with what of the picture is no reflected light.
+# Passes of Cycles with the parts of the picture that are not reflected light.
 REST_PASSES = ("emit", "environment")
 # File with what stands in the way of light.
 OCCLUDERS = "occluders.npz"

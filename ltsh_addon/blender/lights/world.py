@@ -245,5 +245,5 @@ def _as_surfaces_see(world, name: str, warn) -> None:
     if unclear:
         warn(
             f"world {name!r}: its light depends on {listed(sorted(unclear))} of a Light Path node, of which Cycles "
-            "takes a mixture that hangs on how it samples; shaded as for rays that are none of these"
+            "takes a mixture that depends on how it samples; shaded as for rays that are none of these"
         )

@@ -308,7 +308,7 @@ def inject_aovs(
 
 
 def _write_hit(material) -> None:
-    """AOVs of what a hit has once, however many lobes."""
+    """AOVs that a hit has once, however many lobes it has."""
     tree = material.node_tree
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
     receiver = tree.nodes.new("ShaderNodeAttribute")

@@ -179,7 +179,7 @@ def is_emission(node) -> bool:
 
 
 def notes_of(node) -> list[str]:
-    """What a shader node is shaded as and what of it is not shaded, where that is not what Cycles does."""
+    """How the shading of a node differs from that of Cycles: what it is shaded as, and which parts are left out."""
     bsdf = bsdf_of(node)
     if bsdf is None:
         return [f"node {node.name!r} {NOT_SUPPORTED}"]

@@ -32,7 +32,7 @@ NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specula
 ROUGH_KINDS = ("principled", "diffuse")
 # The kind of a lobe that is the coat of another one; all others are those of `cycles.lobes.LOBE_KINDS`.
 COAT = "coat"
-# That of what only lets light through.
+# The kind of nodes that only let light through.
 REFRACTION = "refraction"
 
 
@@ -96,7 +96,7 @@ class Look:
     brush: Brush | None = None  # None: isotropic
     sheen: tuple[float, float] | None = None  # over it and its coat: the largest weight of a color, and its roughness
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    glow: float = 0.0  # of what shines with the image of its color, and has no lobe: by so much
+    glow: float = 0.0  # strength of a material that only shines, with the image of its color
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
@@ -194,7 +194,7 @@ class Share:
     constant: float = 1.0
     image: Value | None = None
     curve: ViewFactor | None = None
-    shining: float = 1.0  # about how much of what emits is seen: on average, less what transparency takes
+    shining: float = 1.0  # about which share of its emission is seen, on average and behind transparency
 
     @property
     def estimate(self) -> float:

@@ -128,7 +128,7 @@ def embree_libraries() -> list[Path]:
 
 
 def denoiser_libraries() -> list[Path]:
-    """The same of Open Image Denoise 2, first the one to call: the names of its parts are longer."""
+    """The same for Open Image Denoise 2. The library to call comes first: the names of its parts are longer."""
     return _brought_along("OpenImageDenoise")
 
 
@@ -234,9 +234,9 @@ _kept: ContextVar[BlenderProcess | None] = ContextVar("kept Blender", default=No
 
 @contextlib.contextmanager
 def kept_blender(folder: Path):
-    """Meanwhile one Blender does all jobs of this thread, which saves its start; `folder` is its temporary one.
+    """Meanwhile one Blender does all jobs of this thread, which saves starting others; `folder` is its temporary one.
 
-    A Blender that is kept already goes on doing them.
+    Within another `kept_blender` the Blender of that one does them.
     """
     if (kept := _kept.get()) is not None:
         kept.temporary.append(folder)

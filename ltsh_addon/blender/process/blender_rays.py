@@ -54,7 +54,7 @@ class BlenderCaster:
         return found
 
     def closest(self, is_clear: bool, *rays: np.ndarray) -> Hits:
-        """What rays (origins, directions, near, far, masks) meet first of what is transparent, or of what blocks."""
+        """First hits of rays (origins, directions, near, far, masks), on transparent surfaces or on those that block."""
         for name, values in zip(RAYS, rays, strict=True):
             save_array(self._folder / f"{name}.npy", values)
         job = {"task": "rays", "occluders": str(self._occluders), "is_clear": is_clear}
@@ -62,7 +62,7 @@ class BlenderCaster:
         return Hits(*(np.load(self._folder / f"{field.name}.npy") for field in fields(Hits)))
 
 
-# -- in the second Blender -----------------------------------------------------------------------------------------
+# In the second Blender:
 
 # Blender takes places and distances in single precision.
 FARTHEST_RAY = 1e18

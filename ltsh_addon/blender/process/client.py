@@ -49,7 +49,7 @@ class ExtractOptions:
     scene_name: str | None = None
     view_layer: str | None = None
     scripts: bool = False  # run those of the file
-    rest: bool = False  # also what of the picture is no reflected light
+    rest: bool = False  # also the parts of the picture that are not reflected light
     indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
@@ -120,7 +120,7 @@ class Extraction:
 
     @property
     def rest(self) -> np.ndarray | None:
-        """What of the picture (H, W, 4) is no reflected light, times the exposure: emission, lights in sight, world.
+        """The part of the picture (H, W, 4) that is not reflected light (emission, lights in sight, world), exposed.
 
         With all reflected light it is the picture that Cycles makes of the file. None where it was not asked for.
         """

@@ -50,7 +50,7 @@ def _answer(job: dict, folder: Path, progress) -> dict:
     files = _module("files")
     try:
         manifest = _perform(job, folder, progress)
-        # Of this job and of what was before it since the last manifest, the start of Blender included.
+        # Since the last manifest: with the start of Blender in the first one.
         manifest["processor_seconds"] = time.process_time() - _told[0]
         _told[0] = time.process_time()
         (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")

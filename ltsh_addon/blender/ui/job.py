@@ -422,7 +422,7 @@ class Job:
         """Remove what the job wrote for itself."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    # -- what is shown ------------------------------------------------------------------------------------------------
+    # What is shown:
 
     def seconds(self) -> float:
         """Since the start."""

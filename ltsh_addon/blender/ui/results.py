@@ -208,7 +208,7 @@ def _stored(settings, key: str, value: str):
     return value if items is None else items[value].value
 
 
-# -- the light mixer --------------------------------------------------------------------------------------------------
+# The light mixer:
 
 # Of the picture that was asked for last, and what shades lights that have moved.
 _mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}

@@ -347,7 +347,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
-    # -- what the Image Editor shows of it ----------------------------------------------------------------------------
+    # What the Image Editor shows of it:
+
     mode: EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
     )

@@ -106,7 +106,7 @@ def assert_as_cycles(folder, note="", least=0.03, most_doubtful=0.35):
     return occluders
 
 
-# -- shapes --
+# Shapes:
 
 
 def cube(location=(0.0, 0.0, 1.0), size=1.0, material=None):
@@ -262,7 +262,7 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
     assert warnings == [] and len(occluders.mesh) == 1  # the floor
 
 
-# -- materials --
+# Materials:
 
 
 def pane(material):
@@ -461,7 +461,7 @@ def test_what_is_not_as_in_cycles_is_named(name):
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 
-# -- hair and points --
+# Hair and points:
 
 
 def test_points_have_the_shadow_of_balls(tmp_path):
@@ -501,7 +501,7 @@ def test_hair_of_particles_has_the_shadow_of_tubes(tmp_path):
     assert_mean_shadow(tmp_path, "tubes", 0.015)
 
 
-# -- lights --
+# Lights:
 
 
 def two_lights(key_blockers=None, fill_blockers=None):

@@ -273,7 +273,7 @@ def test_single_precision_knows_narrow_polygons(name, corners):
 
 @table_names
 def test_single_precision_counts_figures_of_eight_as_double_does(name):
-    """The sign of what remains of the halves is that of their solid angles, whatever the lobe makes of them; those whose
+    """What remains of the halves has the sign of their solid angles, whatever the lobe makes of them; those whose
     halves are about equal are left out."""
     generator = np.random.default_rng(14)
     polygons = random_rectangles(generator, 2000, crossing=True)[:, [0, 2, 1, 3]]

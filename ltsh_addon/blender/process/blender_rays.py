@@ -54,7 +54,7 @@ class BlenderCaster:
         return found
 
     def closest(self, is_clear: bool, *rays: np.ndarray) -> Hits:
-        """First hits of rays (origins, directions, near, far, masks): on transparent surfaces, or on ones that block."""
+        """First hits of rays (origins, directions, near, far, masks): on transparent surfaces, or on what blocks."""
         for name, values in zip(RAYS, rays, strict=True):
             save_array(self._folder / f"{name}.npy", values)
         job = {"task": "rays", "occluders": str(self._occluders), "is_clear": is_clear}

@@ -248,30 +248,54 @@ _WAYS = {
 }
 
 
+def _loop(way: str, body: Iterable[str]) -> Iterator[str]:
+    """A loop over the lights that `ltsh_todo` has for a way. It runs once without any, then left is 0."""
+    yield f"    left = todo.{way};"
+    yield "    do {"
+    yield "        number = ltsh_next(left);"
+    yield "        int header = ltsh_header(place.z + number);"
+    yield "        ltsh_light light = ltsh_seen_light(header, point);"
+    yield from (f"        {line}" for line in body)
+    yield "        left &= left - 1u;"
+    yield "    } while (left != 0u);"
+
+
 def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterator[str]:
     """A loop over the lights of each way; `light(integral)` says what they add."""
     ways = {way: integral.format(name=name, lobe=lobe) for way, integral in _WAYS.items()}
     if features.focused:
         ways["focused"] = ""
-    for way, integral in ways.items():
-        yield f"    left = todo.{way};"
-        yield "    do {"
-        yield "        number = ltsh_next(left);"
-        yield "        int header = ltsh_header(place.z + number);"
-        yield "        ltsh_light light = ltsh_seen_light(header, point);"
+
+    def body(way, integral):
         if way != "focused":
-            yield f"        {name}_view sight = {name}_viewed({lobe}, light);"
+            yield f"{name}_view sight = {name}_viewed({lobe}, light);"
         if way in ("whole", "cut", "tiny"):
-            yield "        light = ltsh_with_corners(light, sight.wide, sight.whole);"
-        yield from (f"        {line}" for line in light(integral))
+            yield "light = ltsh_with_corners(light, sight.wide, sight.whole);"
+        yield from light(integral)
         factor = "factor"
-        yield "        float factor = ltsh_factor(number, todo);"
+        yield "float factor = ltsh_factor(number, todo);"
         if features.shadowed:
             factor += f" * ltsh_seen(near, place.z + number).{'x' if name == 'specular' else 'y'}"
-        yield f"        reflected *= {factor} * ltsh_light_texel(header + 4).xyz;"
-        yield "        radiance += left != 0u ? reflected : vec3(0.0);"
-        yield "        left &= left - 1u;"
-        yield "    } while (left != 0u);"
+        yield f"reflected *= {factor} * ltsh_light_texel(header + 4).xyz;"
+        yield "radiance += left != 0u ? reflected : vec3(0.0);"
+
+    for way, integral in ways.items():
+        yield from _loop(way, body(way, integral))
+
+
+def _uneven_loop(normal: str, width: str, others: Iterable[str], is_done: str) -> Iterator[str]:
+    """A loop that finds the factors of lights that are not equally bright all over; `others` are further statements.
+
+    Where `is_done` holds for a light the loops after this one leave it out.
+    """
+
+    def body():
+        yield f"float factor = ltsh_mean_emission(header, point, light, {normal}, {width}, left != 0u);"
+        yield "ltsh_factors[number] = factor;"
+        yield from others
+        yield f"todo = ltsh_todo_among(todo, left != 0u && ({is_done}) ? ~(1u << uint(number)) : ~0u);"
+
+    return _loop("uneven", body())
 
 
 def _specular_loops(features) -> Iterator[str]:
@@ -287,7 +311,9 @@ def _specular_loops(features) -> Iterator[str]:
             profile = "ltsh_range_of_profile(light, header)"
         yield f"vec3 reflected = ltsh_reflected(point, ltsh_limited(values, point, light, header, {profile}));"
 
-    return _loops("specular", "shine", light, features)
+    if features.facing:
+        yield from _uneven_loop("point.normal", "weights.width", (), "factor == 0.0")
+    yield from _loops("specular", "shine", light, features)
 
 
 def _diffuse_loops(features) -> Iterator[str]:
@@ -306,7 +332,16 @@ def _diffuse_loops(features) -> Iterator[str]:
             yield "float form_factor = diffuse_focused(matte, light, header, 1.0, left != 0u).x;"
         yield "vec3 reflected = form_factor * base.xyz;"
 
-    return _loops("diffuse", "matte", light, features)
+    if features.facing:
+        seen = " * ltsh_seen(near, place.z + number).y" if features.shadowed else ""
+        caps = [
+            "bool is_cap = (caps >> uint(number) & 1u) != 0u;",
+            f"float form_factor = factor * diffuse_of_cap(matte, light){seen};",
+            "vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;",
+            "radiance += left != 0u && is_cap ? reflected : vec3(0.0);",
+        ]
+        yield from _uneven_loop("matte.plane_0", "-1.0", caps, "is_cap || factor == 0.0")
+    yield from _loops("diffuse", "matte", light, features)
 
 
 def _specular_text(table, is_cosine, features) -> str:

@@ -195,19 +195,6 @@ void main()
         radiance += is_point ? reflected : vec3(0.0);
     } while (++number < count);
     uint left;
-#ifdef LTSH_FACING
-    left = todo.uneven;
-    do {
-        number = ltsh_next(left);
-        int header = ltsh_header(place.z + number);
-        ltsh_light light = ltsh_seen_light(header, point);
-        float factor = ltsh_mean_emission(header, point, light, point.normal, weights.width, left != 0u);
-        ltsh_factors[number] = factor;
-        uint kept = left != 0u && factor == 0.0 ? ~(1u << uint(number)) : ~0u;
-        todo = ltsh_todo_among(todo, kept);
-        left &= left - 1u;
-    } while (left != 0u);
-#endif
 @SPECULAR_LOOPS@
     }
 #endif
@@ -235,26 +222,6 @@ void main()
         radiance += is_cap && is_even ? reflected : vec3(0.0);
     } while (++number < count);
     uint left;
-#ifdef LTSH_FACING
-    left = todo.uneven;
-    do {
-        number = ltsh_next(left);
-        int header = ltsh_header(place.z + number);
-        ltsh_light light = ltsh_seen_light(header, point);
-        float factor = ltsh_mean_emission(header, point, light, matte.plane_0, -1.0, left != 0u);
-        ltsh_factors[number] = factor;
-        bool is_cap = (caps >> uint(number) & 1u) != 0u;
-        float form_factor = factor * diffuse_of_cap(matte, light);
-#ifdef LTSH_SHADOWED
-        form_factor *= ltsh_seen(near, place.z + number).y;
-#endif
-        vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;
-        radiance += left != 0u && is_cap ? reflected : vec3(0.0);
-        uint kept = left != 0u && (is_cap || factor == 0.0) ? ~(1u << uint(number)) : ~0u;
-        todo = ltsh_todo_among(todo, kept);
-        left &= left - 1u;
-    } while (left != 0u);
-#endif
 @DIFFUSE_LOOPS@
     }
 #endif

@@ -117,6 +117,7 @@ def _write_npz(path, arrays, compress=True):
 # Beyond 89.4 degrees smooth lobes are cut by the horizon on the scale of alpha; their fits would hide needles.
 GRAZING_COSINE = 0.01
 WALK_SHARE = 0.25
+ALBEDO_NODES = 48
 
 
 @dataclass(frozen=True)
@@ -222,10 +223,10 @@ def _row(family, points, channels):
     return warp_entries(points.cosine, points.alpha, *channels.T[:3]), tilt
 
 
-def average_albedo(model, roughness, curves, count=48):
+def average_albedo(model, roughness, curves):
     """Integral (R, F) of 2 mu albedo(mu) over mu in [0, 1]: Gauss-Legendre in sqrt(mu), which is dense at grazing."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
+    nodes, weights = np.polynomial.legendre.leggauss(ALBEDO_NODES)
     root, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     mu, weights = root**2, weights * 2.0 * root
-    rows = [directional_albedo(model, mu, np.full(count, value**2), curves) for value in roughness]
+    rows = [directional_albedo(model, mu, np.full(ALBEDO_NODES, value**2), curves) for value in roughness]
     return np.stack([(2.0 * mu * weights) @ row for row in rows])

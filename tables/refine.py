@@ -113,8 +113,9 @@ def _basis(family, points, warp):
     return warped_basis(family, points.directions, entries, _tilt(family, warp))
 
 
-def _warp_slopes(family, points, warp, coefficients, lobe, step=1e-5):
+def _warp_slopes(family, points, warp, coefficients, lobe):
     """Derivatives (P, S, n) of the lobe by the channels of the warp."""
+    step = 1e-5
     moved = [_basis(family, points, warp + step * axis) for axis in np.eye(family.parameters)]
     return np.stack([(np.einsum("psk,pk->ps", basis, coefficients) - lobe) / step for basis in moved], axis=-1)
 

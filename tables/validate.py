@@ -19,6 +19,10 @@ from ltsh_addon.shading.lookup_table import LookupTable
 from .families import gauss_legendre
 
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
+# The largest theta_o of the points, in degrees.
+MOST_THETA = 88.0
+# Samples of the hemisphere by visible normals, in radius and angle, and by the height above the horizon.
+RADIAL, ANGULAR, HORIZON = 56, 56, 40
 # Disk-shaped lights of the light error: as many directions, and the radii in degrees that they take in turn.
 LIGHTS = 96
 LIGHT_RADII = (10.0, 20.0, 35.0)
@@ -44,10 +48,10 @@ class TableStatistics:
         return asdict(self)
 
 
-def validate(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_theta=88.0) -> TableStatistics:
+def validate(table: LookupTable, count: int = 28) -> TableStatistics:
     """Statistics over count x count cell-centered points of (roughness, theta_o in degrees)."""
     errors, solved, albedo, negative, lights, light_errors = np.array(
-        [_measure(table, *point) for point in grid(count, roughness, max_theta)]
+        [_measure(table, *point) for point in grid(count)]
     ).T
     return TableStatistics(
         float(errors.mean()),
@@ -63,17 +67,16 @@ def validate(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_thet
     )
 
 
-def grid(count, roughness=(0.1, 1.0), max_theta=88.0):
+def grid(count, roughness=(0.1, 1.0)):
     """(cos_theta_o, roughness) of count x count cell-centered points, roughness by roughness."""
     center = (np.arange(count) + 0.5) / count
     rough = roughness[0] + center * (roughness[1] - roughness[0])
-    return [(mu, value) for value in rough for mu in np.cos(np.radians(center * max_theta))]
+    return [(mu, value) for value in rough for mu in np.cos(np.radians(center * MOST_THETA))]
 
 
-def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0), max_theta=88.0) -> np.ndarray:
+def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0)) -> np.ndarray:
     """Relative L2 errors (count, count) of the points of `validate`: rows roughness, columns theta_o."""
-    points = grid(count, roughness, max_theta)
-    return np.array([_measure(table, *point)[0] for point in points]).reshape(count, count)
+    return np.array([_measure(table, *point)[0] for point in grid(count, roughness)]).reshape(count, count)
 
 
 def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
@@ -195,17 +198,17 @@ def validate_corners(table: LookupTable, count: int = 14) -> CornerStatistics:
     )
 
 
-def fresnel_basis_error(table: LookupTable, count: int = 7, ior=IOR) -> dict[float, tuple[float, float]]:
+def fresnel_basis_error(table: LookupTable, count: int = 7) -> dict[float, tuple[float, float]]:
     """For each index of refraction the largest relative error of the directional albedo and of the lobe (L2) that the
     combination of the table's Fresnel curves has, with the exact GGX lobe, at count x count points of `validate`."""
-    worst = {index: (0.0, 0.0) for index in ior}
+    worst = {index: (0.0, 0.0) for index in IOR}
     cosines = np.linspace(0.0, 1.0, table.fresnel_curves.shape[1])
-    weights_of = table.dielectric_weights(np.array(ior))
+    weights_of = table.dielectric_weights(np.array(IOR))
     for mu, roughness in grid(count):
         directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([roughness**2])))
         lobe = brdf.ggx_brdf_cosine(mu, roughness**2, directions)
         half = brdf.half_angle_cosine(mu, directions)
-        for column, index in enumerate(ior):
+        for column, index in enumerate(IOR):
             exact = lobe * brdf.dielectric_reflectance(half, index)
             combined = lobe * np.interp(half, cosines, weights_of[:, column] @ table.fresnel_curves)
             albedo = abs((weights * combined).sum() / (weights * exact).sum() - 1.0)
@@ -214,14 +217,14 @@ def fresnel_basis_error(table: LookupTable, count: int = 7, ior=IOR) -> dict[flo
     return worst
 
 
-def hemisphere_samples(cos_theta_o, alpha, radial: int = 56, angular: int = 56, horizon: int = 40):
+def hemisphere_samples(cos_theta_o, alpha):
     """Directions (P, S, 3) with y > 0 and weights (P, S), for cos_theta_o (P,) and alpha (P,).
 
-    The weighted sum of a function that is even in y is its integral over the upper hemisphere; S = radial * angular +
-    horizon * (3 horizon / 2). Directions below the horizon have weight 0.
+    The weighted sum of a function that is even in y is its integral over the upper hemisphere; S = RADIAL * ANGULAR +
+    HORIZON * (3 HORIZON / 2). Directions below the horizon have weight 0.
     """
-    visible, visible_share = _visible_normal_samples(cos_theta_o, alpha, radial, angular)
-    low, low_share = _horizon_samples(horizon)
+    visible, visible_share = _visible_normal_samples(cos_theta_o, alpha)
+    low, low_share = _horizon_samples()
     count = len(cos_theta_o)
     directions = np.concatenate([visible, np.broadcast_to(low, (count, *low.shape))], axis=1)
     share = np.concatenate([visible_share, low_share])
@@ -229,9 +232,9 @@ def hemisphere_samples(cos_theta_o, alpha, radial: int = 56, angular: int = 56, 
     return directions, np.where(directions[..., 2] > 0.0, share / density, 0.0)
 
 
-def _visible_normal_samples(cos_theta_o, alpha, radial, angular):
-    u, u_weights = gauss_legendre(radial)
-    azimuth = (np.arange(angular) + 0.5) / angular * np.pi
+def _visible_normal_samples(cos_theta_o, alpha):
+    u, u_weights = gauss_legendre(RADIAL)
+    azimuth = (np.arange(ANGULAR) + 0.5) / ANGULAR * np.pi
     u, azimuth = (grid.ravel() for grid in np.meshgrid(u, azimuth, indexing="ij"))
     sin_o = np.sqrt(1.0 - cos_theta_o**2)
     stretched = np.stack([alpha * sin_o, cos_theta_o], axis=0) / np.hypot(alpha * sin_o, cos_theta_o)
@@ -248,7 +251,7 @@ def _visible_normal_samples(cos_theta_o, alpha, radial, angular):
     half /= np.linalg.norm(half, axis=-1, keepdims=True)
     view = np.stack([sin_o, np.zeros_like(sin_o), cos_theta_o], axis=-1)[:, None]
     directions = 2.0 * (half * view).sum(axis=-1, keepdims=True) * half - view
-    return directions, np.repeat(u_weights, angular) / angular
+    return directions, np.repeat(u_weights, ANGULAR) / ANGULAR
 
 
 def _visible_normal_density(cos_theta_o, alpha, directions):
@@ -257,9 +260,9 @@ def _visible_normal_density(cos_theta_o, alpha, directions):
     return brdf.visible_normal_density(cos_theta_o[:, None], x * x + y * y, z * z, (alpha**2)[:, None])
 
 
-def _horizon_samples(count):
-    u, weights = gauss_legendre(count)
-    azimuths = count + count // 2
+def _horizon_samples():
+    u, weights = gauss_legendre(HORIZON)
+    azimuths = HORIZON + HORIZON // 2
     azimuth = 0.5 * np.pi * (1.0 - np.cos(np.pi * (np.arange(azimuths) + 0.5) / azimuths))
     z, azimuth = (grid.ravel() for grid in np.meshgrid(u * u, azimuth, indexing="ij"))
     radius = np.sqrt(1.0 - z * z)

@@ -30,6 +30,7 @@ CORE_VERSION = 7
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
+TEXTURE_SIZE = 64  # of the two textures
 
 
 @cache
@@ -292,9 +293,9 @@ def half_layers(table: LookupTable) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis(padded.reshape(rows, columns, layers, 4), 2, 0))
 
 
-def two_textures(table: LookupTable, size: int = 64) -> np.ndarray:
+def two_textures(table: LookupTable) -> np.ndarray:
     """(2, N, N, 4) float32: the two textures of a table of the family "ltc"."""
-    nodes = np.linspace(0.0, 1.0, size)
+    nodes = np.linspace(0.0, 1.0, TEXTURE_SIZE)
     theta, roughness = (grid.ravel() for grid in np.meshgrid(nodes, nodes, indexing="ij"))
     lobe = table.lookup(1.0 - theta * theta, roughness, curves=2)
     sine, cosine = np.sin(lobe.tilt), np.cos(lobe.tilt)
@@ -304,7 +305,7 @@ def two_textures(table: LookupTable, size: int = 64) -> np.ndarray:
     inverse = np.stack([across[0], along[0], across[1], along[1]], axis=-1) / lobe.yy[:, None]
     sphere = clipped_sphere_factor(2.0 * roughness - 1.0, theta)
     second = np.stack([*lobe.coefficients[:, 0], np.zeros_like(sphere), sphere], axis=-1)
-    return np.stack([inverse, second]).reshape(2, size, size, 4).astype(np.float32)
+    return np.stack([inverse, second]).reshape(2, TEXTURE_SIZE, TEXTURE_SIZE, 4).astype(np.float32)
 
 
 def clipped_sphere_factor(height: np.ndarray, form_factor: np.ndarray) -> np.ndarray:

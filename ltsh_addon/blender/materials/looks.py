@@ -151,9 +151,9 @@ def is_missing(image) -> bool:
     return not all(image.size)
 
 
-def plain_look(color, notes: tuple[str, ...] = ()) -> Look:
+def plain_look(color) -> Look:
     """A diffuse surface."""
-    return Look("diffuse", {"color": constant(color)}, notes=notes)
+    return Look("diffuse", {"color": constant(color)})
 
 
 def default_look() -> Look:

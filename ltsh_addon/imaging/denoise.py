@@ -67,13 +67,9 @@ class Denoiser:
         """Give its memory back."""
         self._ReleaseDevice(self._device)
 
-    def denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """The radiance `color` (H, W, 3) without its noise, float32; never negative. `albedo` and `normal` (H, W, 3)
-        may be noisy too. Values that are not finite count as 0."""
-        return self.all_denoised([color], albedo, normal)[0]
-
     def all_denoised(self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
-        """As `denoised`, of several pictures of the same surfaces."""
+        """Pictures of the same surfaces, radiance (H, W, 3), without their noise: float32, never negative. `albedo` and
+        `normal` (H, W, 3) may be noisy too. Values that are not finite count as 0."""
         guides = {"albedo": self._filtered({"albedo": albedo}), "normal": self._filtered({"normal": normal})}
         return [self._filtered({"color": color, **guides}, hdr=True, cleanAux=True) for color in colors]
 

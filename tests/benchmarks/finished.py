@@ -48,7 +48,7 @@ def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=T
     if denoise:
         albedo, normal = (read_layer(made.guides, *guide) for guide in (render.ALBEDO, render.NORMAL))
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            image = denoiser.denoised(image, albedo, normal)
+            (image,) = denoiser.all_denoised([image], albedo, normal)
     return image, made.processor_seconds + time.process_time() - start, made.samples
 
 

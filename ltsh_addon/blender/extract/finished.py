@@ -13,7 +13,7 @@ from ..evaluated import SURFACE_TYPES
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
-from ..render_settings import enable_passes, render_exr, working_space
+from ..render_settings import enable_passes, render_exr
 from .pixels import REST_PASSES, open_scene, scene_named
 
 # Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
@@ -45,6 +45,7 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     layer = render_settings.only_view_layer(scene, warnings, job["view_layer"], "rendered")
     width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    render_settings.render_border(scene)  # an error where it is less than a pixel
     everything = _kept_by_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
@@ -55,18 +56,9 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     files = _render_chunks(scene, layer, folder, {**job, "seconds": seconds}, progress)
     if has_edges:
         _render_edges(scene, layer, folder, progress)
-    border = render_settings.render_border(scene)
     return {
-        "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
         "camera": camera.name,
-        "width": width,
-        "height": height,
-        "border": None if border is None else vars(border),
-        "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
-        "pixel_filter": render_settings.filter_name(scene),
-        "exposure": scene.cycles.film_exposure,
-        "color_space": working_space(),
         "layer": layer.name,
         "files": files,
         "edges": [EDGES, EDGE_SAMPLES[1]] if has_edges else None,

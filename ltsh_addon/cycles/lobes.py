@@ -192,7 +192,7 @@ class LobeSlot:
         return {"anisotropy": np.where(ratio > 0.0, 1.0 - ratio, 0.0), "tangent": turned}
 
     def value(self, name: str, default=None) -> np.ndarray:
-        """The quantity `name`, or what changes nothing, or `default` where there is no such value."""
+        """The quantity `name`; where the lobe has none, its neutral value, or else `default`."""
         if name in self.lobe:
             return self.lobe[name][self.index]
         kind, neutral = LOBE_AOVS[name]

@@ -54,7 +54,7 @@ class UvTriangles:
     def texels(self, first_row: int, row_count: int, conservative: bool = False) -> Texels:
         """The texels of some rows whose centers are covered; where triangles overlap the last one wins, as in Blender.
 
-        With `conservative` also those that are touched anywhere by a triangle and whose center is not covered: their
+        With `conservative` also texels that a triangle touches without covering their center: their
         sample is the point of the triangle nearest to the center.
         """
         owner = np.full(row_count * self.width, -1, dtype=np.int64)

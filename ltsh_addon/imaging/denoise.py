@@ -106,7 +106,7 @@ def _plain(image: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def open_denoiser(libraries: Iterable[Path], threads: int) -> Iterator[Denoiser]:
-    """The first of `libraries`, or of those that the system has, that works. Raises NoDenoiser."""
+    """The first library that works: of `libraries`, then of the system. Raises NoDenoiser."""
     reasons = []
     for library in (*map(str, libraries), *SYSTEM_LIBRARIES):
         try:

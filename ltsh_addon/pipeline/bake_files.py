@@ -114,8 +114,8 @@ class Planes:
         return block
 
     def _beyond(self, target, source):
-        """Of the texels `target`, to which `source` are the nearest, those that show an adjacent face, (Q,), and the
-        texels (Q, 4) that they show, with weights."""
+        """Which of the texels `target` show an adjacent face (Q,), and the texels (Q, 4) that each shows, with weights.
+        `source` are the nearest covered texels."""
         height, width = self.shape
         points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
         which, place, island = self._seams.reflected(points + 0.5, near)

@@ -488,7 +488,7 @@ def options_from(kind: type, values: dict[str, Any], **settings) -> Any:
 
 
 def command_line(options: Any) -> list[str]:
-    """The arguments that give `options` back, but for those that have their defaults; scene and output come first."""
+    """The arguments that give `options` back, without those that have their defaults; scene and output come first."""
     words = [str(options.scene), "-o", str(options.output)]
     for name, (default, arguments) in arguments_of(type(options)).items():
         value, first = getattr(options, name), arguments[0]

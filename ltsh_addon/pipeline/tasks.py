@@ -260,7 +260,7 @@ class Records:
             return False
 
     def all_whole(self, key: str, stems: Iterable[str] | None = None) -> list[dict]:
-        """All records with that key whose files are whole, or those that are named "<stem>.<anything>"."""
+        """All records with that key whose files are whole; with `stems` only those named "<stem>.<anything>"."""
         if stems is None:
             paths = sorted(self._folder.rglob("*.json"))
         else:

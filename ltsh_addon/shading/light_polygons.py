@@ -189,7 +189,7 @@ def local_frames(normal, view):
 
 
 def in_front(samples, light, candidates):
-    """Those candidate points that lie on the side to which the light shines, in its cone, and that it lights at all."""
+    """The candidate points on the side to which the light shines, in its cone, and among its receivers."""
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )

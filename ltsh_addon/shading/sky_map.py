@@ -162,8 +162,8 @@ class SkyMap:
 
 
 def _stretch(axes):
-    """By what (Q,) to multiply directions along the first of the axes (3, Q) of lobes, and to divide them along the
-    second, so that what they cover is about round in the world: the root of what would make it so."""
+    """The factor (Q,) by which directions are stretched along the first axis (3, Q) of lobes, and shrunk along the
+    second: the root of the one that would make the area they cover round in the world."""
     across = _cross(axes[0], axes[2])
     squares = dot(across, across) / (dot(axes[1], axes[1]) * dot(axes[2], axes[2]))
     return squares ** np.float32(-0.125)

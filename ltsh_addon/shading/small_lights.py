@@ -134,7 +134,7 @@ def seen_sizes(lobes, part, rays: Rays, radius) -> np.ndarray:
 
 
 def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (...) of the lights of `seen_sizes` that are small, and of those among them that shine at the samples.
+    """Masks (...) of the lights that are small, by their `seen_sizes`, and of the small ones that shine at the samples.
 
     Lights that cross a horizon are not small.
     """

@@ -115,8 +115,8 @@ class OccluderMesh:
 
 @dataclass(frozen=True)
 class ChosenBy:
-    """Which shadow rays Cycles sends to a light: those that the light chooses, without Cast Shadow none, and those that
-    the surface chooses, without multiple importance sampling none."""
+    """Which shadow rays Cycles sends to a light: `light`, rays that the light chooses (off without Cast Shadow), and
+    `surface`, rays that the surface chooses (off without multiple importance sampling)."""
 
     light: bool = True
     surface: bool = True
@@ -278,7 +278,7 @@ class Parts:
 
 
 def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
-    """By number, for meshes with an image: the parts that block all light, and those that may let some through.
+    """By number, for meshes with an image: the parts that block all light, and the parts that may let some through.
 
     So that few rays have to look at the image. Parts overlap a little: no ray slips between those of different sizes.
     """

@@ -155,8 +155,8 @@ class Starts:
     def from_surface(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `aimed`, of rays (R,) each from a sample of its own, that start at the samples themselves, as those that
-        Cycles sends on from a surface."""
+        """As `aimed`, for rays (R,) that each start at a sample itself, as rays do that Cycles sends on from a
+        surface."""
         normal = self.geometric_normal[index].T
         moved = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
         return moved + self.position[index].T, *_toward(directions, distances, moved)

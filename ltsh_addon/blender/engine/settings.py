@@ -96,7 +96,7 @@ def _is_cycles(panel) -> bool:
 
 
 def shared_panels() -> list[type]:
-    """Panels that are about what LTSH shades too: those that Cycles shows, but for its own render settings."""
+    """Panels of things that LTSH shades too: all that Cycles shows, without its own render settings."""
     panels = [panel for panel in _below(bpy.types.Panel) if ENGINE not in getattr(panel, "COMPAT_ENGINES", (ENGINE,))]
     shown = [panel for panel in panels if "CYCLES" in panel.COMPAT_ENGINES]
     if not shown:

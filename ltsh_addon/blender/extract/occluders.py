@@ -234,7 +234,7 @@ class _Collector:
 
 
 def _meets(instance) -> tuple[bool, bool]:
-    """Is the instance met by rays that lights choose, and by those that surfaces choose, glossy ones?"""
+    """Do rays that lights choose meet the instance, and do those that surfaces choose, glossy ones?"""
     ob, owner = instance.object, owner_of(instance)
     return tuple(getattr(ob, name) and getattr(owner, name) for name in ("visible_shadow", "visible_glossy"))
 

@@ -239,7 +239,7 @@ def prepare_scene(
 
 
 def add_world(inventory: LightInventory, scene, world) -> None:
-    """Look at what the lights of `inventory` emit, and at the `world`, which was that of `scene`."""
+    """Add to `inventory` what its lights emit, and the light of `world`, which was that of `scene`."""
     of_world = world_lights(scene, world, inventory.warn)
     inventory.lights = seen_lights(scene, inventory) + of_world
     inventory.world = world if of_world else None

@@ -128,7 +128,7 @@ def light_pictures(scene, world, like: AreaLight, warn) -> tuple[list[SkyPicture
 
 
 def background_pictures(scene, world, warn) -> list[SkyPicture]:
-    """A cube of what cameras see of `world`, which is that of `scene`."""
+    """A cube of pictures of `world` as cameras see it; it is the world of `scene`."""
     with _observatory(scene, world, warn, by_cameras=True) as look:
         pixels = _pixels(world)
         pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)

@@ -113,7 +113,7 @@ class Look:
 
     @property
     def through(self) -> float:
-        """The share of it, but for metal, that lets see what is behind."""
+        """The share of the lobe, metal left out, through which one sees what is behind it."""
         if self.kind in ("glass", REFRACTION):
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0

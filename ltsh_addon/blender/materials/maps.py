@@ -45,8 +45,8 @@ class SavedImages:
 
 
 def plain_texture(output, groups):
-    """The image texture node that the `output` of a node comes from and nothing else, where it is looked up and which
-    part is taken of it; None for all that is more.
+    """The image texture node that alone makes the `output` of a node, where it is looked up, and which part of it is
+    taken; None where anything else has a say.
 
     `groups` leads to the node (see `graph.Source`). The place is a dictionary as `cycles.texels.BakeMaterial` reads it,
     the part "color", or a channel "0", "1" or "2".

@@ -41,7 +41,7 @@ EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 
 @functools.cache
 def missing_libraries() -> str | None:
-    """One line that says what is missing and what to do, for beside grey buttons; None where all is there.
+    """What is missing and what to do, in one line beside gray buttons; None where all is there.
 
     Tried once, since panels ask with every redraw: what comes later is found when the add-on is enabled again.
     """

@@ -496,8 +496,8 @@ def _interval_lines(planes):
 def _closing_lines(planes):
     """The piece of horizon number slot - 1 that an edge's crossing gives.
 
-    Of an edge that crosses two horizons, which it crosses first says where it is below the other: by the same
-    comparison for both, so that rounding cannot leave the polygon open, however close together they are.
+    Where an edge crosses two horizons, the order of the crossings says where it is below the other one. Both horizons
+    use the same comparison, so that rounding cannot leave the polygon open, however close they are.
     """
     for k, a in enumerate(_AXES[:planes]):
         yield f"            if (slot == {k + 1}) {{"

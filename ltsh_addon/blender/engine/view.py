@@ -48,7 +48,7 @@ NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
 SAME_SHAPE = 0.01
 MOST_NOTES = 4
 FEWEST_LETTERS = 20  # no line is broken into shorter ones
-TEXT_SIZE = 11.0
+TEXT_SIZE, LINE = 11.0, 1.4  # and from line to line
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
@@ -70,12 +70,14 @@ class EngineView:
         self._error = ""
         self._content: tuple[tuple, str] | None = None
         self._shadows = LiveShadows()
-        self._shadow_notes: tuple[str, ...] = ()
+        self._shadow_notes: list[str] = []
         _at_work.add(self._shadows)
         _views.add(self)
 
     def __del__(self):
+        # Blender lets go of a view that shows something else, or is closed: nothing here may be part of a circle.
         self._shadows.stop()
+        self._world.stop()
         _views.discard(self)
         if not _views:
             _lamps.stop()
@@ -155,13 +157,12 @@ class EngineView:
     def _follow_shadows(self, depsgraph) -> None:
         """Let the renderer draw shadows, if the scene has them."""
         self._renderer.shadows = self._shadows if depsgraph.scene.ltsh.shadows else None
+        notes = self._shadow_notes
 
         def collect():
-            notes: list[str] = []
+            notes.clear()
             override = depsgraph.view_layer_eval.material_override
-            occluders = collect_occluders(depsgraph, override, notes.append)
-            self._shadow_notes = tuple(notes)
-            return blocks_nothing(occluders, depsgraph.scene.world)
+            return blocks_nothing(collect_occluders(depsgraph, override, notes.append), depsgraph.scene.world)
 
         self._shadows.follow((id(self.mirror), self.mirror.surfaces_version), collect)
 
@@ -518,40 +519,50 @@ def _draw() -> None:
     if not is_drawn(context):
         return
     error, notes, captions, quiet = _texts.get(region.as_pointer(), ("", [], Captions(), QuietLine()))
-    lines = lines_of(error, notes)
     scale = context.preferences.system.ui_scale
     font, size = 0, TEXT_SIZE * scale
     blf.size(font, size)
-    sides = _covered(context)
+    sides = covered(context.area, region)
     # Blender's own boxes are at the left and above.
-    right = region.width - sides["UI"] - MARGIN * scale
-    free = right - max(sides["TOOLS"], sides["HUD"]) - MARGIN * scale
-    lines = wrapped(lines, free, lambda text: blf.dimensions(font, text)[0])
-    if quiet.text:
-        pointed = _pointed.get("region") == region.as_pointer()
-        lines.append((quiet.text, POINTED_COLOR if pointed else QUIET_COLOR))
-        width, bottom = blf.dimensions(font, quiet.text)[0], MARGIN * scale
-        _places[region.as_pointer()] = right - width - 0.5 * size, bottom - 0.35 * size, right, bottom + 1.05 * size
-    for number, (line, color) in enumerate(reversed(lines)):
-        width = blf.dimensions(font, line)[0]
-        _write(font, line, right - width, MARGIN * scale + number * 1.4 * size, size, color)
+    right, bottom = region.width - sides["RIGHT"] - MARGIN * scale, sides["BOTTOM"] + MARGIN * scale
+    free = right - max(sides["LEFT"], sides["FLOAT"]) - MARGIN * scale
+
+    def broken(lines):
+        return wrapped(lines, free, lambda text: blf.dimensions(font, text)[0])
+
+    is_pointed = _pointed.get("region") == region.as_pointer()
+    quiet_lines = broken([(quiet.text, POINTED_COLOR if is_pointed else QUIET_COLOR)]) if quiet.text else []
+    most = int((region.height - sides["TOP"] - bottom) / (LINE * size)) - len(quiet_lines)
+    lines = [*broken(lines_of(error, notes))[: max(most, 0)], *quiet_lines]
+    widths = [blf.dimensions(font, line)[0] for line, _ in lines]
+    if quiet_lines:
+        left = right - max(widths[-len(quiet_lines) :]) - 0.5 * size
+        top = bottom + (LINE * (len(quiet_lines) - 1) + 1.05) * size
+        _places[region.as_pointer()] = left, bottom - 0.35 * size, right, top
+    for number, ((line, color), width) in enumerate(zip(reversed(lines), reversed(widths), strict=True)):
+        _write(font, line, right - width, bottom + number * LINE * size, size, color)
     blf.size(font, CAPTION_SIZE * scale)
     _draw_captions(font, captions, region, sides, scale)
 
 
-def _covered(context) -> dict[str, int]:
-    """Pixels that other regions of the area cover, by their type."""
-    covered = {"TOOLS": 0, "UI": 0, "HUD": 0, "HEADER": 0, "TOOL_HEADER": 0}
-    if context.preferences.system.use_region_overlap:
-        for part in context.area.regions:
-            if part.type in covered and part.width > 1 and part.height > 1:
-                covered[part.type] = part.width if part.type in ("TOOLS", "UI", "HUD") else part.height
-    return covered
+def covered(area, region) -> dict[str, int]:
+    """Pixels of `region` that other regions of its area lie over, by their side; FLOAT: at the left, too."""
+    sides = {"LEFT": 0, "RIGHT": 0, "BOTTOM": 0, "TOP": 0, "FLOAT": 0}
+    x, y, width, height = region.x, region.y, region.width, region.height
+    for part in area.regions:
+        is_over = part.x < x + width and x < part.x + part.width and part.y < y + height and y < part.y + part.height
+        if part.type == "WINDOW" or not is_over or min(part.width, part.height) <= 1:
+            continue
+        reach = {"LEFT": part.x + part.width - x, "RIGHT": x + width - part.x, "BOTTOM": part.y + part.height - y,
+                 "TOP": y + height - part.y, "FLOAT": part.x + part.width - x}  # fmt: skip
+        if part.alignment in sides:
+            sides[part.alignment] = max(sides[part.alignment], reach[part.alignment])
+    return sides
 
 
 def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int], scale: float) -> None:
     line = CAPTION_SIZE * scale
-    top = region.height - sides["HEADER"] - sides["TOOL_HEADER"] - MARGIN * scale - line
+    top = region.height - sides["TOP"] - MARGIN * scale - line
     place = captions.split * region.width
     width, _ = blf.dimensions(font, captions.left)
     _write(font, captions.left, place - width - MARGIN * scale, top, line, CAPTION_COLOR)

@@ -533,9 +533,9 @@ class SeenWorld:
     warnings: list[str]
 
 
-def look_at_world(path: Path, world: str, frame: int, folder: Path) -> SeenWorld:
+def look_at_world(path: Path, world: str, frame: int, folder: Path, progress: Progress | None = None) -> SeenWorld:
     """The `world` of this name in the .blend `path`, at a frame; files go to `folder`. Raises as `extract` does."""
-    found = run_child({"task": "world", "path": str(path), "world": world, "frame": frame}, folder, None)
+    found = run_child({"task": "world", "path": str(path), "world": world, "frame": frame}, folder, progress)
     light, background = (np.load(folder / f"{name}.npy") for name in ("light", "background"))
     return SeenWorld(light, tuple(AreaLight(**one) for one in found["lights"]), background, found["warnings"])
 

@@ -104,6 +104,11 @@ def _upload(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
     return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=buffer)
 
 
+def _blank() -> ShareGrid:
+    """A grid without a point: every light is seen."""
+    return ShareGrid(_upload(np.ones((1, 2), np.float32)[None], (1, 1)), float_texture(np.zeros((1, 1, 4))), np.eye(4))
+
+
 # What is traced one after another while nothing changes: pixels between points in either direction (None: so many that
 # there are `COARSE_POINTS`), and rays of a light and a point.
 LEVELS = ((None, 8), (1, 32))
@@ -274,6 +279,7 @@ class LiveShadows:
         self._latest: dict[int, dict[int, np.ndarray]] = {}  # by the number of a light
         self._layers = np.ones((0, 0, 0, 2), np.float32)  # of the grid
         self._grid: ShareGrid | None = None
+        self._blank: ShareGrid | None = None
         self._origin = np.zeros(3)
 
     @property
@@ -320,11 +326,14 @@ class LiveShadows:
         return any(one._thread is not None and (one._outcomes or not one._thread.is_alive()) for one in self._both)
 
     def stop(self) -> None:
-        """Let the thread end soon, and what helps it."""
+        """Let the thread end soon, and what helps it; let go of the textures at once, and of the glass."""
         for one in self._both:
             one._is_left = True
             one._stop.set()
+            one._grid = one._blank = None
+            one._own = (0, None)
         self.rest()
+        self._glass = None
 
     def rest(self) -> None:
         """End what helps the thread, unless that works: it is started again where it is worth it."""
@@ -334,10 +343,14 @@ class LiveShadows:
     def take_news(self) -> None:
         """Take over what has been found; pictures are to be drawn anew where `version` is another one then."""
         for one in self._both:
-            if one._thread is not None and not one._thread.is_alive():
+            before, has_ended = one._version, one._thread is not None and not one._thread.is_alive()
+            if has_ended:
                 one._thread = None
             while one._outcomes:
                 one._take(*one._outcomes.popleft())
+            # What could not begin beside the thread begins with the first picture.
+            if has_ended and one._version == before and any(other._next_level() is not None for other in self._both):
+                one._version += 1
 
     def _take(self, request: _Request, outcome: dict[int, np.ndarray] | Exception) -> None:
         if request.is_own and not isinstance(outcome, Exception):
@@ -365,7 +378,7 @@ class LiveShadows:
         self, gbuffer: GBufferTextures, view: View, lights: Lights, sides: Lights = (), number: int = 0
     ) -> ShareGrid | None:
         """The shares as far as they are known, as of `ShadowRays.shares`; `number` counts the pictures of a view at
-        rest."""
+        rest. Before they are there, a grid without a point: with another shader they would come when it is compiled."""
         if self._given is None or lights is not self._given[0] or sides is not self._given[1]:
             self._given = lights, sides
             self._lights = (*((light,) for light in lights), *((sides,) if sides else ()))
@@ -393,7 +406,11 @@ class LiveShadows:
                 self._begin_own(number // GROUP, gbuffer, view)
             self._waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
-        return self._grid if fits else None
+        if fits or self._is_off:
+            return self._grid if fits else None
+        if self._blank is None:
+            self._blank = _blank()
+        return self._blank
 
     @property
     def _is_outdated(self) -> bool:

@@ -199,6 +199,12 @@ class LiveWorld:
         self._of, self._sky = "", None  # the world that was looked at last, and what was found
         self._thread: threading.Thread | None = None
         self._outcome: tuple[ShownSky, list[str]] | Exception | None = None
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        """Nobody waits any more."""
+        self._wanted = ""
+        self._stopped.set()
 
     def look(self, world) -> ShownSky | None:
         """To be told of a new or changed `world`: what it looked like the last time, None where nobody has looked."""
@@ -234,7 +240,7 @@ class LiveWorld:
             return
         stack = ExitStack()
         folder = stack.enter_context(temporary_folder())
-        name, like = world.name, light_of_world(world)
+        name, like, stopped = world.name, light_of_world(world), self._stopped
         try:
             path = written(folder / "world.blend", [world])[0]
         except BaseException:
@@ -244,7 +250,7 @@ class LiveWorld:
         def work() -> None:
             try:
                 with stack:
-                    found = client.look_at_world(path, name, frame, folder)
+                    found = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
                 light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
                 self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
             except Exception as error:

@@ -26,7 +26,11 @@ from . import preflight
 from .settings import preferences
 
 STARTING = "Starting"
-SURE_SECONDS = 3.0
+# Before, nobody knows how long a job will take, and no time left is told that is not sure.
+SURE_SECONDS, ROUGH_SECONDS = 3.0, 10.0
+# Of the time left at least so much must be measured: it is then right within a factor of two, though a guess for the
+# rest may be three times too short.
+KNOWN_SHARE = 0.5
 SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
 ENDING_SECONDS = 10.0
 NO_CYCLES = "Not complete: without Cycles"
@@ -221,9 +225,10 @@ seen: Seen = {}
 
 
 def _kind(stage: str) -> str:
-    """What stages have in common that take as long for their cost: those of all objects of a bake are alike."""
+    """What stages have in common that take as long for their cost: those of all objects of a bake are alike, and
+    the halves of Cycles."""
     first = stage.partition(" ")[0]
-    return first if first in ("bake", "shade") else stage
+    return first if first in ("bake", "shade", "Cycles") else stage
 
 
 def paces(seen: Seen) -> dict[str, float]:
@@ -239,7 +244,7 @@ class Plan:
     expected to take as long as in the jobs `seen` before."""
 
     def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, seen: Seen | None = None):
-        pace, self._asked = paces(seen or {}), tuple(steps)
+        pace, self._asked, self._before = paces(seen or {}), tuple(steps), dict(seen or {})
         self._steps = tuple(replace(step, cost=step.cost * pace.get(_kind(step.stage), pace[""])) for step in steps)
         self._now = now
         self._at, self._share = 0, 0.0
@@ -294,11 +299,47 @@ class Plan:
 
     def seconds_left(self) -> float:
         """Until the job will have ended, as far as can be told."""
-        return self._rest_of_step() + sum(map(self._expected, self._steps[self._at + 1 :]))
+        return sum(self._parts_left())
 
-    def _expected(self, step: Step) -> float:
-        """Seconds: as long as the same stage took before, or by its cost."""
-        return self._measured.get(step.stage, step.cost * self._pace())
+    @property
+    def is_sure(self) -> bool:
+        """Is enough of the time left measured?"""
+        known, guessed = self._parts_left()
+        return known >= KNOWN_SHARE * (known + guessed)
+
+    def _parts_left(self) -> tuple[float, float]:
+        """Seconds that are known by what was measured, and those that are guessed by costs."""
+        measured = self._measured_costs()
+        kind = _kind(self._steps[self._at].stage)
+        parts = {True: 0.0, False: 0.0}
+        parts[self._is_followed or kind in measured or kind in self._before] += self._rest_of_step(measured)
+        for step in self._steps[self._at + 1 :]:
+            kind = _kind(step.stage)
+            parts[kind in measured or kind in self._before] += self._expected(step, measured)
+        return parts[True], parts[False]
+
+    def _expected(self, step: Step, measured: dict[str, tuple[float, float]]) -> float:
+        """Seconds: as long as the same stage took before, or by its cost as those of its kind, or as all."""
+        seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
+        pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
+        return self._measured.get(step.stage, step.cost * pace)
+
+    def _measured_costs(self) -> dict[str, tuple[float, float]]:
+        """Seconds and costs by kind of the steps of this job, that which runs included as far as it tells."""
+        found: dict[str, tuple[float, float]] = {}
+        for step in self._steps[: self._at + 1]:
+            seconds = self._measured.get(step.stage)
+            if step is self._steps[self._at]:
+                seconds = (self._reported - self._stage_started) / self._fraction if self._is_followed else None
+            if seconds is not None:
+                before = found.get(_kind(step.stage), (0.0, 0.0))
+                found[_kind(step.stage)] = before[0] + seconds, before[1] + step.cost
+        return found
+
+    @property
+    def _is_followed(self) -> bool:
+        """Has the step that runs told enough to say how long it will take?"""
+        return self._fraction >= LEAST_FRACTION and self._reported - self._stage_started >= LEAST_SECONDS
 
     def _pace(self) -> float:
         """Seconds for a cost of 1; a step that takes longer than expected tells that all will."""
@@ -306,13 +347,13 @@ class Plan:
         so_far = seconds + self._now() - self._stage_started
         return max(seconds / cost, so_far / (cost + self._steps[self._at].cost))
 
-    def _rest_of_step(self) -> float:
+    def _rest_of_step(self, measured: dict[str, tuple[float, float]]) -> float:
         """Seconds; between reports the rest melts away and never becomes nothing."""
-        done = self._reported - self._stage_started
-        if self._fraction >= LEAST_FRACTION and done >= LEAST_SECONDS:
+        if self._is_followed:
+            done = self._reported - self._stage_started
             rest, since = done / self._fraction - done, self._reported
         else:
-            rest, since = self._expected(self._steps[self._at]), self._stage_started
+            rest, since = self._expected(self._steps[self._at], measured), self._stage_started
         return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
 
 
@@ -454,6 +495,14 @@ def stage_title(stage: str) -> str:
 
 def progress_text(plan: Plan, seconds: float) -> str:
     """Percent and time left of a whole job that began so many seconds ago."""
-    text = f"{100.0 * plan.share():.0f} %"
-    # Before, nobody knows how long it will take.
-    return text if seconds < SURE_SECONDS else f"{text}, {clock(plan.seconds_left())} {translated('left')}"
+    text, left, is_sure = f"{100.0 * plan.share():.0f} %", plan.seconds_left(), plan.is_sure
+    if seconds < (SURE_SECONDS if is_sure else ROUGH_SECONDS):
+        return text
+    shown = clock(left) if is_sure else f"{translated('about')} {clock(rounded(left))}"
+    return f"{text}, {shown} {translated('left')}"
+
+
+def rounded(seconds: float) -> float:
+    """`seconds` to ten of them, or from two minutes on to minutes."""
+    step = 10.0 if seconds < 115.0 else 60.0
+    return step * max(1, round(seconds / step))

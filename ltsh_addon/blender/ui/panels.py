@@ -76,21 +76,27 @@ def region_width(context) -> float:
     return context.region.width / context.preferences.system.ui_scale
 
 
-def draw_job(layout) -> bool:
-    """The job that runs, with its Cancel button; False where none does."""
+def draw_job(layout, *commands: str) -> bool:
+    """The job that runs, if it is one of `commands`, with its Cancel button: two rows as high as the buttons in whose
+    place they are, so that nothing else in the panel moves. False where none of them runs."""
     job = operators.running_job()
-    if job is None:
+    if job is None or job.command not in commands:
         return False
-    column = layout.box().column()
-    row = column.row()
-    row.label(text=job.title, icon="RENDER_STILL")
-    draw_right(row, clock(job.seconds()))
-    column.progress(factor=job.plan.share(), text=progress_text(job.plan, job.seconds()))
-    row = gray(column)
+    row = layout.row(align=True)
+    row.scale_y = LARGE
+    row.progress(factor=job.plan.share(), text=progress_text(job.plan, job.seconds()))
+    row.operator("ltsh.cancel", text="", icon="X")
+    row = layout.row()
     row.label(text=stage_title(job.stage), translate=False)
-    draw_right(row, f"{job.plan.number} / {job.plan.count}")
-    column.operator("ltsh.cancel", text="Cancel", icon="X")
+    draw_right(row, clock(job.seconds()))
     return True
+
+
+def draw_share(layout, *commands: str) -> None:
+    """The percent that is done of a job, in the header of its panel, which may be closed."""
+    job = operators.running_job()
+    if job is not None and job.command in commands:
+        gray(layout).label(text=f"{100.0 * job.plan.share():.0f} %", translate=False)
 
 
 def gray(layout):
@@ -111,7 +117,7 @@ def draw_button(layout, operator: str, icon: str, ready: bool, scale: float = 1.
     """A button, gray while it cannot run."""
     row = layout.row()
     row.scale_y = scale
-    row.enabled = ready
+    row.enabled = ready and operators.running_job() is None
     row.operator(operator, icon=icon)
 
 
@@ -155,7 +161,6 @@ class _Main:
             row.operator("ltsh.preview", text="End Preview with LTSH", icon="LOOP_BACK", depress=True)
         else:
             row.operator("ltsh.preview", icon="SHADING_RENDERED")
-        draw_job(layout)
         draw_view_settings(layout, context)
 
 
@@ -182,10 +187,13 @@ def draw_view_settings(layout, context) -> None:
 class _Compare:
     bl_label = "Compare"
 
+    def draw_header_preset(self, context):
+        draw_share(self.layout, "compare", "shade")
+
     def draw(self, context):
         layout, settings = self.layout, context.scene.ltsh
-        if operators.running_job() is None:
-            ready = draw_problems(layout, context, "compare")
+        ready = draw_problems(layout, context, "compare")
+        if not draw_job(layout, "compare", "shade"):
             draw_button(layout, "ltsh.compare", "MOD_MIRROR", ready, LARGE)
             draw_button(layout, "ltsh.shade", "RENDER_STILL", ready)
         header, body = layout.panel("ltsh_compare_settings", default_closed=True)
@@ -202,14 +210,17 @@ class _Bake:
     bl_label = "Bake"
     bl_options = {"DEFAULT_CLOSED"}
 
+    def draw_header_preset(self, context):
+        draw_share(self.layout, "bake")
+
     def draw(self, context):
         layout = self.layout
-        if operators.running_job() is None:
-            ready = draw_problems(layout, context, "bake")
-            count = len(preflight.bake_objects(context)[0])
-            if count:
-                text = translated("1 object") if count == 1 else translated("{} objects").format(count)
-                gray(layout).label(text=text, icon="OBJECT_DATA", translate=False)
+        ready = draw_problems(layout, context, "bake")
+        count = len(preflight.bake_objects(context)[0])
+        if count:
+            text = translated("1 object") if count == 1 else translated("{} objects").format(count)
+            gray(layout).label(text=text, icon="OBJECT_DATA", translate=False)
+        if not draw_job(layout, "bake"):
             draw_button(layout, "ltsh.bake", "RENDER_RESULT", ready, LARGE)
             row = layout.row(align=True)
             row.operator("ltsh.apply_bake", icon="MATERIAL")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ltsh_addon.blender.ui.job import MOST, PRIOR_SECONDS, Plan, Step
+from ltsh_addon.blender.ui.job import MOST, PRIOR_SECONDS, Plan, Step, progress_text
 
-STAGES = ("open", "samples", "A", "B", "images")
+STAGES = ("open", "samples", "Cycles A", "Cycles B", "images")
 
 
 def plan_of(*costs, stages=STAGES):
@@ -93,7 +93,9 @@ def test_a_job_is_expected_to_take_as_long_as_the_last_one():
         clock.now += cost * pace
     seen = {}
     plan.end(seen)
-    assert seen == {stage: (cost * pace, cost) for stage, cost, pace in zip(STAGES, costs, paces, strict=False)}
+    assert seen == {
+        stage.split()[0]: (cost * pace, cost) for stage, cost, pace in zip(STAGES, costs, paces, strict=False)
+    }
     larger = [Step(stage, 2.0 * cost) for stage, cost in zip(STAGES, costs, strict=False)]
     takes = sum(2.0 * cost * pace for cost, pace in zip(costs, paces, strict=True))
     assert Plan(larger, lambda: clock.now).seconds_left() < takes / 4.0
@@ -123,8 +125,41 @@ def test_a_job_that_ends_early_teaches_what_it_has_done():
 
 def test_stages_that_are_left_out_are_passed_over_and_unknown_ones_change_nothing():
     plan, _ = plan_of(1.0, 1.0, 1.0, 1.0, 1.0)
-    plan.report("B", 0.0)
+    plan.report("Cycles B", 0.0)
     assert plan.number == 4
     for stage in ("samples", "something else"):
         plan.report(stage, 0.5)
         assert plan.number == 4
+
+
+@given(guess=st.floats(0.4, 3.0), half=st.floats(20.0, 200.0), fraction=st.floats(0.05, 0.95))
+def test_a_time_left_that_is_told_without_about_is_right_within_a_factor_of_two(guess, half, fraction):
+    """The halves of Cycles are alike, and what comes after them takes up to three times as long as expected."""
+    rest = 0.3 * half
+    plan, clock = plan_of(2.0, 1.0, 10.0, 10.0, rest / guess)
+    for stage in STAGES[:2]:
+        plan.report(stage, 0.0)
+        clock.now += 1.5
+    plan.report("Cycles A", 0.0)
+    clock.now += half * fraction
+    plan.report("Cycles A", fraction)
+    left, text = half * (2.0 - fraction) + rest, progress_text(plan, clock.now - 100.0)
+    assert plan.is_sure == ("left" in text and "about" not in text)
+    assert not plan.is_sure or left / 2.0 <= plan.seconds_left() <= 2.0 * left
+
+
+def test_no_time_left_is_told_before_anything_is_measured_and_then_it_is_rough():
+    plan, clock = plan_of(1.0, 1.0, 1.0, 1.0, 1.0)
+    texts = []
+    for clock.now in (103.0, 109.0, 111.0, 160.0):
+        texts.append(progress_text(plan, clock.now - 100.0))
+    assert ["left" in text for text in texts] == [False, False, True, True]
+    assert "about 0:10 left" in texts[2] and "about" in texts[3]
+    seen = {}
+    for stage in STAGES:
+        plan.report(stage, 0.0)
+        clock.now += 10.0
+    plan.end(seen)
+    again = Plan([Step(stage, 1.0) for stage in STAGES], lambda: clock.now, seen)
+    clock.now += 3.0
+    assert "left" in progress_text(again, 3.0) and "about" not in progress_text(again, 3.0)

@@ -148,17 +148,42 @@ def test_without_openexr_only_the_preview_can_be_clicked(scene, monkeypatch):
     assert preflight.missing_libraries() is None
 
 
-def test_a_running_job_has_its_place_and_a_way_to_stop_it(scene, tmp_path):
+@pytest.mark.parametrize(("command", "panel", "other"), [("compare", COMPARE, BAKE), ("shade", COMPARE, BAKE),
+                                                          ("bake", BAKE, COMPARE)])  # fmt: skip
+def test_a_running_job_stands_in_the_place_of_its_buttons_and_nothing_moves(scene, tmp_path, command, panel, other):
+    bpy.data.objects["Floor"].select_set(True)
+    before = {one: (heights(one), drawn(one)) for one in (MAIN_3D, panel, other)}
     plan = Plan([Step("samples", 30.0), Step("Cycles A", 100.0)])
-    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path, "compare", 0)
+    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path, command, 0)
     job._take({"stage": "Cycles A", "fraction": 0.25})
     plan._share = 0.25
-    shown = drawn(MAIN_3D)
-    assert buttons(shown) == {"ltsh.preview": True, "ltsh.cancel": True}
-    assert not {*JOBS, *BAKES} & {*buttons(drawn(COMPARE)), *buttons(drawn(BAKE))}
+    shown = drawn(panel)
+    assert buttons(shown) == {"ltsh.cancel": True} and texts(drawn(panel, "draw_header_preset")) == "25 %"
     (progress,) = [item.what for item in shown if item.kind == "progress"]
     assert progress.startswith("25 %")
-    assert {"Compare with Cycles", "Cycles, First Half", "2 / 2"} <= {item.what for item in shown}
+    assert "Cycles, First Half" in texts(shown)
+    for one, (rows, _) in before.items():
+        assert heights(one) == rows
+    # What cannot be started now is gray, where it was.
+    assert drawn(MAIN_3D) == before[MAIN_3D][1] and texts(drawn(other, "draw_header_preset")) == ""
+    assert not {name for name, can in buttons(drawn(other)).items() if can} & {*JOBS, "ltsh.bake"}
+    assert [item.what for item in drawn(other)] == [item.what for item in before[other][1]]
+
+
+def heights(panel):
+    """Of the rows of a panel, one below the other."""
+    rows = []
+
+    class Rows(Layout):
+        def _called(self, name, given):
+            nested = super()._called(name, given)
+            rows.append(nested)
+            return nested
+
+    found = stand_in(panel)()
+    found.layout = Rows()
+    found.draw(context_of(300, space_data=None))
+    return [vars(one).get("scale_y", 1.0) if isinstance(one, Layout) else 1.0 for one in rows]
 
 
 def row(ob, width=300):

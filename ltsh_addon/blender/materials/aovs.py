@@ -22,7 +22,6 @@ from .graph import (
     Factor,
     Leaf,
     SurfaceShaders,
-    bypass,
     carry_into_group,
     carry_out_of_group,
     computed,
@@ -62,7 +61,8 @@ class MaterialLobes:
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
     unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
-    made_opaque: tuple[tuple, ...] = ()  # input sockets, and the socket or number that was there
+    # Input sockets, the socket or number that was there, and the number that makes them opaque.
+    made_opaque: tuple[tuple, ...] = ()
     kept: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
     is_displaced: bool = False  # its faces are moved, but not where they cast shadows
@@ -100,16 +100,16 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     made_opaque = []
     for found in shaders.cuts:
         if found.node.bl_idname == MIX:
-            made_opaque += [(link.to_socket, found.node.outputs[0]) for link in found.node.outputs[0].links]
-            bypass(found.node, live_link(found.other).from_socket)
+            is_last = found.other == [socket for socket in found.node.inputs if socket.type == "SHADER"][-1]
+            made_opaque.append(_fixed(found.node.inputs[0], float(is_last)))
         else:
-            made_opaque.append((found.clear, live_link(found.clear).from_socket))
+            made_opaque.append((found.clear, live_link(found.clear).from_socket, 1.0))
             cut(found.clear)
     is_clear = is_seen_through(output, shaders)
     cut(output.inputs["Volume"])
     if is_clear:
         if live_link(surface) is not None:
-            made_opaque.append((surface, live_link(surface).from_socket))
+            made_opaque.append((surface, live_link(surface).from_socket, 1.0))
         _show(surface, CLEAR, 1.0)
     elif not shaders.leaves:
         # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
@@ -119,11 +119,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque), kept, has_volume, is_displaced)
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
-            alpha = leaf.node.inputs["Alpha"]
-            link = live_link(alpha)
-            made_opaque.append((alpha, alpha.default_value if link is None else link.from_socket))
-            cut(alpha)
-            alpha.default_value = 1.0
+            made_opaque.append(_fixed(leaf.node.inputs["Alpha"], 1.0))
     leaves, _ = shaded_leaves(shaders)
     weight_of = _Weights().of
     # Every weight before any value: sockets of groups that values come from stay where they are.
@@ -148,13 +144,31 @@ def _kept_by_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
     return NEITHER.union(*(passes_of_cycles(leaf.node) for leaf in leaves if not is_emission(leaf.node)))
 
 
+def _fixed(target, level: float) -> tuple:
+    """Fix the number at the input `target` to `level`, 0 or 1; its entry of `MaterialLobes.made_opaque`.
+
+    What fed it goes on doing so: Cycles reads an image otherwise where its alpha feeds nothing.
+    """
+    before = value_of(target)
+    if is_socket(before):
+        fixed = computed("MAXIMUM" if level else "MINIMUM", before, level, clamp=True)
+        target.id_data.links.new(fixed, target)
+    else:
+        cut(target)
+        target.default_value = level
+    return target, before, level
+
+
 def let_shadow_rays_through(made_opaque) -> None:
     """Give materials their transparency back (see `MaterialLobes`), but for the rays of the camera."""
-    for target, before in made_opaque:
+    for target, before, level in made_opaque:
         tree = target.id_data
         is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
         if target.type != "SHADER":
-            tree.links.new(computed("MAXIMUM", is_camera_ray, before), target)
+            if level:
+                tree.links.new(computed("MAXIMUM", is_camera_ray, before), target)
+            else:
+                tree.links.new(computed("MINIMUM", computed("SUBTRACT", 1.0, is_camera_ray), before), target)
             continue
         now = live_link(target)
         node = tree.nodes.new("ShaderNodeMixShader")

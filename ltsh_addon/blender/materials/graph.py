@@ -284,12 +284,6 @@ def is_seen_through(output, shaders: SurfaceShaders) -> bool:
     return live_link(output.inputs["Volume"]) is not None
 
 
-def bypass(node, source) -> None:
-    """Feed everything that `node` feeds from the socket `source` instead."""
-    for target in [link.to_socket for link in node.outputs[0].links]:
-        node.id_data.links.new(source, target)
-
-
 def cut(socket) -> None:
     """Take away what feeds the input `socket`."""
     for link in list(socket.links):

@@ -14,7 +14,7 @@ from ...cycles.images import EXTENSIONS, INTERPOLATIONS
 from ...cycles.lobes import LOBE_AOVS
 from ...files import save_array
 from ..render_settings import working_space
-from .graph import carry_out_of_group, cut, is_socket, live_link, material_output, source_behind
+from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
 from .values import is_srgb, opaque_pixels
 
 # Number of the map of the places on the UV map that is baked into.
@@ -106,6 +106,21 @@ def _known_encoding(image) -> bool | None:
     return None if is_other_space else is_srgb(image)
 
 
+def _alphas_in_use(tree, paths):
+    """Sockets of `tree` with the alphas of images that feed something: where they do not, Cycles shows other colors.
+
+    Those of the material and of the groups that `paths` lead through.
+    """
+    places = dict.fromkeys(groups[:depth] for groups in ((), *paths) for depth in range(len(groups) + 1))
+    for path in places:
+        for node in (path[-1].node_tree if path else tree).nodes:
+            if node.bl_idname == "ShaderNodeTexImage" and node.outputs["Alpha"].is_linked:
+                socket = node.outputs["Alpha"]
+                for group in reversed(path):
+                    socket = carry_out_of_group(group, socket)
+                yield socket
+
+
 class MaterialPlan:
     """The maps of one material and the nodes that show them in its place.
 
@@ -125,6 +140,7 @@ class MaterialPlan:
             {name: self._recorded(name, value, groups) for name, value in lobe.items()}
             for lobe, groups in zip(lobes, paths, strict=True)
         )
+        self._alphas = list(_alphas_in_use(self.tree, paths))
         self._output, self._surface, self._image_node, self._places = None, None, None, None
         self._emissions: dict[int, object] = {}  # nodes, by the map that they show
 
@@ -190,6 +206,9 @@ class MaterialPlan:
 
     def _emission(self, number):
         emission, sockets = self.tree.nodes.new("ShaderNodeEmission"), self._maps[number]
+        for alpha in self._alphas:
+            one = computed("MAXIMUM", alpha, value_of(emission.inputs["Strength"]), clamp=True)
+            self.tree.links.new(one, emission.inputs["Strength"])
         if number in self._colors:
             self.tree.links.new(sockets[0], emission.inputs["Color"])
             return emission

@@ -136,6 +136,50 @@ def test_transparency_is_cut_in_samples_and_reference(tmp_path, kind):
     assert abs(quadrature.bias(expected, halves["diffuse"].reshape(2, -1, 3))) < 1e-2
 
 
+def _colors_under_alpha(b):
+    """The outputs Color and Alpha of an image of one color, half clear."""
+    image = bpy.data.images.new("Veil", 2, 2, alpha=True)
+    image.pixels.foreach_set(np.tile(np.float32([0.8, 0.6, 0.4, 0.5]), 4))
+    image.pack()
+    node = b.new("ShaderNodeTexImage")
+    node.image = image
+    return node.outputs["Color"], node.outputs["Alpha"]
+
+
+def _principled_with_alpha(b, color, alpha):
+    surface = b.shader("BsdfPrincipled")
+    b.link(color, surface.node.inputs["Base Color"])
+    b.link(alpha, surface.node.inputs["Alpha"])
+    return surface
+
+
+def _diffuse_beside_clear(b, color, alpha, is_first):
+    surface = b.shader("BsdfDiffuse")
+    b.link(color, surface.node.inputs["Color"])
+    if not is_first:
+        return b.mix(alpha, b.clear(), surface)
+    clear = b.new("ShaderNodeMath")
+    clear.operation, clear.inputs[0].default_value = "SUBTRACT", 1.0
+    b.link(alpha, clear.inputs[1])
+    return b.mix(clear.outputs[0], surface, b.clear())
+
+
+@pytest.mark.parametrize("kind", ["principled", "first of a mix", "last of a mix", "group"])
+def test_colors_under_a_cut_alpha_are_those_of_the_image(tmp_path, kind):
+    """Cycles multiplies colors by alpha where the Alpha of the image feeds nothing."""
+    b = Build("Veil")
+
+    def fill():
+        if "mix" in kind:
+            return _diffuse_beside_clear(b, *_colors_under_alpha(b), kind == "first of a mix")
+        return _principled_with_alpha(b, *_colors_under_alpha(b))
+
+    surface, _, _ = seen_from_above(tmp_path, b.show(b.group(fill)[0] if kind == "group" else fill()))
+    expected = ((np.array([0.8, 0.6, 0.4]) + 0.055) / 1.055) ** 2.4
+    # Cycles keeps the product of colors and alpha in 8 bits: one of 102 steps is 1 % of an sRGB value.
+    assert np.abs(surface.diffuse_albedo / expected - 1.0).max() < 2.4 * 0.01 + 0.04 * (kind in ("principled", "group"))
+
+
 def test_every_unsupported_input_is_named_once(tmp_path):
     wanted = {
         "Subsurface Weight": 0.2,

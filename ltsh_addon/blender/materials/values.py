@@ -24,6 +24,7 @@ class ImageUse:
     mapping: tuple[tuple[float, float, float], tuple[float, float, float]]
     closest: bool
     extension: str  # one of EXTENSIONS
+    by_alpha: bool = False  # Cycles multiplies its colors by alpha, as the node's Alpha feeds nothing
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,8 @@ def _image(source: Source) -> Value | None:
     if place is None:
         return None
     uv_map, mapping = place
-    use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension)
+    by_alpha = node.image.alpha_mode == "STRAIGHT" and not node.outputs["Alpha"].is_linked
+    use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension, by_alpha)
     matrix = np.zeros((3, 4))
     if source.socket.name == "Alpha":
         matrix[:, 3] = 1.0

@@ -462,7 +462,8 @@ def _slot_values(value: Value) -> np.ndarray:
         rows[:3], rows[3, 3] = value.matrix, 1.0
         rows[4:6, :3] = use.mapping
         rows[4, 3] = use.closest
-        rows[5, 3] = EXTENSIONS.index(use.extension) + len(EXTENSIONS) * is_encoded(use.image)
+        encoding = is_encoded(use.image) * (1 + use.by_alpha)
+        rows[5, 3] = EXTENSIONS.index(use.extension) + len(EXTENSIONS) * encoding
     return rows
 
 

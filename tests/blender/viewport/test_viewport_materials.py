@@ -399,6 +399,30 @@ def test_missing_images_are_pink_and_named():
 
 
 @edits_with_graphics
+@pytest.mark.parametrize("interpolation", ["Linear", "Closest"])
+@pytest.mark.parametrize("is_used", [False, True])
+def test_colors_under_alpha_are_those_of_cycles(is_used, interpolation):
+    """Cycles multiplies the sRGB values of an image by its alpha where that feeds nothing."""
+    parts.empty_scene(*SIZE)
+    material, node, texture = textured("Decal", "Base Color")
+    texture.image, texture.interpolation = bpy.data.images.new("Decal", 2, 2, alpha=True), interpolation
+    texture.image.pixels.foreach_set(np.tile(np.float32([0.8, 0.6, 0.4, 0.5]), 4))
+    node.inputs["Specular IOR Level"].default_value = 0.0
+    if is_used:
+        material.node_tree.links.new(texture.outputs["Alpha"], node.inputs["Coat Roughness"])
+    parts.add_plane(material)
+    parts.add_area_light()
+    camera = parts.add_camera()
+    bpy.context.view_layer.update()
+    picture, _ = with_graphics(lambda: viewport_picture(camera, "diffuse", False))
+    color = picture.reshape(-1, 3)[picture.sum(axis=-1).argmax()]
+    values = np.array([0.8, 0.6, 0.4]) * (1.0 if is_used else 0.5)
+    expected = np.where(values > 0.04045, ((values + 0.055) / 1.055) ** 2.4, values / 12.92)
+    # Half floats, and images of 8 bits: half a step of 255 is 0.25 to 0.5 % of these values before they are decoded.
+    np.testing.assert_allclose(color / color[0], expected / expected[0], rtol=0.02)
+
+
+@edits_with_graphics
 def test_an_image_that_shines_is_seen_and_lights_nothing():
     """As a baked texture does; seen from above, by an orthographic camera."""
     parts.empty_scene(*SIZE)

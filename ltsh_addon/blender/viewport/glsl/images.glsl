@@ -26,7 +26,8 @@ float decoded(float value)
   return value <= 0.04045 ? value / 12.92 : pow((value + 0.055) / 1.055, 2.4);
 }
 
-vec4 texel_at(sampler2D image, ivec2 texel, ivec2 size, int extension, bool encode)
+/* `encode`: as the sRGB value that Cycles interpolates; `by_alpha`: times its alpha, as Cycles has it then. */
+vec4 texel_at(sampler2D image, ivec2 texel, ivec2 size, int extension, bool encode, bool by_alpha)
 {
   if (extension == EXTENSION_CLIP && (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size)))) {
     return vec4(0.0);
@@ -34,7 +35,7 @@ vec4 texel_at(sampler2D image, ivec2 texel, ivec2 size, int extension, bool enco
   ivec2 place = ivec2(wrapped(texel.x, size.x, extension), wrapped(texel.y, size.y, extension));
   vec4 value = texelFetch(image, place, 0);
   if (encode) {
-    value.rgb = vec3(encoded(value.r), encoded(value.g), encoded(value.b));
+    value.rgb = vec3(encoded(value.r), encoded(value.g), encoded(value.b)) * (by_alpha ? value.a : 1.0);
   }
   return value;
 }
@@ -53,22 +54,23 @@ vec3 slot_value(sampler2D image, int slot, vec2 uv)
   int code = int(row_v.w + 0.5);
   int extension = code % EXTENSIONS;
   bool encode = code >= EXTENSIONS;
+  bool by_alpha = code >= 2 * EXTENSIONS;
   ivec2 size = textureSize(image, 0);
   vec2 texel = vec2(dot(row_u.xyz, place), dot(row_v.xyz, place)) * vec2(size);
   vec4 value;
   if (row_u.w > 0.5) {
-    value = texel_at(image, ivec2(floor(texel)), size, extension, false);
-    encode = false;
+    value = texel_at(image, ivec2(floor(texel)), size, extension, by_alpha, by_alpha);
+    encode = by_alpha;
   }
   else {
     texel -= 0.5;
     ivec2 corner = ivec2(floor(texel));
     vec2 share = texel - floor(texel);
-    vec4 low = mix(texel_at(image, corner, size, extension, encode),
-                   texel_at(image, corner + ivec2(1, 0), size, extension, encode),
+    vec4 low = mix(texel_at(image, corner, size, extension, encode, by_alpha),
+                   texel_at(image, corner + ivec2(1, 0), size, extension, encode, by_alpha),
                    share.x);
-    vec4 high = mix(texel_at(image, corner + ivec2(0, 1), size, extension, encode),
-                    texel_at(image, corner + ivec2(1, 1), size, extension, encode),
+    vec4 high = mix(texel_at(image, corner + ivec2(0, 1), size, extension, encode, by_alpha),
+                    texel_at(image, corner + ivec2(1, 1), size, extension, encode, by_alpha),
                     share.x);
     value = mix(low, high, share.y);
   }

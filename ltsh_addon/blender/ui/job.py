@@ -56,6 +56,7 @@ MOST = 0.99
 # Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
+DIRECT_SECONDS = 3.0  # of a sample of Cycles' direct light
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
 SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # of shadows with `USUAL_RAYS`
 USUAL_RAYS = 256
@@ -167,7 +168,7 @@ def steps(runs: list[Run]) -> list[Step]:
 def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     pixels = 1e-6 * math.prod(options.resolution)
     points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
-    half = rendered + SAMPLE_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
+    half = rendered + DIRECT_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
     sampling, shading = shading_steps(points, options.sub_samples, _rays(options), options.techniques)
     return [
         *sampling,

@@ -502,7 +502,8 @@ class LiveShadows:
             try:
                 outcome = request.shares(lambda stage, fraction: not self._stop.is_set())
             except Exception as error:
-                outcome = error
+                # With its traceback it is part of a circle, which keeps the samples of the picture.
+                outcome = error.with_traceback(None)
             self._outcomes.append((request, outcome))
             if isinstance(outcome, Exception):
                 break

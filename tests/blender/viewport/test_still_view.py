@@ -156,6 +156,26 @@ def test_of_very_many_lights_shadows_are_left_out_and_named():
     assert "2000 lights" in too_many(2000, (1920, 1080)) and "15.4 GiB" in too_many(2000, (1920, 1080))
 
 
+def test_shadows_that_are_stopped_leave_nothing_of_their_picture():
+    """At once, not when Python looks for circles the next time: samples of a window take hundreds of MiB."""
+
+    class Picture:
+        def shares(self, progress):
+            raise Cancelled("stopped")
+
+    gc.collect()
+    gc.disable()
+    try:
+        live, picture = LiveShadows(), Picture()
+        live._trace([picture])
+        left = [weakref.ref(live), weakref.ref(picture)]
+        live.stop()
+        del live, picture
+        assert [one() for one in left] == [None] * 2
+    finally:
+        gc.enable()
+
+
 def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
     with_graphics(lambda: None)
     camera = set_up_scene()

@@ -47,7 +47,7 @@ NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
 # Shares by which the shapes of two pictures may differ: sizes are whole pixels.
 SAME_SHAPE = 0.01
 MOST_NOTES = 4
-FEWEST_LETTERS = 20  # no line is broken into shorter ones
+FEWEST_LETTERS, LONG_WORD = 8, 20  # no line is broken into shorter ones, and shorter words are not broken
 TEXT_SIZE, LINE = 11.0, 1.4  # and from line to line
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
@@ -502,7 +502,8 @@ def wrapped(lines: list[tuple[str, tuple]], width: float, width_of) -> list[tupl
     broken = []
     for text, color in lines:
         letters = max(FEWEST_LETTERS, int(width * len(text) / max(width_of(text), 1.0)))
-        broken += [(part, color) for part in textwrap.wrap(text, letters, subsequent_indent="  ")]
+        parts = textwrap.wrap(text, letters, subsequent_indent="  ", break_long_words=letters >= LONG_WORD)
+        broken += [(part, color) for part in parts]
     return broken
 
 

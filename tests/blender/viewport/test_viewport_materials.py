@@ -379,6 +379,11 @@ def test_long_lines_of_the_view_are_broken():
     assert lines[-1] == ("short", "blue") and len(lines) > 2
     assert all(6.0 * len(part) <= 200.0 for part, _ in lines)
     assert " ".join(part.strip() for part, color in lines if color == "red") == text
+    # Between a toolbar and a sidebar of twice the scale there may be room for a word alone.
+    assert view.wrapped([("No bounces", "red")], 110.0, lambda part: 15.0 * len(part)) == [
+        ("No", "red"),
+        ("  bounces", "red"),
+    ]
 
 
 @edits_with_graphics

@@ -21,7 +21,7 @@ from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
 from ..materials.aovs import KeptByCycles
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
-from .emission import NO_FACTOR, Falloff, emission_of, open_studio
+from .emission import Falloff, ObjectFacts, emission_of, open_studio, what_is_lost
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
 from .textures import UnseenLight, look_at_area_lights
@@ -95,7 +95,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             continue
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
-            placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory)))
+            placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory, instance)))
             inventory.settings[light.name] = [ob.data.energy, ob.data.exposure, *ob.data.color]
             if cycles_setting(ob.data, "use_multiple_importance_sampling") and ob.data.type == "AREA":
                 hit.append(light)
@@ -310,7 +310,7 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     return value
 
 
-def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLight | None:
+def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None) -> UnseenLight | None:
     """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
     light = ob.data
     if tree_in_use(light) is None:
@@ -318,19 +318,37 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory) -> UnseenLig
     emission = emission_of(light)
     if emission.plain:
         return None
-    is_point = light.type != "AREA"
-    if emission.directional and light.type in ("AREA", "SUN"):
-        nodes = ", ".join(sorted(emission.directional))
-        inventory.warn(
-            f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
-        )
-    if emission.falloff is None:
-        inventory.warn(f"light {ob.original.name!r}: {NO_FACTOR}")
-    if light.type == "SUN" and emission.varies:
-        inventory.warn(f"light {ob.original.name!r}: its emission varies over the sun, shaded as in its middle")
-    by_ray = bool(emission.directional)
-    varies = emission.varies or (is_point and by_ray)
-    return UnseenLight(light.original, matrix, varies, emission.falloff or Falloff(), is_point, by_ray)
+    for problem in what_is_lost(emission, is_light=True):
+        inventory.warn(f"light {ob.original.name!r}: {problem}")
+    shared = {
+        "falloff": emission.falloff or Falloff(),
+        "facts": ObjectFacts.of(ob, instance),
+        "instance": (ob.original.name_full, *_instance_key(instance)),
+    }
+    if light.type in ("AREA", "SUN"):
+        if emission.directional and light.type == "AREA":
+            nodes = ", ".join(sorted(emission.directional))
+            inventory.warn(
+                f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
+            )
+        is_placed = light.type == "SUN" or emission.is_placed
+        return UnseenLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
+    is_ball = not light.use_soft_falloff and light.shadow_soft_size > 0.0
+    # Cycles' UV of spots goes with the direction. Disks that turn to each point shine along their normals.
+    by_spot = light.type == "SPOT" and emission.by_uv
+    within = bool(emission.directional) or by_spot
+    axes = matrix[:3, :3]
+    is_placed = emission.is_placed or by_spot or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE
+    return UnseenLight(
+        light.original, matrix, emission.varies, is_placed=emission.varies and is_placed,
+        by_ray=within or not is_ball, within=within, by_spot=by_spot, is_mixed=emission.by_place, **shared,
+    )  # fmt: skip
+
+
+def _instance_key(instance) -> tuple:
+    if instance is None or not instance.is_instance:
+        return ()
+    return instance.parent.original.name_full, *instance.persistent_id
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from mathutils import Color, Euler, Matrix, Vector
 
+from ...scene import listed
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
 from ..materials.graph import Source, is_group, is_socket, shaders_behind, source_of, surface_of, tree_in_use, value_of
 from ..materials.values import value_at
@@ -25,16 +26,30 @@ CONSTANT_NODES = frozenset(
         *("BrightContrast", "Invert", "RGBCurve", "VectorCurve", "FloatCurve", "RGBToBW", "LightFalloff"),
     )
 ) | {"FunctionNodeInputColor", "FunctionNodeInputVector", "FunctionNodeInputInt", "FunctionNodeInputBool"}
-# Values that depend on where the light shines, by node and output; all outputs where none is named.
+# What values depend on, by node and output; all outputs where none is named. On where the light shines:
 DIRECTIONAL = {
-    "ShaderNodeLightPath": (),
     "ShaderNodeLayerWeight": (),
     "ShaderNodeFresnel": (),
-    "ShaderNodeCameraData": (),
-    "ShaderNodeTexIES": (),
+    "ShaderNodeTexIES": (),  # unless something is linked to its vector
     "ShaderNodeNewGeometry": ("Incoming",),
-    "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),
+    "ShaderNodeTexCoord": ("Reflection",),
 }
+# On the camera of the picture:
+OF_CAMERA = {"ShaderNodeCameraData": (), "ShaderNodeTexCoord": ("Camera", "Window")}
+# On the place in the world, or on the object, not only on the place on the light:
+PLACED = {
+    **{f"ShaderNode{name}": () for name in ("NewGeometry", "ObjectInfo", "VectorTransform", "Attribute", "Bump")},
+    **{f"ShaderNode{name}": () for name in ("CameraData", "Tangent", "NormalMap", "TexEnvironment", "TexSky")},
+    "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),  # and Object, where another one is named
+}
+# On the place on the light or its normal there; unlinked vectors of textures are such places, too.
+BY_PLACE = {
+    "ShaderNodeNewGeometry": ("Position", "Normal", "True Normal", "Parametric", "Tangent"),
+    "ShaderNodeTexCoord": ("Generated", "Normal", "UV", "Object", "Reflection"),
+    **{f"ShaderNode{name}": () for name in ("LayerWeight", "Fresnel", "UVMap", "Tangent", "Bump", "NormalMap")},
+}
+BY_UV = {"ShaderNodeNewGeometry": ("Parametric",), "ShaderNodeTexCoord": ("UV",), "ShaderNodeUVMap": ()}
+LIGHT_PATH, CAMERA_RAY, IES = "ShaderNodeLightPath", "Is Camera Ray", "ShaderNodeTexIES"
 
 
 LIGHT_FALLOFF = "ShaderNodeLightFalloff"
@@ -66,6 +81,11 @@ class Emission:
     plain: bool = False  # one Emission node, white, of strength 1
     varies: bool = False
     directional: set[str] = field(default_factory=set)  # labels of nodes
+    of_camera: set[str] = field(default_factory=set)  # labels of nodes
+    of_path: set[str] = field(default_factory=set)  # outputs of Light Path nodes but for CAMERA_RAY
+    is_placed: bool = False  # it has to be looked at where it stands
+    by_place: bool = False
+    by_uv: bool = False
     falloff: Falloff | None = Falloff()  # a factor of all of it; None: Light Falloff nodes do something else
 
 
@@ -242,6 +262,8 @@ def _value(value):
         return _values(value)
     if isinstance(value, bpy.types.Text):
         return value.as_string()
+    if isinstance(value, bpy.types.Object):
+        return value.name_full, *map(tuple, value.matrix_world)
     if isinstance(value, bpy.types.bpy_struct):
         return value.name_full if isinstance(value, bpy.types.ID) else ""
     return value
@@ -263,12 +285,98 @@ def _note_value(source: Source | None, found: Emission, seen: set) -> None:
     if key in seen:
         return
     seen.add(key)
-    kind = source.node.bl_idname
-    if kind in DIRECTIONAL and (not DIRECTIONAL[kind] or source.socket.name in DIRECTIONAL[kind]):
-        found.directional.add(source.node.bl_label)
+    node, kind, output = source.node, source.node.bl_idname, source.socket.name
+    vector = node.inputs.get("Vector") if kind.startswith("ShaderNodeTex") else None
+    is_free = vector is not None and vector.enabled and not vector.is_linked
+    if _is_among(source, DIRECTIONAL) and (kind != IES or is_free):
+        found.directional.add(node.bl_label)
+    if _is_among(source, OF_CAMERA):
+        found.of_camera.add(node.bl_label)
+    if kind == LIGHT_PATH and output != CAMERA_RAY:
+        found.of_path.add(output)
+    found.is_placed |= _is_among(source, PLACED) or (output == "Object" and getattr(node, "object", None) is not None)
+    found.by_place |= _is_among(source, BY_PLACE) or (is_free and kind != IES)
+    found.by_uv |= _is_among(source, BY_UV) or (is_free and kind == "ShaderNodeTexImage")
     found.varies |= kind not in CONSTANT_NODES
-    for entry in source.node.inputs:
+    for entry in node.inputs:
         _note_value(source_of(entry, source.groups), found, seen)
+
+
+def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
+    outputs = kinds.get(source.node.bl_idname)
+    return outputs is not None and (not outputs or source.socket.name in outputs)
+
+
+def what_is_lost(emission: Emission, is_light: bool) -> list[str]:
+    """What of the emission of a light, or else a material, is not shaded as Cycles has it, but for its direction."""
+    found = []
+    if emission.of_camera:
+        nodes = ", ".join(sorted(emission.of_camera))
+        found.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")
+    # Cycles asks lights for what they emit with no kind of ray, and materials with different ones.
+    paths = sorted(name for name in emission.of_path if not (is_light and name.startswith("Is ")))
+    if paths:
+        found.append(
+            f"its emission depends on {listed(paths, 3)} of a Light Path node, of which Cycles takes a mixture that "
+            "hangs on how it samples, shaded as seen by a camera right before it"
+        )
+    if emission.falloff is None:
+        found.append(NO_FACTOR)
+    return found
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """What Object Info nodes say of an object, but for its place."""
+
+    color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    index: int = 0
+    random: float = 0.0
+
+    @classmethod
+    def of(cls, ob, instance=None) -> ObjectFacts:
+        """Those of an object, or of an instance of it."""
+        is_made = instance is not None and instance.is_instance
+        random = instance.random_id if is_made else _random_id(ob.name)
+        return cls(tuple(ob.color), ob.pass_index, random / 0xFFFFFFFF)
+
+
+def _random_id(name: str) -> int:
+    """The random number of an object by its name, as in Cycles: lookup3 (B. Jenkins 2006) of a sum of its letters."""
+    mask, key = 0xFFFFFFFF, 0
+    for letter in np.frombuffer(name.encode(), np.int8).tolist():
+        key = (37 * key + letter) & mask
+    start = 0xDEADBEEF + (2 << 2) + 13
+    a, b, c = (start + key) & mask, start, start
+    for bits in (14, 11, 25, 16, 4, 14, 24):
+        c ^= b
+        c = (c - (b << bits | b >> (32 - bits))) & mask
+        a, b, c = b, c, a
+    return b
+
+
+@contextmanager
+def seen_by_surfaces(blocks, random: float):
+    """Meanwhile no ray is one of a camera for the nodes of materials and lights, and `random` is that of the object."""
+    values = {LIGHT_PATH: (CAMERA_RAY, 0.0), "ShaderNodeObjectInfo": ("Random", random)}
+    moved = []
+    try:
+        for tree in trees_of(blocks):
+            for node in [node for node in tree.nodes if node.bl_idname in values]:
+                name, value = values[node.bl_idname]
+                targets = [link.to_socket for link in node.outputs[name].links]
+                if targets:
+                    own = tree.nodes.new("ShaderNodeValue")
+                    own.outputs[0].default_value = value
+                    moved.append((tree, own, node.outputs[name], targets))
+                    for target in targets:
+                        tree.links.new(own.outputs[0], target)
+        yield
+    finally:
+        for tree, own, output, targets in moved:
+            for target in targets:
+                tree.links.new(output, target)
+            tree.nodes.remove(own)
 
 
 PIXELS = 256
@@ -282,14 +390,15 @@ CLIP = 1e-3
 class Studio:
     """A scene with one object and a camera that looks at it; use `open_studio`."""
 
-    def __init__(self, scene, camera):
-        self.scene, self.camera = scene, camera
+    def __init__(self, scene, camera, base):
+        self.scene, self.camera, self.base = scene, camera, base
 
     @contextmanager
-    def show(self, ob, matrix: np.ndarray):
-        """Meanwhile `ob`, an object of no other scene, stands at `matrix` (4, 4)."""
+    def show(self, ob, matrix: np.ndarray, facts: ObjectFacts):
+        """Meanwhile `ob`, an object of no other scene, stands at `matrix` (4, 4), which may be sheared."""
         self.scene.collection.objects.link(ob)
-        ob.matrix_world = Matrix(matrix.tolist())
+        ob.parent, ob.matrix_parent_inverse = self.base, Matrix(matrix.tolist())
+        ob.color, ob.pass_index = facts.color, facts.index
         try:
             yield
         finally:
@@ -317,14 +426,16 @@ class Studio:
         light = self.picture()
         return light[..., :3], light[..., 3] > 0.5
 
-    def look_around(self, forward, right, pixels: int) -> np.ndarray:
-        """Radiance (pixels, pixels, 3) that arrives at the origin from the quarter turn around `forward`; columns run
-        along `right`, row 0 is at its cross product with `forward`."""
-        axes = np.eye(4)
-        axes[:3, 0], axes[:3, 1], axes[:3, 2] = right, np.cross(right, forward), -forward
-        self.camera.matrix_world = Matrix(axes.tolist())
+    def look_around(self, center, axes, angle: float, reach: float, pixels: int) -> np.ndarray:
+        """Radiance (pixels, pixels, 3) that arrives at `center` from up to `angle` rad across around forward, for the
+        `axes` (forward, right); columns run along right, row 0 is at its cross product with forward. What is farther
+        away than `reach` in m is not seen, nor what is a thousand times closer."""
+        forward, right = axes
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = np.stack([right, np.cross(right, forward), -forward], axis=-1), center
+        self.camera.matrix_world = Matrix(matrix.tolist())
         lens, render = self.camera.data, self.scene.render
-        lens.type, lens.angle, lens.clip_start, lens.clip_end = "PERSP", 0.5 * np.pi, 1e-3, 10.0
+        lens.type, lens.angle, lens.clip_start, lens.clip_end = "PERSP", angle, 1e-3 * reach, reach
         render.resolution_x = render.resolution_y = pixels
         render.pixel_aspect_x = render.pixel_aspect_y = 1.0
         try:
@@ -376,9 +487,11 @@ def open_studio(of_scene):
     scene = bpy.data.scenes.new("Look at an emitter")
     lens = bpy.data.cameras.new("Look at an emitter")
     camera = bpy.data.objects.new("Look at an emitter", lens)
+    base = bpy.data.objects.new("Look at an emitter", None)
     try:
         scene.frame_set(of_scene.frame_current, subframe=of_scene.frame_subframe)
-        scene.collection.objects.link(camera)
+        for ob in (camera, base):
+            scene.collection.objects.link(ob)
         scene.camera, scene.world = camera, None
         lens.type, lens.sensor_fit = "ORTHO", "HORIZONTAL"
         render, cycles = scene.render, scene.cycles
@@ -394,8 +507,9 @@ def open_studio(of_scene):
         settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGBA", "32"
         settings.exr_codec = "NONE"
         enable_passes(scene.view_layers[0], ("combined",))
-        yield Studio(scene, camera)
+        yield Studio(scene, camera, base)
     finally:
         bpy.data.scenes.remove(scene)
         bpy.data.objects.remove(camera)
+        bpy.data.objects.remove(base)
         bpy.data.cameras.remove(lens)

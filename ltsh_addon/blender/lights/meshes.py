@@ -14,7 +14,17 @@ from ...cycles.planar_polygons import FlatPolygon
 from ...scene import AreaLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, live_link, material_output
-from .emission import NO_FACTOR, PIXELS, Emission, Falloff, Studio, emission_of, falloff_left_out
+from .emission import (
+    PIXELS,
+    Emission,
+    Falloff,
+    ObjectFacts,
+    Studio,
+    emission_of,
+    falloff_left_out,
+    seen_by_surfaces,
+    what_is_lost,
+)
 from .linking import Receivers
 
 
@@ -27,6 +37,7 @@ class Placement:
     slots: np.ndarray  # (T,) index of the material slot
     matrix: np.ndarray  # (4, 4)
     mesh: object = None  # copy of the evaluated mesh, where a texture must be looked at
+    facts: ObjectFacts = ObjectFacts()
 
 
 @dataclass
@@ -80,6 +91,7 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             placement = _placement(ob, matrix, found[key], depsgraph if copies else None)
             if placement is not None:
+                placement.facts = ObjectFacts.of(ob, instance)
                 found[key].placements.append(placement)
                 instancer = surface_instancer(instance)
                 if instancer is not None:
@@ -245,8 +257,8 @@ def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
         if emission.emits and emission.directional:
             nodes = ", ".join(sorted(emission.directional))
             warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
-        if emission.emits and emission.falloff is None:
-            warn(f"material {material.name!r}: {NO_FACTOR}")
+        for problem in what_is_lost(emission, is_light=False) if emission.emits else ():
+            warn(f"material {material.name!r}: {problem}")
         if emission.emits and material.displacement_method != "BUMP" and displaces(material):
             warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
@@ -334,17 +346,20 @@ def _material_radiance(studio: Studio, material, known: dict) -> np.ndarray:
         mesh.from_pydata([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [], [(0, 1, 2, 3)])
         mesh.materials.append(material)
         up, u, v = np.array([0.0, 0.0, 1.0]), np.array([0.5, 0.0, 0.0]), np.array([0.0, 0.5, 0.0])
-        with _shown(studio, mesh, np.eye(4)):
+        with _shown(studio, mesh, np.eye(4), ObjectFacts()):
             images = [studio.look(np.zeros(3), u, v, way * up, pixels=4)[0] for way in (1.0, -1.0)]
         known[material.name_full] = np.array([image.mean(axis=(0, 1)) for image in images])
     return known[material.name_full]
 
 
-def _shown(studio: Studio, mesh, matrix: np.ndarray):
+@contextmanager
+def _shown(studio: Studio, mesh, matrix: np.ndarray, facts: ObjectFacts):
+    """Meanwhile `mesh` stands at `matrix`, as surfaces see it."""
     ob = bpy.data.objects.new("Look at a mesh", mesh)
     # Its light must not fall on itself.
     ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = ob.visible_shadow = False
-    return studio.show(ob, matrix)
+    with seen_by_surfaces(mesh.materials, facts.random), studio.show(ob, matrix, facts):
+        yield
 
 
 def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, warn) -> list[AreaLight]:
@@ -361,7 +376,7 @@ def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, wa
     most = max(1, GRID * GRID // (count * len(_sides(side))))
     lights, errors = [], []
     for placement, polygons in textured:
-        with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
+        with _shown(studio, _dressed(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in polygons:
                 for way in _sides(side):
                     light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
@@ -415,7 +430,7 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
     lights = []
     for placement, polygons in textured:
         largest = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())[:STAND_INS]
-        with _shown(studio, _dressed(mesh_light, placement), placement.matrix):
+        with _shown(studio, _dressed(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in largest:
                 for way in _sides(side):
                     light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))

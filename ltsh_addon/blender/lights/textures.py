@@ -12,24 +12,50 @@ from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
 from ...scene import AreaLight, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
-from .emission import PIXELS, Falloff, Studio, falloff_left_out
+from .emission import PIXELS, Falloff, ObjectFacts, Studio, falloff_left_out, seen_by_surfaces
 
-# Lights of one data block, with the same texture, that are looked at one by one; the others get what the first has.
+# Lights of one data block that have to be looked at where they stand: the others get what the first has.
 MOST_LOOKS = 100
-# Below this half angle in rad Cycles takes the first terms of a series instead of tan h - h.
-SMALL_SPREAD = 0.05
 
 
 @dataclass(frozen=True)
 class UnseenLight:
-    """An area light whose node tree has a say in its radiance."""
+    """A light whose node tree has a say in its radiance."""
 
     data: object  # the original light data block
     matrix: np.ndarray  # (4, 4) in the world
-    varies: bool  # over the light's surface, as far as its nodes tell
-    falloff: Falloff
-    is_point: bool = False  # a point, spot or sun
-    by_ray: bool = False  # what it emits depends on where it shines
+    varies: bool  # over the light's surface or by direction, as far as its nodes tell
+    falloff: Falloff = Falloff()
+    is_placed: bool = False  # it has to be looked at where it stands
+    # Of points and spots: what it emits goes with the direction, as from its middle; it is to be looked at from within,
+    # or as a spot; it also goes with the place on the light.
+    by_ray: bool = False
+    within: bool = False
+    by_spot: bool = False
+    is_mixed: bool = False
+    facts: ObjectFacts = ObjectFacts()
+    instance: tuple = ()  # tells instances of the data apart, whatever changes of them
+
+    @property
+    def flags(self) -> dict:
+        """The fields that are True or False, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, bool)}
+
+    @property
+    def key(self) -> tuple:
+        """Tells what is to be looked at apart: data, or instances of them."""
+        return self.data.session_uid, *(self.instance if self.is_placed else ())
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where it is looked at, (4, 4)."""
+        return self.matrix if self.is_placed else np.eye(4)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """Axes (3, 3) of patterns of points and spots."""
+        linear = self.matrix[:3, :3]
+        return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
 
 
 def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
@@ -41,128 +67,171 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
             continue
         source = unseen[position]
         own = seen.setdefault(source.data.name_full, [])
-        if not own or (source.varies and len(own) < MOST_LOOKS):
-            own.append(
-                point_factor(light.is_distant, source, studio) if source.is_point else _factor(light, source, studio)
-            )
-            factor, covered = own[-1]
+        if not own or (source.is_placed and len(own) < MOST_LOOKS):
+            own.append(seen_factor(source, studio))
+            found = own[-1]
         else:
-            factor, covered = own[0]
-            if source.varies:
-                warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the texture of the first")
+            found = own[0]
+            if source.is_placed:
+                warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the nodes of the first")
         if not light.is_distant:
             light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
         elif source.falloff != Falloff():
             warn(f"light {light.name!r}: its Light Falloff has no distance, shaded as its Strength")
         if light.is_facing or light.is_distant:
-            result.extend(with_pattern(light, factor, source, warn))
-            continue
-        result.extend(_with_factor(light, factor, covered, warn))
+            result.extend(with_pattern(light, found, source, warn))
+        else:
+            result.extend(_with_factor(light, found.factor, warn))
     return result
 
 
-def spread_peak(spread: float) -> float:
-    """By what the radiance of a light of `spread` rad exceeds, straight ahead, that of one of 180 degrees."""
-    half = 0.5 * spread
-    if spread >= np.pi - 1e-6:
-        return 1.0
-    tangent = np.tan(half)
-    return float(3.0 * tangent / half**3 if half <= SMALL_SPREAD else tangent / (tangent - half))
+@dataclass(frozen=True)
+class SeenNodes:
+    """What the node tree of a light multiplies its radiance by."""
+
+    # (H, W, 3): of area lights columns run along half_u, row 0 is at +half_v; of points and spots by direction, as of a
+    # `Pattern`; (1, 1, 3): it is the same everywhere, as that of suns.
+    factor: np.ndarray
+    lost: float = 0.0  # how far off that is, as a share, where it goes with direction and place, or varies over a sun
 
 
-def _factor(light: AreaLight, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
-    """What the node tree multiplies the radiance by (H, W, 3), and the pixels (H, W) on the light.
+def seen_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+    """What Cycles sees of the nodes of a light."""
+    return {"AREA": _area_factor, "SUN": _sun_factor}.get(source.data.type, _point_factor)(source, studio)
 
-    Columns run along half_u, row 0 is at +half_v.
-    """
-    ob = bpy.data.objects.new("Look at a light", source.data)
-    ob.visible_camera = True
-    pixels = PIXELS if source.varies else 8
-    with falloff_left_out([source.data]), studio.show(ob, source.matrix):
-        image, _ = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
-    if np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0:
+
+def _area_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+    data, place = source.data, source.place
+    size_v = data.size if data.shape in ("SQUARE", "DISK") else data.size_y
+    half_u, half_v = 0.5 * data.size * place[:3, 0], 0.5 * size_v * place[:3, 1]
+    direction = -place[:3, 2] / np.linalg.norm(place[:3, 2])
+    with _standing(source, studio, {"spread": np.pi}):
+        image, _ = studio.look(place[:3, 3], half_u, half_v, direction, PIXELS if source.varies else 8)
+    if np.dot(np.cross(half_u, half_v), direction) < 0.0:
         image = image[::-1]
-    plain = light.radiance * spread_peak(light.spread)
-    factor = np.divide(image, plain, out=np.zeros_like(image), where=plain != 0.0)
-    rows, columns = image.shape[:2]
-    covered = np.ones((rows, columns), bool)
-    if light.is_round:
-        # Pixels that the edge goes through are partly dark.
-        x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-        covered = np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
-    return factor, covered
+    return SeenNodes(image / (_WHITE["energy"] / np.pi))
 
 
 # Of the map of directions of a point or spot light: rows, and points along each side of the six views it is made of.
 PATTERN_ROWS, VIEW_PIXELS = 64, 192
-SMALL_RADIUS = 1e-3  # in place of none: m
-# Colors of a pattern that differ by more, as a share of the light, are said to be lost.
-PATTERN_COLORS = 0.05
+# In place of none: m, and of the distance from the origin.
+SMALL_RADIUS, SMALL_SHARE = 1e-3, 1e-4
+# Colors of a pattern that differ by more, as a share of the light, are said to be lost, and whatever else is lost.
+PATTERN_COLORS = MOST_LOST = 0.05
+# Of a sun: pixels along each side, and the angles in rad that it is looked at with.
+SUN_PIXELS, LEAST_SUN, WIDEST_SUN = 32, 1e-3, 2.9
 
 
-def point_factor(is_distant: bool, source: UnseenLight, studio: Studio) -> tuple[np.ndarray, np.ndarray]:
-    """What the node tree multiplies the radiance of a point, spot or sun by: (1, 1, 3), or where it varies (H, W, 3) by
-    direction in the frame of the light, as of a `Pattern`; all are covered."""
-    data = source.data.copy()
-    try:
-        if is_distant or not source.varies:
-            data = _white(data, "AREA", {"shape": "SQUARE", "size": 1.0, "spread": np.pi})
-            with _in_the_middle(data, studio):
-                image = studio.look(np.zeros(3), 0.5 * _AXES[0], 0.5 * _AXES[1], -_AXES[2], 8)[0]
-            factor = image.mean(axis=(0, 1), keepdims=True)
-        else:
-            radius = 1.0 if source.by_ray else max(data.shadow_soft_size, SMALL_RADIUS)
-            data = _white(data, "POINT", {"shadow_soft_size": radius, "use_soft_falloff": False})
-            with _in_the_middle(data, studio):
-                factor = _seen_from_all_sides(studio, source.by_ray, radius)
-    finally:
-        bpy.data.lights.remove(data)
-    factor = factor / (_WHITE["energy"] / np.pi)
-    return factor, np.ones(factor.shape[:2], bool)
+def _sun_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+    """The mean over the disk of a sun."""
+    angle = min(max(source.data.angle, LEAST_SUN), WIDEST_SUN)
+    toward = source.matrix[:3, 2] / np.linalg.norm(source.matrix[:3, 2])
+    right = np.cross(toward, np.eye(3)[np.argmin(np.abs(toward))])
+    axes = toward, right / np.linalg.norm(right)
+    with _standing(source, studio, {"angle": angle}):
+        image = studio.look_around(np.zeros(3), axes, angle, 1.0, SUN_PIXELS)
+    step = (np.arange(SUN_PIXELS) + 0.5) * (2.0 / SUN_PIXELS) - 1.0
+    inside = image[np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / SUN_PIXELS] / _WHITE["energy"]
+    mean = inside.mean(axis=0)
+    return SeenNodes(mean.reshape(1, 1, 3), _apart(inside, mean))
+
+
+def _apart(values: np.ndarray, expected: np.ndarray) -> float:
+    """How far apart two arrays are, on average, as a share of the second."""
+    return float(np.abs(values - expected).mean() / max(np.abs(expected).mean(), 1e-30))
+
+
+def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+    data, center = source.data, source.place[:3, 3]
+    small = max(SMALL_RADIUS, SMALL_SHARE * np.abs(center).max())
+    radius = max(data.shadow_soft_size, small)
+
+    def views(within: bool, radius: float) -> list[np.ndarray]:
+        """Pictures of the six sides."""
+        kind = "SPOT" if data.type == "SPOT" and source.by_spot else "POINT"
+        settings = {"shadow_soft_size": radius, "use_soft_falloff": False}
+        with _standing(source, studio, settings, kind):
+            found = [_side(studio, center, number, radius, within) for number in range(6)]
+        return [image / (_WHITE["energy"] / np.pi) for image in found]
+
+    within = source.within
+    if not source.by_ray:
+        return SeenNodes(_unfolded(views(False, radius), False))
+    seen = views(within, small)
+    factor = _unfolded(seen, within)
+    if not source.varies:
+        return SeenNodes(factor.mean(axis=(0, 1), keepdims=True))
+    if not source.is_mixed or radius == small:
+        return SeenNodes(factor)
+    if data.use_soft_falloff or source.by_spot:
+        return SeenNodes(factor, _apart(_unfolded(views(within, radius), within), factor))
+    # Of a ball that is seen as a whole, the mean stands for its middle.
+    step = (np.arange(VIEW_PIXELS) + 0.5) * (2.0 / VIEW_PIXELS) - 1.0
+    disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
+    whole = np.array([image[disk] for image in views(False, radius)])
+    half = VIEW_PIXELS // 2
+    middle = np.array([image[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) for image in seen])[:, None]
+    scale = whole.mean() / max(middle.mean(), 1e-30)
+    return SeenNodes(factor * scale, _apart(middle * scale, whole))
 
 
 _AXES = np.eye(3)
 _WHITE = {"color": (1.0, 1.0, 1.0), "energy": 100.0, "exposure": 0.0, "normalize": False, "use_temperature": False}
 
 
-def _white(data, kind: str, settings: dict):
-    """The light `data` as one of another kind, white."""
-    name, data.type = data.name, kind
-    # Another type is another class.
-    data = bpy.data.lights[name]
-    data.animation_data_clear()
-    for key, value in {**_WHITE, **settings}.items():
-        setattr(data, key, value)
-    return data
-
-
 @contextmanager
-def _in_the_middle(data, studio):
-    """Meanwhile the light stands at the origin, without its falloff."""
-    ob = bpy.data.objects.new("Look at a light", data)
-    ob.visible_camera = True
-    with falloff_left_out([data]), studio.show(ob, np.eye(4)):
-        yield
+def _standing(source: UnseenLight, studio: Studio, settings: dict, kind: str = ""):
+    """Meanwhile the light, or one of another `kind` with its nodes, stands at its place, white and without falloff."""
+    data = source.data.copy()
+    try:
+        if kind and kind != data.type:
+            name, data.type = data.name, kind
+            # Another type is another class.
+            data = bpy.data.lights[name]
+        data.animation_data_clear()
+        if data.type == "SPOT":
+            settings = {**settings, "spot_blend": 0.0}
+        for key, value in {**_WHITE, **settings}.items():
+            setattr(data, key, value)
+        ob = bpy.data.objects.new("Look at a light", data)
+        ob.visible_camera = True
+        with falloff_left_out([data]), seen_by_surfaces([data], source.facts.random):
+            with studio.show(ob, source.place, source.facts):
+                yield
+    finally:
+        bpy.data.lights.remove(data)
 
 
-def _seen_from_all_sides(studio, by_ray: bool, radius: float) -> np.ndarray:
-    """The map (H, W, 3) of a ball: from six sides, or from within, where rays go against its normals."""
+def _side_axes(number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The axis out of a side of a cube, and one to its right."""
+    return _AXES[number // 2] * (-1.0) ** number, _AXES[(number // 2 + 1) % 3]
+
+
+def _side(studio: Studio, center, number: int, radius: float, within: bool) -> np.ndarray:
+    """A picture (N, N, 3) of a side of a ball, or from within of the one across."""
+    out, right = _side_axes(number)
+    if not within:
+        return studio.look(center, radius * right, radius * np.cross(out, right), out, VIEW_PIXELS, 1.0)[0]
+    # Spots are not met by rays from their middle.
+    place = center + 0.02 * radius * out
+    return studio.look_around(place, (-out, right), 0.5 * np.pi, 2.0 * radius, VIEW_PIXELS)
+
+
+def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
+    """The map (H, W, 3) of directions, of pictures of the six sides; those from within show it by rays that go
+    against its normals."""
     rows, columns = PATTERN_ROWS, 2 * PATTERN_ROWS
     polar = (np.arange(rows) + 0.5)[:, None] * (np.pi / rows)
     around = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
     x, y, z = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0.0 * around
     normal = np.stack([x, y, z], axis=-1)
     result, highest = np.zeros((rows, columns, 3)), np.full((rows, columns), -1.0)
-    for number in range(6):
-        out, right = _AXES[number // 2] * (-1.0) ** number, _AXES[(number // 2 + 1) % 3]
+    for number, image in enumerate(views):
+        out, right = _side_axes(number)
         facing = normal @ out
-        better, depth = facing > highest, np.ones_like(facing)
-        if by_ray:
-            # Light that goes out along the normal is met by a ray that goes the other way.
-            image, up, depth = studio.look_around(-out, right, VIEW_PIXELS), np.cross(right, -out), -facing
-        else:
-            up = np.cross(out, right)
-            image = studio.look(np.zeros(3), radius * right, radius * up, out, VIEW_PIXELS, 1.0)[0]
+        better = facing > highest
+        # Light that goes out along the normal is met by a ray that goes the other way.
+        up, depth = (np.cross(right, -out), -facing) if within else (np.cross(out, right), np.ones_like(facing))
         depth = np.where(better & (depth != 0.0), depth, 1.0)
         row, column = (
             np.clip((normal @ axis / depth + 1.0) * 0.5 * VIEW_PIXELS, 0, VIEW_PIXELS - 1).astype(int)
@@ -172,27 +241,36 @@ def _seen_from_all_sides(studio, by_ray: bool, radius: float) -> np.ndarray:
     return result
 
 
-def with_pattern(light: AreaLight, factor: np.ndarray, source: UnseenLight, warn) -> list[AreaLight]:
-    """A point, spot or sun whose radiance its node tree multiplies by `factor`, as from `point_factor`."""
+def with_pattern(light: AreaLight, found: SeenNodes, source: UnseenLight, warn) -> list[AreaLight]:
+    """A point, spot or sun with what was `found` of its nodes."""
+    factor = found.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
     mean = (factor * weights).sum(axis=(0, 1)) / (weights.sum() * factor.shape[1])
     if not mean.any():
         return []
     light = replace(light, radiance=light.radiance * mean)
+    if found.lost > MOST_LOST:
+        what = "over the sun, shaded as its mean" if light.is_distant else "over the light, shaded as in its middle"
+        warn(f"light {light.name!r}: its emission varies {what}, up to {100.0 * found.lost:.0f} % off on average")
     if factor.shape[0] == 1:
         return [light]
     values = factor.mean(axis=-1) / mean.mean()
-    apart = np.abs(factor - values[..., None] * mean).mean() / max(np.abs(mean).mean(), 1e-30)
+    apart = _apart(values[..., None] * mean, factor)
     if apart > PATTERN_COLORS:
         warn(f"light {light.name!r}: the colors of its pattern are shaded as their mean, {100.0 * apart:.0f} % off")
-    axes = np.linalg.inv(source.matrix[:3, :3] / np.linalg.norm(source.matrix[:3, :3], axis=0))
-    # A light without a radius shines everywhere with the normal that goes there.
-    by_ray = source.by_ray or source.data.shadow_soft_size == 0.0
-    return [replace(light, pattern=Pattern(axes, values, by_ray))]
+    return [replace(light, pattern=Pattern(source.axes, values, source.by_ray))]
 
 
-def _with_factor(light: AreaLight, factor: np.ndarray, covered: np.ndarray, warn) -> list[AreaLight]:
-    patches = cut_into_patches(factor * light.radiance, covered)
+def _covered(light: AreaLight, rows: int, columns: int) -> np.ndarray:
+    """Which pixels (rows, columns) are on the light; those that the edge of a round one goes through are partly dark."""
+    if not light.is_round:
+        return np.ones((rows, columns), bool)
+    x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    return np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
+
+
+def _with_factor(light: AreaLight, factor: np.ndarray, warn) -> list[AreaLight]:
+    patches = cut_into_patches(factor * light.radiance, _covered(light, *factor.shape[:2]))
     if patches.error > ERROR:
         warn(
             f"light {light.name!r}: its texture is shaded as {len(patches.smallest)} patches of constant radiance, "
@@ -207,11 +285,16 @@ MOST_PATCHES = 64
 POINTS, SUB = 128, 2
 
 
+# Lights with nodes of which the patches are kept.
+MOST_SEEN = 256
+
+
 class ShownTextures:
-    """Patches of the images on lights, kept for as long as neither the images nor the nodes change."""
+    """Patches of the images and nodes of lights, kept for as long as these do not change."""
 
     def __init__(self):
         self._patches: dict[tuple, Patches | None] = {}
+        self._seen: dict[tuple, tuple[SeenNodes, Patches]] = {}
 
     def clear(self) -> None:
         """Read all images again."""
@@ -220,15 +303,19 @@ class ShownTextures:
     def split(self, light: AreaLight, factor: Value, notes: list[str]) -> list[AreaLight] | None:
         """`light` times `factor` as patches, named in `notes` where they are coarse; None: not resolved."""
         patches = self._patches_of(light, factor)
-        if patches is None:
-            return None
-        if patches.error > ERROR:
-            notes.append(
-                f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
-                f"{100.0 * patches.error:.0f} % off on average"
-            )
-        shown = (patch for whole in split_light(light, patches) for patch in whole.patches)
-        return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
+        return None if patches is None else _shown_patches(light, patches, notes)
+
+    def split_seen(self, light: AreaLight, found: SeenNodes, notes: list[str]) -> list[AreaLight]:
+        """As `split`, of what was `found` of its nodes."""
+        key = id(found), light.is_round
+        if key not in self._seen:
+            if len(self._seen) >= MOST_SEEN:
+                self._seen.clear()
+            rows, columns = found.factor.shape[:2]
+            patches = cut_into_patches(found.factor, _covered(light, rows, columns), MOST_PATCHES)
+            # With what it was made of, whose number no other one gets meanwhile.
+            self._seen[key] = found, patches
+        return _shown_patches(light, self._seen[key][1], notes)
 
     def _patches_of(self, light: AreaLight, factor: Value) -> Patches | None:
         use = factor.image
@@ -238,6 +325,16 @@ class ShownTextures:
             texture = _texture(use)
             self._patches[key] = None if texture is None else _cut(texture, factor, light.is_round)
         return self._patches[key]
+
+
+def _shown_patches(light: AreaLight, patches: Patches, notes: list[str]) -> list[AreaLight]:
+    if patches.error > ERROR:
+        notes.append(
+            f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
+            f"{100.0 * patches.error:.0f} % off on average"
+        )
+    shown = (patch for whole in split_light(light, patches) for patch in whole.patches)
+    return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
 
 
 def _texture(use) -> ImageTexture | None:

@@ -545,21 +545,24 @@ LAMPS = "look at lights"  # a stage, whose fraction says of how many there are f
 
 @dataclass(frozen=True)
 class UnseenLamp:
-    """The data of a point, spot or sun light in a .blend, whose nodes Cycles is to look at."""
+    """The data of a light in a .blend at whose nodes Cycles is to look; the rest is of `lights.textures.UnseenLight`."""
 
     path: str
     name: str
-    varies: bool
-    by_ray: bool
+    matrix: list  # (4, 4)
+    flags: dict
+    facts: dict
 
 
-def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Callable[[int, np.ndarray], bool]) -> None:
-    """What the nodes of `lamps` multiply their light by, at a frame, as `lights.textures.point_factor` has it:
-    `take(number, factor)` one after another, until it says no. Files go to `folder`. Raises as `extract` does."""
+def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Callable[..., bool]) -> None:
+    """What Cycles sees of the nodes of `lamps` at a frame, as `lights.textures.SeenNodes` has it:
+    `take(number, factor, lost)` one after another, until it says no. Files go to `folder`. Raises as `extract` does."""
 
     def watched(stage: str, fraction: float) -> bool | None:
         number = round(fraction * len(lamps)) - 1
-        return take(number, np.load(folder / f"{number}.npy")) if stage == LAMPS else None
+        if stage != LAMPS:
+            return None
+        return take(number, np.load(folder / f"{number}.npy"), float(np.load(folder / f"{number}_lost.npy")))
 
     run_child({"task": "lamps", "lamps": [asdict(lamp) for lamp in lamps], "frame": frame}, folder, watched)
 

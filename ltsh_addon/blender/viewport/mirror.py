@@ -34,7 +34,7 @@ from ..lights.area import area_light, note_unsupported, reason_to_leave_out, uns
 from ..lights.emission import emission_of, factors_of, nodes_as_text, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, ShownTextures, UnseenLight, point_factor, with_pattern
+from ..lights.textures import MOST_LOOKS, SeenNodes, ShownTextures, UnseenLight, seen_factor, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
@@ -51,8 +51,8 @@ MOST_LIGHTS = 2048
 # Why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has looked at them"
-# Gives the pattern of evaluated data with nodes, as of `point_factor`, or says why there is none.
-Patterns = Callable[[bpy.types.Light, UnseenLight], np.ndarray | str]
+# Gives what Cycles sees of evaluated data with nodes, or says why it is not known.
+Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
 
 
 def no_patterns(data, source: UnseenLight) -> str:
@@ -85,7 +85,7 @@ def view_lights(
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         shown = [
             light
-            for light in _with_nodes(plain, (ob, matrix), (textures, patterns), notes)
+            for light in _with_nodes(plain, instance, (textures, patterns), notes)
             if np.any(light.radiance != 0.0)
         ]
         if shown:
@@ -126,58 +126,72 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
     return constant_mesh_lights(found, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[int, np.ndarray]:
-    """What Cycles makes of the node trees of point, spot and sun lights, as of `point_factor`, by the session uid of
-    their data; afterwards `scene` is as it was."""
-    wanted, silent = {}, SimpleNamespace(warn=lambda text: None)
+def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
+    """What Cycles sees of the nodes of lights of which views must be told, by the `key` of the `UnseenLight`;
+    afterwards `scene` is as it was."""
+    wanted: dict[tuple, UnseenLight] = {}
+
+    def note(data, source: UnseenLight) -> str:
+        if len(wanted) < MOST_LOOKS:
+            wanted[source.key] = source
+        return NOT_YET
+
+    receivers, looked = Receivers([]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
-        if ob.type == "LIGHT" and ob.data.type != "AREA" and len(wanted) < MOST_LOOKS:
-            source = unseen_light(ob, np.array(instance.matrix_world, dtype=np.float64), silent)
-            if source is not None:
-                wanted[source.data.session_uid] = source
+        if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
+            matrix = np.array(instance.matrix_world, dtype=np.float64)
+            if not reason_to_leave_out(ob, matrix):
+                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, looked, [])
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {uid: point_factor(source.data.type == "SUN", source, studio)[0] for uid, source in wanted.items()}
+        return {key: seen_factor(source, studio) for key, source in wanted.items()}
 
 
 @dataclass
 class _Look:
     """A second Blender at work."""
 
-    states: dict[int, tuple]  # of the lights that it has not told about yet
-    found: list[tuple[int, np.ndarray]] = field(default_factory=list)  # what it has told
+    states: dict[tuple, tuple]  # of the lights that it has not told about yet, by their keys
+    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # what it has told
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
 
 
 class LiveLamps:
-    """Point, spot and sun lights as Cycles sees their nodes, for all windows: a second Blender looks at those that are
-    new or changed while the views go on. Lights are told by the session uids of their data."""
+    """Lights as Cycles sees their nodes, for all windows: a second Blender looks at those that are new or changed while
+    the views go on. Lights are told by the `key` of `UnseenLight`."""
 
     def __init__(self):
-        self._known: dict[int, tuple[tuple, np.ndarray | str]] = {}  # state of its nodes, and what was found
-        self._wanted: dict[int, tuple] = {}
+        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of its nodes, and what was found
+        self._wanted: dict[tuple, tuple] = {}
+        self._sources: dict[tuple, UnseenLight] = {}  # as of what is wanted
         self._changed, self._images = 0.0, 0
         self._look: _Look | None = None
 
-    def pattern(self, data, source: UnseenLight) -> np.ndarray | str:
+    def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
         """What was found last, or that nothing is known yet; lights that have changed since are looked at."""
-        uid, state = source.data.session_uid, self._state(data, source)
-        known, found = self._known.get(uid, ((), NOT_YET))
-        on_its_way = self._wanted.get(uid) or (self._look.states.get(uid) if self._look is not None else None)
+        key, state = source.key, self._state(data, source)
+        known, found = self._known.get(key, ((), NOT_YET))
+        on_its_way = self._wanted.get(key) or (self._look.states.get(key) if self._look is not None else None)
         if known == state:
-            self._wanted.pop(uid, None)
+            self._wanted.pop(key, None)
         elif on_its_way != state:
-            self._wanted[uid], self._changed = state, time.monotonic()
+            self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
         return found
 
     def _state(self, data, source: UnseenLight) -> tuple:
         text = nodes_as_text(data)
-        radius = 0.0 if data.type == "SUN" or source.by_ray else data.shadow_soft_size
-        return source.varies, source.by_ray, data.type == "SUN", radius, text, self._images if "image: " in text else 0
+        names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
+        if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
+            names = (*names, "shadow_soft_size")
+        if source.by_spot:
+            names = (*names, "spot_size")
+        where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
+        images = self._images if "image: " in text else 0
+        return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
 
     def note_images(self) -> None:
         """Lights with images are looked at again."""
@@ -202,44 +216,46 @@ class LiveLamps:
         has_ended = not look.thread.is_alive()
         news = bool(look.found)
         while look.found:
-            uid, factor = look.found.pop(0)
-            self._known[uid] = look.states.pop(uid), factor
+            key, found = look.found.pop(0)
+            self._known[key] = look.states.pop(key), found
         if has_ended:
             self._look = None
-            for uid, state in look.states.items():
+            for key, state in look.states.items():
                 if look.error:
-                    self._known[uid] = state, look.error
+                    self._known[key] = state, look.error
                 else:
-                    self._wanted.setdefault(uid, state)
+                    self._wanted.setdefault(key, state)
             news |= bool(look.error)
         # What has changed meanwhile is not worth finishing.
-        look.is_stopped |= any(uid in look.states for uid in self._wanted)
+        look.is_stopped |= any(key in look.states for key in self._wanted)
         return news
 
     def _begin(self, frame: int) -> bool:
         """Start a second Blender; True: that failed, and is to be said."""
         present = {light.session_uid: light for light in bpy.data.lights}
-        self._known = {uid: known for uid, known in self._known.items() if uid in present}
-        look = _Look({uid: state for uid, state in self._wanted.items() if uid in present})
+        self._known = {key: known for key, known in self._known.items() if key[0] in present}
+        look = _Look({key: state for key, state in self._wanted.items() if key[0] in present})
         self._wanted.clear()
         if not look.states:
             return False
         stack = ExitStack()
-        uids = list(look.states)
+        keys = list(look.states)
+        sources = [self._sources[key] for key in keys]
+        lights = [present[key[0]] for key in keys]
         try:
             folder = stack.enter_context(temporary_folder())
-            places = written(folder / "lamps.blend", [present[uid] for uid in uids])
+            places = written(folder / "lamps.blend", lights)
             lamps = [
-                client.UnseenLamp(str(place), present[uid].name, *look.states[uid][:2])
-                for uid, place in zip(uids, places, strict=True)
+                client.UnseenLamp(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
+                for place, light, source in zip(places, lights, sources, strict=True)
             ]
         except (OSError, RuntimeError) as error:
             stack.close()
-            self._known.update({uid: (look.states[uid], f"{NOT_RESOLVED}: {error_line(error)}") for uid in uids})
+            self._known.update({key: (look.states[key], f"{NOT_RESOLVED}: {error_line(error)}") for key in keys})
             return True
 
-        def take(number: int, factor: np.ndarray) -> bool:
-            look.found.append((uids[number], factor))
+        def take(number: int, factor: np.ndarray, lost: float) -> bool:
+            look.found.append((keys[number], SeenNodes(factor, lost)))
             return not look.is_stopped
 
         def work() -> None:
@@ -257,9 +273,11 @@ class LiveLamps:
         return False
 
 
-def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) -> list[AreaLight]:
-    """`light` with what its node tree makes of it: constants, images and, of an object and matrix, patterns."""
-    (ob, matrix), (textures, patterns), data = of, looked, of[0].data
+def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
+    """`light`, of a depsgraph `instance`, with what its node tree makes of it; `looked` are the textures and patterns
+    of `view_lights`."""
+    ob, (textures, patterns) = instance.object, looked
+    data = ob.data
     emission = None if tree_in_use(data) is None else emission_of(data)
     if emission is None or emission.plain:
         return [light]
@@ -278,19 +296,19 @@ def _with_nodes(light: AreaLight, of: tuple, looked: tuple, notes: list[str]) ->
         patches = textures.split(light, factor, notes) if factor is not None and is_area else None
         if patches is not None:
             return patches
-    problem = NOT_RESOLVED
-    if data.type != "AREA":
-        warnings: list[str] = []
-        unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append))
-        found = patterns(data, unseen)
-        if not isinstance(found, str):
-            notes += warnings
-            if not light.is_distant:
-                light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
-            return with_pattern(light, found, unseen, notes.append)
-        problem = found
-    notes.append(f"{light.name}: {problem}")
-    return [replace(light, falloff=0, smooth=0.0)]
+    warnings: list[str] = []
+    matrix = np.array(instance.matrix_world, dtype=np.float64)
+    unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
+    found = patterns(data, unseen)
+    if isinstance(found, str):
+        notes.append(f"{light.name}: {found}")
+        return [replace(light, falloff=0, smooth=0.0)]
+    notes += warnings
+    if not light.is_distant:
+        light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
+    if light.is_facing or light.is_distant:
+        return with_pattern(light, found, unseen, notes.append)
+    return textures.split_seen(light, found, notes)
 
 
 # Types of objects that views leave out, and what is said of them; so many names of each.

@@ -17,8 +17,8 @@ from ...scene import AreaLight, SceneError, error_line
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
-from ..lights.emission import Falloff, open_studio
-from ..lights.textures import UnseenLight, point_factor
+from ..lights.emission import ObjectFacts, open_studio
+from ..lights.textures import UnseenLight, seen_factor
 from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
 from ..materials.looks import world_radiance
 from ..process.client import GRAPHICS, LAMPS, VIEW_PASSES, VIEW_PNG
@@ -188,10 +188,12 @@ def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
             if lamp["name"] not in there.lights:
                 raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
             wanted.lights = [lamp["name"]]
-        source = UnseenLight(wanted.lights[0], np.eye(4), lamp["varies"], Falloff(), True, lamp["by_ray"])
+        facts = ObjectFacts(**lamp["facts"])
+        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
         with open_studio(scene) as studio:
-            factor, _ = point_factor(source.data.type == "SUN", source, studio)
-        save_array(folder / f"{number}.npy", factor)
+            found = seen_factor(source, studio)
+        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
+        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
         progress(LAMPS, (number + 1) / count)
     return {}
 
@@ -206,7 +208,7 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     scene, camera, sky, patterns = seen
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.data.session_uid, NOT_RESOLVED))
+    mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))
     mirror.sync(depsgraph)
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)

@@ -164,7 +164,10 @@ def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     if not source.is_mixed or radius == small:
         return SeenNodes(factor)
     if data.use_soft_falloff or source.by_spot:
-        return SeenNodes(factor, _apart(_unfolded(views(within, radius), within), factor))
+        # The mean over a disk is free of what changes its sign across the middle.
+        beside = _unfolded(views(within, radius), within) - factor
+        across = np.roll(beside[::-1], PATTERN_ROWS, axis=1)
+        return SeenNodes(factor, _apart(factor + 0.5 * (beside + across), factor))
     # Of a ball that is seen as a whole, the mean stands for its middle.
     step = (np.arange(VIEW_PIXELS) + 0.5) * (2.0 / VIEW_PIXELS) - 1.0
     disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
@@ -262,7 +265,7 @@ def with_pattern(light: AreaLight, found: SeenNodes, source: UnseenLight, warn) 
 
 
 def _covered(light: AreaLight, rows: int, columns: int) -> np.ndarray:
-    """Which pixels (rows, columns) are on the light; those that the edge of a round one goes through are partly dark."""
+    """The pixels (rows, columns) on the light; those that the edge of a round one goes through are partly dark."""
     if not light.is_round:
         return np.ones((rows, columns), bool)
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)

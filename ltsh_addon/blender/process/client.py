@@ -545,7 +545,7 @@ LAMPS = "look at lights"  # a stage, whose fraction says of how many there are f
 
 @dataclass(frozen=True)
 class UnseenLamp:
-    """The data of a light in a .blend at whose nodes Cycles is to look; the rest is of `lights.textures.UnseenLight`."""
+    """The data of a light in a .blend at whose nodes Cycles is to look, and fields of its `UnseenLight`."""
 
     path: str
     name: str
@@ -562,7 +562,7 @@ def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Calla
         number = round(fraction * len(lamps)) - 1
         if stage != LAMPS:
             return None
-        return take(number, np.load(folder / f"{number}.npy"), float(np.load(folder / f"{number}_lost.npy")))
+        return take(number, np.load(folder / f"{number}.npy"), np.load(folder / f"{number}_lost.npy").item())
 
     run_child({"task": "lamps", "lamps": [asdict(lamp) for lamp in lamps], "frame": frame}, folder, watched)
 

@@ -99,15 +99,25 @@ def test_a_light_without_emission_is_none(tmp_path):
     assert [light.name for light in assert_agrees(tmp_path)[2].lights] == ["Key"]
 
 
-def test_instances_have_their_own_look_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(textures, "MOST_LOOKS", 2)
+@pytest.mark.parametrize("is_placed", [False, True], ids=["on the light", "in the world"])
+def test_instances_have_a_look_of_their_own_where_they_need_one(tmp_path, monkeypatch, is_placed):
+    looks, look = [], textures.seen_factor
+    monkeypatch.setattr(textures, "seen_factor", lambda *values: looks.append(values) or look(*values))
     start()
-    collection = into_collection("Lamps", add_picture_light())
+    light = add_picture_light()
+    if is_placed:
+        tree, emission = light_tree(light)
+        place = tree.nodes.new("ShaderNodeNewGeometry").outputs["Position"]
+        tree.links.new(place, emission.inputs["Strength"])
+    collection = into_collection("Lamps", light)
     for x in (-0.8, 0.0, 0.9):
         add_instancer(collection, f"At {x}", location=(x, 0.0, 0.4), scale=(1.0 + abs(x),) * 3)
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=2048, count=8, tolerance=5e-3)
-    assert sum("'Light'" in line and "2 instances" in line for line in warnings) == 1
+    assert len(looks) == (3 if is_placed else 1) and warnings == []
     assert len({round(float(np.linalg.norm(light.half_v)), 4) for light in inventory.lights}) > 1
+    if is_placed:
+        monkeypatch.setattr(textures, "MOST_LOOKS", 2)
+        assert sum("'Light'" in line and "2 instances" in line for line in scene_parts.prepare()[3]) == 1
 
 
 def test_a_texture_too_fine_is_named_with_its_error():

@@ -121,12 +121,10 @@ def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
     settings = {"angle": 0.2, "energy": 3.0} if kind == "SUN" else {"shadow_soft_size": 0.2}
     with_nodes(kind, nodes, **settings)
     lights, warnings, surface, halves = rendered(tmp_path)
-    # Of a sun the middle is taken, and that is said.
-    assert (kind == "SUN" and nodes in (stripes, lamp_of_files)) == any(
-        "'Sun': its emission" in line for line in warnings
-    )
-    middle = kind == "SUN" and nodes in (stripes, lamp_of_files)
-    for technique, limit in (("reference", 5e-2 if middle else 6e-3), ("ltsh4", 5e-2 if middle else 1.5e-2)):
+    assert warnings == []
+    # Stripes vary by 5 % over the sun, of which the mean is taken: a highlight sees it.
+    middle = 1.2e-2 if kind == "SUN" and nodes is stripes else 6e-3
+    for technique, limit in (("reference", middle), ("ltsh4", 1.5e-2)):
         found = shading.shade(surface, lights, technique, workers=1)
         for lobe in ("diffuse", "specular"):
             values = getattr(found, lobe)[0].astype(np.float64)

@@ -256,6 +256,66 @@ def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_v
     bpy.data.lights.remove(bpy.data.lights["Striped"])
 
 
+def world_stripes(tree):
+    """1 + 0.3 x of the place in the world."""
+    line = along_x(tree, "Normal", 0.3)
+    place = tree.nodes.new("ShaderNodeNewGeometry").outputs["Position"]
+    tree.links.new(place, next(node for node in tree.nodes if node.bl_idname == "ShaderNodeSeparateXYZ").inputs[0])
+    return line
+
+
+def cloud(tree):
+    """A pattern on the light that no formula of ours knows."""
+    return tree.nodes.new("ShaderNodeTexVoronoi").outputs["Distance"]
+
+
+def power_and_place(light):
+    """Power (3,) of a light with its patches, and the place (3,) of its middle."""
+    powers = np.array([np.linalg.norm(patch.area_vector) * patch.radiance for patch in light])
+    return powers.sum(axis=0), np.average([patch.center for patch in light], axis=0, weights=powers.sum(axis=1))
+
+
+def test_windows_show_what_depends_on_the_place_and_patterns_of_area_lights():
+    parts.empty_scene()
+    bulb, _ = add_bulb("Bulb", "POINT", world_stripes)
+    flat = parts.add_area_light("Flat")
+    tree, emission = light_tree(flat)
+    tree.links.new(cloud(tree), emission.inputs["Strength"])
+    lamps = mirror.LiveLamps()
+    assert "Flat" in seen(lamps.pattern)[1]
+    wait_for(lamps)
+
+    def check():
+        parts.add_camera()
+        lights, notes = seen(lamps.pattern)
+        expected = {light.name: light for light in parts.prepare()[2].lights}
+        assert not [note for note in notes.splitlines() if "patches" not in note]
+        by_name = {name: [light for light in lights if light.name == name] for name in expected}
+        assert len(by_name["Flat"]) > 8 and len(by_name["Bulb"]) == 1
+        power, place = power_and_place(by_name["Flat"])
+        theirs = power_and_place(expected["Flat"].patches)
+        np.testing.assert_allclose(power, theirs[0], rtol=1e-3)
+        # 1.2 x 0.7 m.
+        np.testing.assert_allclose(place, theirs[1], atol=2e-3)
+        (own,) = by_name["Bulb"]
+        np.testing.assert_allclose(own.radiance, expected["Bulb"].radiance, rtol=1e-5)
+        np.testing.assert_allclose(own.pattern.values, expected["Bulb"].pattern.values, rtol=1e-4, atol=1e-4)
+        return own.radiance
+
+    first = check()
+    # The pattern on the light goes with it; what is in the world does not, and is looked at again.
+    flat.location.x += 0.5
+    assert not lamps.is_busy and "Flat: it shines" not in seen(lamps.pattern)[1] and not lamps.is_busy
+    bulb.location.x = 3.0
+    (moved,) = (light for light in seen(lamps.pattern)[0] if light.name == "Bulb")
+    assert lamps.is_busy and np.array_equal(moved.radiance, first)
+    bulb.location.x = 2.0
+    seen(lamps.pattern)
+    assert len(lamps._wanted) == 1
+    wait_for(lamps)
+    np.testing.assert_allclose(check() / first, (1.0 + 0.3 * 2.0) / (1.0 + 0.3 * 0.5), rtol=1e-2)
+
+
 def test_only_what_may_change_a_value_changes_the_text_of_nodes():
     parts.empty_scene()
     tree = add_bulb("Lamp", "POINT", beam)[1]

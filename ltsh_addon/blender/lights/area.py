@@ -318,6 +318,9 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=Non
     emission = emission_of(light)
     if emission.plain:
         return None
+    if light.type == "SUN":
+        # As Cycles has it: there is no distance.
+        emission.falloff = Falloff()
     for problem in what_is_lost(emission, is_light=True):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
     shared = {

@@ -76,8 +76,6 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
                 warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the nodes of the first")
         if not light.is_distant:
             light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
-        elif source.falloff != Falloff():
-            warn(f"light {light.name!r}: its Light Falloff has no distance, shaded as its Strength")
         if light.is_facing or light.is_distant:
             result.extend(with_pattern(light, found, source, warn))
         else:

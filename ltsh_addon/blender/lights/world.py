@@ -13,7 +13,7 @@ from mathutils import Matrix
 from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
 from ...scene import AreaLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
-from .emission import CONSTANT_NODES, open_studio, trees_of
+from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
 # Pixels along each side of a picture: of a world without images, and of one with, at least and at most.
 PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
@@ -24,7 +24,6 @@ MOST_RADIANCE = 1e15  # W m^-2 sr^-1
 SAMPLING_METHODS = ("NONE", "AUTOMATIC", "MANUAL")  # of a world, by their numbers
 NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1
 # What Light Path nodes say of the light that surfaces see, as where Cycles samples the world.
-LIGHT_PATH = "ShaderNodeLightPath"
 SEEN_BY_SURFACES = {"Is Camera Ray": 0.0, "Ray Depth": 1.0}
 EVERYWHERE_THE_SAME = (
     CONSTANT_NODES
@@ -200,6 +199,7 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
                     radiance[odd] = 0.0
                 return SkyPicture(ahead, right, up, radiance)
 
+            _note_cameras(own, world.name, warn)
             yield look
     finally:
         bpy.data.worlds.remove(own)
@@ -225,6 +225,21 @@ def _own_groups(tree) -> list:
             node.node_tree = node.node_tree.copy()
             made += [node.node_tree, *_own_groups(node.node_tree)]
     return made
+
+
+def _note_cameras(world, name: str, warn) -> None:
+    """Warn of nodes that say where a direction is in the picture."""
+    found = set()
+    for node in _nodes(world):
+        outputs = OF_CAMERA.get(node.bl_idname)
+        if outputs is not None:
+            used = {output.name for output in node.outputs if output.is_linked}
+            found |= {f"{node.bl_label}: {output}" for output in used if not outputs or output in outputs}
+    if found:
+        warn(
+            f"world {name!r}: it depends on the camera ({listed(sorted(found))}); its light and its background are "
+            "those of six cameras, one for each side of a cube"
+        )
 
 
 def _as_surfaces_see(world, name: str, warn) -> None:

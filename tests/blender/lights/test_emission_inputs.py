@@ -159,3 +159,49 @@ def test_a_sheared_mesh_is_looked_at_as_it_stands(tmp_path):
     found = shading.shade(surface, prepared[2].lights, "reference", workers=1).diffuse[0].astype(np.float64)
     assert quadrature.relative_l2(found, halves.astype(np.float64)) < 0.01
     assert abs(quadrature.bias(found, halves.astype(np.float64))) < 0.01
+
+
+WORLDS = {
+    "place": ("Geometry Position", "Coordinate Generated", OTHER),
+    "direction": ("Geometry Incoming", "Coordinate Reflection", "Coordinate Normal"),
+}
+
+
+@pytest.mark.parametrize("inputs", WORLDS.values(), ids=WORLDS)
+def test_what_nodes_of_worlds_read_is_what_cycles_gives_them(tmp_path, inputs):
+    """Three of them at once, as red, green and blue."""
+    scene_parts.empty_scene(10, 6)
+    scene_parts.add_camera()
+    floor = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(0.8, 0.8, 0.8, 1.0))[0]
+    scene_parts.add_plane(floor, size=12.0)
+    scene_parts.link(bpy.data.objects.new("Other", None), (0.3, -0.4, 0.7), (0.5, 0.2, 1.0), (0.7, 1.2, 1.0))
+    world, sky = scene_parts.add_world()
+    tree = world.node_tree
+    color = tree.nodes.new("ShaderNodeCombineColor")
+    for name, channel in zip(inputs, color.inputs, strict=True):
+        value = tree.nodes.new("ShaderNodeVectorMath")
+        value.operation, value.inputs[1].default_value = "DOT_PRODUCT", (0.6, -0.5, 0.4)
+        size = tree.nodes.new("ShaderNodeMath")
+        size.operation = "ABSOLUTE"
+        tree.links.new(output_of(tree, name), value.inputs[0])
+        tree.links.new(value.outputs["Value"], size.inputs[0])
+        tree.links.new(size.outputs[0], channel)
+    tree.links.new(color.outputs[0], sky.inputs["Color"])
+    prepared = scene_parts.prepare()
+    assert prepared[3] == []
+    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
+    halves = scene_parts.reference(tmp_path, prepared, 1024)["diffuse"].reshape(2, -1, 3)[:, pixel].astype(np.float64)
+    found = shading.shade(surface, prepared[2].lights, "reference", workers=1).diffuse[0].astype(np.float64)
+    for channel, name in enumerate(inputs):
+        own, expected = found[:, channel : channel + 1], halves[..., channel : channel + 1]
+        assert quadrature.relative_l2(own, expected) < 0.015 and abs(quadrature.bias(own, expected)) < 0.01, name
+
+
+def test_a_world_that_depends_on_the_camera_is_named():
+    scene_parts.empty_scene(8, 8)
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    world, sky = scene_parts.add_world()
+    place = world.node_tree.nodes.new("ShaderNodeTexCoord").outputs["Window"]
+    world.node_tree.links.new(place, sky.inputs["Color"])
+    assert sum("'World'" in line and "Window" in line for line in scene_parts.prepare()[3]) == 1

@@ -115,8 +115,6 @@ def lamp_of_files(tree):
 @pytest.mark.parametrize("kind", ["POINT", "SPOT", "SUN"])
 @pytest.mark.parametrize("nodes", [value, falloff, stripes, lamp_of_files], ids=lambda nodes: nodes.__name__)
 def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
-    if kind == "SUN" and nodes is falloff:
-        pytest.skip("what is infinitely far away has no falloff")
     plane_scene()
     settings = {"angle": 0.2, "energy": 3.0} if kind == "SUN" else {"shadow_soft_size": 0.2}
     with_nodes(kind, nodes, **settings)

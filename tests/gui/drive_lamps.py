@@ -1,4 +1,5 @@
-"""Lights with nodes in the viewport: a lamp of a file (IES) is shown by itself, edited, undone, and beside numpy.
+"""Lights with nodes in the viewport: a lamp of a file (IES) is shown by itself, edited, undone, and beside numpy; then
+a ball and an area light by the place in the world, and a point by its normal.
 
 To be opened with the example scene.
 """
@@ -39,6 +40,39 @@ def main(rig):
     rig.xdo("key", "Escape")
     yield 2
     eyes.check_against_numpy(rig, "lamps", seen, found["LTSH Specular"] + found["LTSH Diffuse"], EXPOSURE)
+    lamps_of_patterns(bpy.context.scene)
+    seen = yield from looked_at(rig, "lamps_6_patterns.png", "new", 3)
+    found = yield from eyes.final_render(rig)
+    rig.xdo("key", "Escape")
+    yield 2
+    eyes.check_against_numpy(rig, "patterns", seen, found["LTSH Specular"] + found["LTSH Diffuse"], EXPOSURE)
+
+
+def lamps_of_patterns(scene):
+    """In place of the lamp of a file: a ball and a flat one by the mean of x, y and z, a point by its normal."""
+    bpy.data.objects["Lamp"].hide_viewport = bpy.data.objects["Lamp"].hide_render = True
+    for name, kind, radius, x in (
+        ("Ball", "POINT", 0.3, -1.2),
+        ("Point", "POINT", 0.0, 0.0),
+        ("Flat", "AREA", 1.0, 1.4),
+    ):
+        data = bpy.data.lights.new(f"Lamp {name}", kind)
+        data.energy, data.use_nodes = 150.0, True
+        if kind == "AREA":
+            data.shape, data.size = "SQUARE", radius
+        else:
+            data.shadow_soft_size, data.use_soft_falloff = radius, False
+        tree = data.node_tree
+        emission = next(one for one in tree.nodes if one.bl_idname == "ShaderNodeEmission")
+        strength = tree.nodes.new("ShaderNodeNewGeometry").outputs["Normal" if name == "Point" else "Position"]
+        if name == "Point":
+            cells = tree.nodes.new("ShaderNodeTexVoronoi")
+            tree.links.new(strength, cells.inputs["Vector"])
+            strength = cells.outputs["Distance"]
+        tree.links.new(strength, emission.inputs["Strength"])
+        lamp = bpy.data.objects.new(f"Lamp {name}", data)
+        lamp.location, lamp.rotation_euler, lamp.scale = (x, 0.0, 2.4), (0.3, 0.1, 0.5), (1.0, 1.4, 1.0)
+        scene.collection.objects.link(lamp)
 
 
 def lamp_of_a_file(scene):
@@ -65,21 +99,23 @@ def notes(rig):
     return module("engine.view")._texts[rig.region().as_pointer()][1]
 
 
-def looked_at(rig, name, what):
-    """Wait until Cycles has looked at the lamp; what the view shows then."""
+def looked_at(rig, name, what, count=1):
+    """Wait until Cycles has looked at so many lamps; what the view shows then."""
     lamps, start = module("engine.view")._lamps, time.monotonic()
     yield from until(lambda: lamps.is_busy)
     yield 0.1
     said = [note for note in notes(rig) if "Lamp" in note]
     if what == "new":
-        rig.check(len(said) == 1 and "until Cycles" in said[0], f"a new lamp is said to be missing: {said}")
+        known = len(said) == count and all("until Cycles" in note for note in said)
+        rig.check(known, f"each new lamp is said to be missing: {said}")
         rig.shot(name.replace(".png", "_waiting.png"))
     else:
         rig.check(not said, f"{what}: the lamp of before is shown meanwhile: {said}")
     yield from until(lambda: not lamps.is_busy, 60.0)
     rig.fact(f"{what}: seconds until it is seen", round(time.monotonic() - start, 1))
     seen = yield from eyes.settled(rig, name)
-    rig.check(not [note for note in notes(rig) if "Lamp" in note], f"{what}: no note is left")
+    left = [note for note in notes(rig) if "Lamp" in note and "patches" not in note]
+    rig.check(not left, f"{what}: no note is left")
     return seen
 
 

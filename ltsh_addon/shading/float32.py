@@ -163,6 +163,40 @@ class Lobes:
         return {row: np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows}
 
 
+@dataclass(frozen=True)
+class AlikeLights:
+    """L lights with equally many corners: vectors (3, L) and numbers (L,), single precision but for the first."""
+
+    centers: np.ndarray  # (2, 3, L) center and centroid
+    corners: np.ndarray  # (V, 3, L) as of `AreaLight.polygon`, from the center
+    half_u: np.ndarray
+    half_v: np.ndarray
+    direction: np.ndarray
+    radiance: np.ndarray
+    area_vector: np.ndarray
+    radius: np.ndarray  # m, around the centroid
+    diagonal: np.ndarray  # as of `small_lights.SmallLight`
+    numbers: np.ndarray  # among all lights
+    place: np.ndarray  # (N,) here, of N lights in all; -1 of others, and of those that are too narrow
+
+    @classmethod
+    def of(cls, lights, numbers) -> AlikeLights:
+        """The `numbers` (L,) of (light, group, corners)."""
+        own = [lights[number][0] for number in numbers]
+        centroid, area, _, diagonal = small_lights.all_of(own)
+        center = np.array([light.center for light in own])
+        corners = np.array([lights[number][2] for number in numbers])
+        radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
+        vectors = [np.array([getattr(light, name) for light in own]) for name in ("half_u", "half_v", "direction", "radiance")]
+        longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)
+        is_narrow = np.sqrt(np.square(area).sum(axis=1)) < NARROWEST * longest
+        place = np.full(len(lights), -1)
+        place[numbers] = np.where(is_narrow, -1, np.arange(len(numbers)))
+        corners = (corners - center[:, None]).transpose(1, 2, 0)
+        others = (values.T.astype(np.float32, order="C") for values in (*vectors, area, radius, diagonal))
+        return cls(np.stack([center.T, centroid.T]), corners.astype(np.float32, order="C"), *others, numbers, place)
+
+
 class Lights(list):
     """Lights (light, group, corners) that affect one pass; trees of many of them are made once."""
 
@@ -183,6 +217,14 @@ class Lights(list):
                 kinds.setdefault((group, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
+
+    @cached_property
+    def alike(self) -> list[AlikeLights]:
+        """Of trees those lights with equally many corners of which single precision can tell all."""
+        kinds: dict[int, list[int]] = {}
+        for number in (number for _, numbers in self.trees for number in numbers):
+            kinds.setdefault(0 if self[number][0].is_round else len(self[number][2]), []).append(number)
+        return [AlikeLights.of(self, np.array(numbers)) for count, numbers in kinds.items() if count]
 
     @cached_property
     def alone(self) -> list[int]:
@@ -208,6 +250,7 @@ class _Lighting:
         self.samples, self.lights, self.radiance, self.scratch = samples, lights, radiance, scratch
         self.shade_in_float64 = shade_in_float64
         self.needs_float64 = [[] for _ in lights]  # indices of samples, per light
+        self.pairs_in_float64: list[tuple] = []  # the same as pairs (K,) of a sample and a light
 
     def add(self, lobes: Lobes) -> None:
         """Add the light that `lobes` reflect."""
@@ -292,16 +335,67 @@ class _Lighting:
                 sky.add(lobes, chosen, sums[group])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
-        """Add to the sums (F, 3, Q) by group the light of those of many lights that are far away; by number of the
-        light the columns (Q',) for which it is left to do."""
+        """Add to the sums (F, 3, Q) by group the light of many lights; by number of the light the columns (Q',) for
+        which it is left to do."""
         left = {}
         for tree, numbers in self.lights.trees:
             light, group, _ = self.lights[numbers[0]]
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
-            near = add_far_lights(tree, lobes, position, chosen, sums[group]) if len(chosen) else {}
-            left.update({numbers[place]: columns for place, columns in near.items()})
+            if not len(chosen):
+                continue
+            columns, own = add_far_lights(tree, lobes, position, chosen, sums[group])
+            pairs = columns, np.array(numbers)[own]
+            if lobes.only_tails:
+                self.pairs_in_float64.append((lobes.index[columns], pairs[1]))
+                continue
+            rest = np.ones(len(columns), bool)
+            for alike in self.lights.alike:
+                place = alike.place[pairs[1]]
+                chosen = place >= 0
+                rest &= ~chosen
+                self._add_near(lobes, position, (columns[chosen], place[chosen], alike), sums[group])
+            columns, number = (own[rest] for own in pairs)
+            for light in np.unique(number):
+                left[int(light)] = np.sort(columns[number == light])
         return left
+
+    def _add_near(self, lobes, position, pairs, total) -> None:
+        """Add to total (F, 3, Q) the light of pairs of a column (K,) and a light (K,) of `AlikeLights`, the third."""
+        columns, number, lights = pairs
+        extent, left = np.abs(position).sum(axis=0), [np.empty(0, np.intp)]
+        for piece in moments32.pieces(len(columns), SMALL_CHUNK):
+            part, own = columns[piece], number[piece]
+            offset = (lights.centers[1][:, own] - position[:, part]).astype(np.float32)
+            radius = lights.radius[own]
+            rays = small_lights.Rays.along(offset, lights.area_vector[:, own], lights.diagonal[own])
+            size = small_lights.seen_sizes(lobes, part, rays, radius)
+            rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
+            small, lit = small_lights.small_and_lit(lobes, part, rays, radius, size)
+            left.append(piece.start + np.nonzero(~small)[0])
+            lit = np.nonzero(lit)[0]
+            if len(lit):
+                _scatter(lobes.at_point(part[lit], rays.take(lit)), part[lit], lights.radiance[:, own[lit]], total)
+        left = np.concatenate(left)
+        for piece in moments32.pieces(len(left), CORNERS // len(lights.corners)):
+            part, own = columns[left[piece]], number[left[piece]]
+            if not len(part):
+                continue
+            center, direction = lights.centers[0][:, own], lights.direction[:, own]
+            offset = (center - position[:, part]).astype(np.float32)
+            toward = dot(offset, direction)
+            facing = toward < -off_plane(center, extent[part])
+            axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
+            polygons = local_corners(None, lights.corners[:, :, own], offset, axes, self.scratch)
+            found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(total), integrate)
+            if lobes.limits is not None:
+                halves = lights.half_u[:, own], lights.half_v[:, own]
+                seen = SeenLight.of_plain(halves, lights.area_vector[:, own], offset, toward)
+                lobes.limits.apply(found, part, seen, self.scratch)
+            if redo.any():
+                found[:, redo] = 0.0
+                self.pairs_in_float64.append((lobes.index[part[redo]], lights.numbers[own[redo]]))
+            _scatter(found, part, lights.radiance[:, own], total)
 
     def _add_small(self, lobes, light, position, among, total) -> np.ndarray | None:
         """Add the light to total (F, 3, Q) where it is small, `among` those columns (Q',), None for all, and those of
@@ -403,10 +497,12 @@ class _Lighting:
     def finish(self, leftovers) -> None:
         """Add what was left to float64, or put it into `leftovers`."""
         counts = [sum(map(len, parts)) for parts in self.needs_float64]
-        if not any(counts):
+        pairs = [own for own in self.pairs_in_float64 if len(own[0])]
+        if not any(counts) and not pairs:
             return
-        members = np.concatenate([part for parts in self.needs_float64 for part in parts])
-        number = np.repeat(np.arange(len(counts)), counts)
+        members = [part for parts in self.needs_float64 for part in parts]
+        members = np.concatenate([*members, *(own for own, _ in pairs)])
+        number = np.concatenate([np.repeat(np.arange(len(counts)), counts), *(own for _, own in pairs)])
         if leftovers is not None and len(members) < FLOAT64_CHUNK:
             leftovers.append((members.astype(np.int32), number.astype(np.int32)))
             return
@@ -431,8 +527,9 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
         of_batch = np.nonzero(among[number] >= 0)[0]
         for start in range(0, len(of_batch), FLOAT64_CHUNK):
             pairs = of_batch[start : start + FLOAT64_CHUNK]
-            items = [lights[position] for position in chosen]
-            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, among[number[pairs]])
+            used, own = np.unique(among[number[pairs]], return_inverse=True)
+            items = [lights[chosen[position]] for position in used]
+            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, own)
             target = np.zeros((1, len(pairs), 3))
             shade_in_float64(samples.take(members[pairs]), [own], target)
             yield pairs, target[0]
@@ -447,6 +544,13 @@ def _light_of_each(items, number):
     corners = np.stack([corners for _, _, corners in items])
     distant = items[0][0].is_distant
     return float64.LightOfEachSample(**fields, is_distant=distant), 0, corners[number].transpose(1, 0, 2)
+
+
+def _scatter(found, columns, radiance, total) -> None:
+    """Add to total (F, 3, Q) integrals (F, K) times radiance (3, K) in the columns (K,), some of them several times."""
+    for own, values in zip(total, found, strict=True):
+        for channel in range(3):
+            own[channel] += np.bincount(columns, values * radiance[channel], own.shape[1])
 
 
 def _is_narrow(light, corners) -> bool:

@@ -94,8 +94,8 @@ def round_levels(light, position, width):
 def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
     """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
 
-    corners (V, 3) in the world; offset (3, P) from the points to the light's center, which for "POLYGON" may lie
-    anywhere near. Of a FacingDisk the corners are their own number, the offset its own.
+    corners (V, 3) in the world, or (V, 3, P) from the center; offset (3, P) from the points to the light's center,
+    which for "POLYGON" may lie anywhere near. Of a FacingDisk the corners are their own number, the offset its own.
     """
     coordinates, _, points = rows.shape
     center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
@@ -108,8 +108,9 @@ def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarr
             out += np.multiply(v, t, out=product)
             np.add(center, out, out=result[:, number])
         return result
-    if light.is_round or light.shape == "POLYGON":
-        for number, corner in enumerate((corners - light.center).astype(np.float32)):
+    if corners.ndim == 3 or light.is_round or light.shape == "POLYGON":
+        corners = corners if corners.ndim == 3 else (corners - light.center).astype(np.float32)
+        for number, corner in enumerate(corners):
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
             np.add(center, out, out=result[:, number])
         return result

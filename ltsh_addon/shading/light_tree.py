@@ -48,6 +48,8 @@ ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
 LEAST = np.float32(1e-12)
 # Samples of a tile, for diffuse and specular lobes, and pairs of a sample and a node that are shaded at a time.
 TILE, PAIRS = (400, 200), 32768
+# Tiles that need more leaves whole than MANY_LEAVES are cut into such of fewer samples for these leaves, twice.
+FINER_TILES, MANY_LEAVES = (50, 12), 20
 # Of nodes that swing by less of their light the lights are taken as parallel.
 TURNED = 1e-6
 # Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
@@ -239,30 +241,31 @@ class Tiles:
     mirrored: tuple[np.ndarray, np.ndarray] | None  # the same of the mirrored views; None for diffuse lobes
     width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
     only_tails: bool  # nodes must be in the tails of the lobes, `SHARP_TAIL` from their peaks
-    cubics: Cubics
 
     @classmethod
-    def of(cls, lobes, position, chosen) -> Tiles:
-        """Those of the columns `chosen` (Q',) of samples with x, y, z in `position` (3, Q)."""
-        direction = lobes.rows[lobes.clip_rows[-1]] if lobes.sharpest is None else lobes.sharpest.mirrored
-        place = position[:, chosen]
-        extent = np.ptp(place, axis=1)
-        weight = 4.0 / max(np.sqrt(extent @ extent), 1e-30)
-        keys = np.concatenate([weight * (place - place.mean(axis=1, keepdims=True)), direction[:, chosen]])
-        keys = keys.astype(np.float32)
-        parts = _halves(keys, np.arange(len(chosen)), TILE[lobes.sharpest is not None])
-        columns = [chosen[part] for part in parts]
-        low, high = (np.array([end(position[:, part], axis=1) for part in columns]) for end in (np.min, np.max))
-        horizons = [_cones_of(lobes.rows[row], columns) for row in lobes.clip_rows]
+    def of(cls, lobes, position, columns) -> Tiles:
+        """Those of lists of columns of samples with x, y, z in `position` (3, Q)."""
+        every = np.concatenate(columns)
+        first = np.concatenate([[0], np.cumsum([len(own) for own in columns])[:-1]])
+        place = position[:, every]
+        low, high = (end.reduceat(place, first, axis=1).T for end in (np.minimum, np.maximum))
+        horizons = [_cones_of(lobes.rows[row][:, every], first) for row in lobes.clip_rows]
         mirrored = width = None
         if lobes.sharpest is not None:
-            mirrored = _cones_of(lobes.sharpest.mirrored, columns)
-            width = np.array([lobes.sharpest.width[part].min() for part in columns])
-        cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
+            mirrored = _cones_of(lobes.sharpest.mirrored[:, every], first)
+            width = np.minimum.reduceat(lobes.sharpest.width[every], first)
         half = (0.5 * (high - low)).astype(np.float32)
-        return cls(
-            columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails, cubics
-        )
+        return cls(columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails)
+
+
+def _keys(lobes, position, chosen) -> np.ndarray:
+    """What tells the columns `chosen` (Q',) apart, (D, Q')."""
+    direction = lobes.rows[lobes.clip_rows[-1]] if lobes.sharpest is None else lobes.sharpest.mirrored
+    place = position[:, chosen]
+    extent = np.ptp(place, axis=1)
+    weight = 4.0 / max(np.sqrt(extent @ extent), 1e-30)
+    keys = np.concatenate([weight * (place - place.mean(axis=1, keepdims=True)), direction[:, chosen]])
+    return keys.astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -319,17 +322,15 @@ def _halves(keys, part, most):
     return [*_halves(keys, part[order[:half]], most), *_halves(keys, part[order[half:]], most)]
 
 
-def _cones_of(vectors, columns):
-    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of every tile."""
-    axes, angles = [], []
-    for part in columns:
-        own = vectors[:, part].astype(np.float64)
-        own /= np.maximum(np.sqrt(dot(own, own)), 1e-30)
-        axis = own.sum(axis=1)
-        axis /= max(np.sqrt(axis @ axis), 1e-30)
-        axes.append(axis)
-        angles.append(np.arccos(np.clip((axis @ own).min(), -1.0, 1.0)))
-    return np.array(axes, np.float32), np.array(angles, np.float32)
+def _cones_of(vectors, first):
+    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of every tile, from the column `first` (T,) on."""
+    own = vectors.astype(np.float64)
+    own /= np.maximum(np.sqrt(dot(own, own)), 1e-30)
+    axis = np.add.reduceat(own, first, axis=1)
+    axis /= np.maximum(np.sqrt(dot(axis, axis)), 1e-30)
+    count = np.diff(np.append(first, own.shape[1]))
+    least = np.minimum.reduceat(dot(np.repeat(axis, count, axis=1), own), first)
+    return axis.T.astype(np.float32), np.arccos(np.clip(least, -1.0, 1.0)).astype(np.float32)
 
 
 def _angles(offset, distance, axis):
@@ -396,7 +397,7 @@ class _Pairs:
                 is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), LEAST), 1.0)
             crossed += CROSSED * is_crossed
         # A light alone is dark behind its plane; where many are turned differently, they are so one after another.
-        self.is_smooth = tiles.cubics.are_smooth[tile] & ~self.are_crossed & ((plane == 0.0) | tree.is_turned[node])
+        self.is_smooth = ~self.are_crossed & ((plane == 0.0) | tree.is_turned[node])
         seen = radius / nearest
         self.are_in_tail = np.zeros(len(node), bool)
         self.is_wrong = np.zeros(len(node), bool)
@@ -427,6 +428,18 @@ class _Pairs:
         small = (self.size < SMALL) & (self.crossed <= most)
         return (small | (self.size < LARGEST) & (self.error <= most)) & ~self.is_wrong
 
+    def are_near(self, light) -> np.ndarray:
+        """Mask (K,) of the leaves that are no points, where tiles get so much light (K,) of the group."""
+        are_points = self.are_fine(LEAF_ERROR * light) & (self.size < LEAF_SIZE)
+        return self.are_leaves & ~are_points
+
+    def by_tile(self):
+        """Yield (number of a tile, its pairs)."""
+        pairs = self.take(np.argsort(self.tile, kind="stable"))
+        numbers, first = np.unique(pairs.tile, return_index=True)
+        for number, start, end in zip(numbers, first, np.append(first, len(pairs.tile))[1:], strict=True):
+            yield number, pairs.take(slice(start, end))
+
     def take(self, index) -> _Pairs:
         """Those at the index (Q,)."""
         return self._of({name: values[index] for name, values in vars(self).items()})
@@ -455,34 +468,58 @@ def _refined(tree, tiles, is_fine) -> _Pairs:
     return _Pairs.joined(fine)
 
 
-def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> dict[int, np.ndarray]:
+def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.ndarray, np.ndarray]:
     """Add to total (F, 3, Q) what the columns `chosen` (Q',) of `lobes`, at x, y, z in `position` (3, Q), get of the
-    lights of the tree; by number of the light the columns that need it whole."""
-    tiles = Tiles.of(lobes, position, chosen)
+    lights of the tree; pairs (K,) of a column and the number of a light that it needs whole."""
+    is_specular = lobes.sharpest is not None
+    keys = _keys(lobes, position, chosen)
+    parts = _halves(keys, np.arange(len(chosen)), TILE[is_specular])
+    tiles = Tiles.of(lobes, position, [chosen[part] for part in parts])
+    cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
     coarse = _refined(tree, tiles, lambda pairs: pairs.size < COARSE)
-    light = np.bincount(coarse.tile, coarse.light, len(tiles.columns))
-    most = ERROR[lobes.sharpest is not None] * light
+    light = np.bincount(coarse.tile, coarse.light, len(parts))
+    most = ERROR[is_specular] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
-    pairs.is_smooth &= INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
-    are_points = pairs.are_fine(LEAF_ERROR * light[pairs.tile]) & (pairs.size < LEAF_SIZE)
-    near = pairs.are_leaves & ~are_points
-    left: dict[int, list] = {}
-    for own, number in zip(pairs.tile[near], tree.number[pairs.node[near]], strict=True):
-        left.setdefault(int(number), []).append(tiles.columns[own])
-    pairs = pairs.take(~near)
-    pairs = pairs.take(np.argsort(pairs.tile, kind="stable"))
-    bounds = np.searchsorted(pairs.tile, np.arange(len(tiles.columns) + 1))
-    for number, columns in enumerate(tiles.columns):
-        own = pairs.take(slice(bounds[number], bounds[number + 1]))
-        few = columns[tiles.cubics.anchors[number]]
+    pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (
+        INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
+    )
+    near = pairs.are_near(light[pairs.tile])
+    for number, own in pairs.take(~near).by_tile():
+        columns = tiles.columns[number]
         smooth = own.is_smooth
         if smooth.any():
-            weights = tiles.cubics.weights[number, : len(columns)].T
+            few, weights = columns[cubics.anchors[number]], cubics.weights[number, : len(columns)].T
             total[:, :, columns] += _light_of(tree, lobes, position[:, few], (few, own.take(smooth))) @ weights
             own = own.take(~smooth)
         if not smooth.all():
             total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
-    return {number: np.sort(np.concatenate(parts)) for number, parts in left.items()}
+    near, left = pairs.take(near), []
+    for size in (*FINER_TILES, None):
+        own_light, tile, node, cut = light, [], [], []
+        light = []
+        for number, own in near.by_tile():
+            if size is None or len(own.node) <= MANY_LEAVES:
+                left.append((chosen[parts[number]], tree.number[own.node]))
+                continue
+            finer = _halves(keys, parts[number], size)
+            tile.append(np.repeat(len(cut) + np.arange(len(finer)), len(own.node)))
+            node += [own.node] * len(finer)
+            light += [own_light[number]] * len(finer)
+            cut += finer
+        if not cut:
+            break
+        parts, light = cut, np.array(light)
+        tiles = Tiles.of(lobes, position, [chosen[part] for part in parts])
+        pairs = _Pairs(tree, tiles, np.concatenate(tile), np.concatenate(node))
+        pairs = pairs.take(~pairs.is_dark)
+        near = pairs.are_near(light[pairs.tile])
+        for number, own in pairs.take(~near).by_tile():
+            columns = tiles.columns[number]
+            total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
+        near = pairs.take(near)
+    columns = [np.repeat(own, len(lights)) for own, lights in left]
+    lights = [np.tile(lights, len(own)) for own, lights in left]
+    return tuple(np.concatenate([np.empty(0, np.intp), *own]) for own in (columns, lights))
 
 
 @dataclass(frozen=True)

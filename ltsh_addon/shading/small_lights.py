@@ -106,7 +106,8 @@ class Rays:
     def take(self, index) -> Rays:
         """The rays `index` (Q,) of the last axis."""
         chosen = (values[..., index] for values in (self.offset, self.squares, self.distance, self.flux))
-        return Rays(*chosen, self.diagonal, None if self.slack is None else self.slack[index])
+        diagonal = self.diagonal[index] if np.ndim(self.diagonal) else self.diagonal
+        return Rays(*chosen, diagonal, None if self.slack is None else self.slack[index])
 
 
 class SharpestLobes:

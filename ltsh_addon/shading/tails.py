@@ -44,6 +44,13 @@ class SeenLight:
         return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
     @classmethod
+    def of_plain(cls, halves, area, offset, toward) -> SeenLight:
+        """That of lights without a profile by their half axes, two (3, Q), and area vectors (3, Q)."""
+        u, v = halves
+        diagonals = np.stack([u + v, u - v])
+        return cls(offset, toward, diagonals, (diagonals * diagonals).sum(axis=1), np.sqrt(dot(area, area)), None)
+
+    @classmethod
     def of_disk(cls, disk) -> SeenLight:
         """That of a FacingDisk."""
         u, v = disk.half_u, disk.half_v

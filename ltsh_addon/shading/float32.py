@@ -187,7 +187,8 @@ class AlikeLights:
         center = np.array([light.center for light in own])
         corners = np.array([lights[number][2] for number in numbers])
         radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
-        vectors = [np.array([getattr(light, name) for light in own]) for name in ("half_u", "half_v", "direction", "radiance")]
+        names = ("half_u", "half_v", "direction", "radiance")
+        vectors = [np.array([getattr(light, name) for light in own]) for name in names]
         longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)
         is_narrow = np.sqrt(np.square(area).sum(axis=1)) < NARROWEST * longest
         place = np.full(len(lights), -1)

@@ -27,7 +27,7 @@ from .tails import NEAR_RADII
 FEWEST = 64
 # Size of a node by the length over which the integrand changes: up to SMALL whatever its light is; up to LARGEST where
 # its error is at most ERROR of the light of a group that a tile gets, of diffuse and of specular lobes.
-SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 5e-4)
+SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 2.5e-4)
 # Size of the nodes that tell how much light that is.
 COARSE = 0.6
 # Smaller ones are one point, others four.
@@ -36,8 +36,9 @@ POINT = 0.08
 FOURTH_ORDER = 1.0
 # Angle in rad from the peak of a sharp lobe beyond which single precision tells its tail to 2e-4.
 SHARP_TAIL = 0.05
-# Leaves whose error or size is larger are shaded as polygons.
-LEAF_ERROR, LEAF_SIZE = 2e-3, 1.0
+# Leaves whose error or size is larger are shaded as polygons; their error also in the finer tiles below, which are told
+# apart by where their lobes point, so that their light may be far less than its bound.
+LEAF_ERROR, FINER_LEAF_ERROR, LEAF_SIZE = 2e-3, 5e-4, 1.0
 # What a tile gets of a node is interpolated between ten of its samples where it is so small, as seen from there, that
 # the error of cubics, INTERPOLATED times the fourth power of that size, is at most ERROR.
 INTERPOLATED = 0.3
@@ -48,8 +49,8 @@ ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
 LEAST = np.float32(1e-12)
 # Samples of a tile, for diffuse and specular lobes, and pairs of a sample and a node that are shaded at a time.
 TILE, PAIRS = (400, 200), 32768
-# Tiles that need more leaves whole than MANY_LEAVES are cut into such of fewer samples for these leaves, twice.
-FINER_TILES, MANY_LEAVES = (50, 12), 20
+# For these leaves, tiles that need more than MANY_LEAVES whole are cut into such of at most so many samples.
+FINER_TILE, MANY_LEAVES = 25, 20
 # Of nodes that swing by less of their light the lights are taken as parallel.
 TURNED = 1e-6
 # Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
@@ -428,9 +429,9 @@ class _Pairs:
         small = (self.size < SMALL) & (self.crossed <= most)
         return (small | (self.size < LARGEST) & (self.error <= most)) & ~self.is_wrong
 
-    def are_near(self, light) -> np.ndarray:
-        """Mask (K,) of the leaves that are no points, where tiles get so much light (K,) of the group."""
-        are_points = self.are_fine(LEAF_ERROR * light) & (self.size < LEAF_SIZE)
+    def are_near(self, most) -> np.ndarray:
+        """Mask (K,) of the leaves that are no points, where their error may be so much (K,)."""
+        are_points = self.are_fine(most) & (self.size < LEAF_SIZE)
         return self.are_leaves & ~are_points
 
     def by_tile(self):
@@ -483,7 +484,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
     pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (
         INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
     )
-    near = pairs.are_near(light[pairs.tile])
+    near = pairs.are_near(LEAF_ERROR * light[pairs.tile])
     for number, own in pairs.take(~near).by_tile():
         columns = tiles.columns[number]
         smooth = own.is_smooth
@@ -493,33 +494,29 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
             own = own.take(~smooth)
         if not smooth.all():
             total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
-    near, left = pairs.take(near), []
-    for size in (*FINER_TILES, None):
-        own_light, tile, node, cut = light, [], [], []
-        light = []
-        for number, own in near.by_tile():
-            if size is None or len(own.node) <= MANY_LEAVES:
-                left.append((chosen[parts[number]], tree.number[own.node]))
-                continue
-            finer = _halves(keys, parts[number], size)
-            tile.append(np.repeat(len(cut) + np.arange(len(finer)), len(own.node)))
-            node += [own.node] * len(finer)
-            light += [own_light[number]] * len(finer)
-            cut += finer
-        if not cut:
-            break
-        parts, light = cut, np.array(light)
-        tiles = Tiles.of(lobes, position, [chosen[part] for part in parts])
-        pairs = _Pairs(tree, tiles, np.concatenate(tile), np.concatenate(node))
+    light = np.bincount(pairs.tile[~near], pairs.light[~near], len(parts))
+    near, left, tile, node, finer = pairs.take(near), [], [], [], []
+    for number, own in near.by_tile():
+        if len(own.node) <= MANY_LEAVES:
+            left.append((tiles.columns[number], own))
+            continue
+        for part in _halves(keys, parts[number], FINER_TILE):
+            tile.append(np.full(len(own.node), len(finer)))
+            node.append(own.node)
+            finer.append((chosen[part], light[number]))
+    if finer:
+        columns, light = zip(*finer, strict=True)
+        pairs = _Pairs(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
         pairs = pairs.take(~pairs.is_dark)
-        near = pairs.are_near(light[pairs.tile])
+        light = light + np.bincount(pairs.tile, pairs.light, len(finer))
+        near = pairs.are_near(FINER_LEAF_ERROR * light[pairs.tile])
         for number, own in pairs.take(~near).by_tile():
-            columns = tiles.columns[number]
-            total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
-        near = pairs.take(near)
-    columns = [np.repeat(own, len(lights)) for own, lights in left]
-    lights = [np.tile(lights, len(own)) for own, lights in left]
-    return tuple(np.concatenate([np.empty(0, np.intp), *own]) for own in (columns, lights))
+            part = columns[number]
+            total[:, :, part] += _light_of(tree, lobes, position[:, part], (part, own))
+        left += [(columns[number], own) for number, own in pairs.take(near).by_tile()]
+    columns = [np.repeat(part, len(own.node)) for part, own in left]
+    numbers = [np.tile(tree.number[own.node], len(part)) for part, own in left]
+    return tuple(np.concatenate([np.empty(0, np.intp), *own]) for own in (columns, numbers))
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,51 @@ def test_light_is_interpolated_on_smooth_surfaces(monkeypatch):
     assert relative_error(found.specular[:, some], truth) < relative_error(own, truth) + OFF
 
 
+def lowered(lights, height):
+    return [light.moved(np.array([0.0, 0.0, -height])) for light in lights]
+
+
+def test_uneven_surfaces_need_few_near_lights_whole(monkeypatch):
+    """Small tiles know better where their lobes point: what the sums are, how they are cut does not matter."""
+    samples, lights = floor_samples(800, 0.2), lowered(many_lights(1000), 1.5)
+    counts, add = [], float32.add_far_lights
+
+    def counting(*arguments):
+        found = add(*arguments)
+        counts.append(len(found[0]))
+        return found
+
+    monkeypatch.setattr(float32, "add_far_lights", counting)
+    found = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1).specular
+    few, counts[:] = sum(counts), []
+    monkeypatch.setattr(light_tree, "MANY_LEAVES", len(lights))
+    expected = shading.shade(samples, lights, "ltsh4", passes=["specular"], workers=1).specular
+    assert few < 0.6 * sum(counts) and relative_error(found, expected) < OFF
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "TRIANGLE", "HEXAGON", "narrow", "DISK"])
+def test_lights_shaded_together_are_those_of_each(shape, monkeypatch):
+    """Of leaves that no tile takes as points, whatever their shape."""
+    lights = [replace(light, shape="DISK") for light in lowered(many_lights(80), 1.7)]
+    if shape in ("TRIANGLE", "HEXAGON"):
+        lights = [replace(one, shape="POLYGON", corners=one.polygon(3 if shape[0] == "T" else 6)) for one in lights]
+    elif shape != "DISK":
+        # The light of a narrow one is left to double precision.
+        thin = 1e-5 if shape == "narrow" else 1.0
+        lights = [
+            replace(one, shape="RECTANGLE", half_v=thin * one.half_v, radiance=one.radiance / thin) for one in lights
+        ]
+    monkeypatch.setattr(light_tree, "LEAF_SIZE", 0.0)
+    samples = floor_samples(300, 0.3)
+    smooth = unit(np.array([0.0, 0.0, 1.0]) + 0.1 * np.random.default_rng(5).normal(size=(300, 3)))
+    samples = replace(samples, smooth_normal=smooth, geometric_normal=smooth)
+    shades = [shading.shade(samples, lights, "ltsh4", workers=1)]
+    monkeypatch.setattr(float32, "FEWEST", 1000)
+    shades.append(shading.shade(samples, lights, "ltsh4", workers=1))
+    for name in ("specular", "diffuse"):
+        assert relative_error(*(getattr(one, name) for one in shades)) < 2e-4
+
+
 def test_cubics_of_two_coordinates_are_interpolated_and_nothing_else():
     generator = np.random.default_rng(1)
     u, v = generator.uniform(-1.0, 1.0, (2, 180)).astype(np.float32)

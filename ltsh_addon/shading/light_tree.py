@@ -6,9 +6,10 @@ node is then one point, two or four, which have the mean and the variances of it
 taken as uniform around their mean. The error is estimated as the light of the node times the fourth power of its size
 by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for
 the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail
-of an "ltsh" lobe get its true value there, as `tails` has it. Lights that are leaves and yet too large go the way of
-all lights. On smooth surfaces ten samples of a tile tell what the others get, but of nodes that are near. (Walter et
-al. 2005, "Lightcuts", for tiles in place of points, doi:10.1145/1073204.1073318.)
+of an "ltsh" lobe get its true value there, as `tails` has it. Leaves that are yet too large are
+looked at again in smaller tiles, where there are many of them; what is left are polygons, shaded together. On smooth
+surfaces ten samples of a tile tell what the others get, but of nodes that are near. (Walter et al. 2005, "Lightcuts",
+for tiles in place of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations

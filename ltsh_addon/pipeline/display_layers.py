@@ -13,8 +13,8 @@ from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .lighting import KEPT_SUFFIX, KeptPicture
+from .mixer import MIXER_FILE, light_pictures
 from .picture import UNSHADOWED, against_cycles
-from .relight import MIXER_FILE, light_pictures
 
 FOLDER = "images"
 ERROR = "error_"

@@ -21,7 +21,18 @@ import numpy as np
 
 from .. import shading, visibility
 from ..files import replacing, temporary_folder
-from ..scene import AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, error_line, light_records, lights_of
+from ..scene import (
+    REFERENCE,
+    AreaLight,
+    Border,
+    ColorSpace,
+    Film,
+    Progress,
+    SurfaceSamples,
+    error_line,
+    light_records,
+    lights_of,
+)
 from ..shading.light_tree import FEWEST
 
 # Of the files of `keep_picture`: all that shading needs, and what shadow rays meet.
@@ -230,6 +241,12 @@ class KeptPicture:
     taken: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W) by pass; left out: 1
     # The same, of lights where they were: by what hard edges differ from those of the samples.
     edges: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def technique(self) -> str:
+        """The most accurate of those that the picture was made with."""
+        names = [name for name in self.options["techniques"] if name != REFERENCE]
+        return names[-1] if names else "ltsh4"
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
         """By what (H, W, 1) a pass of the samples is multiplied, for lights where they were, or `moved` ones."""

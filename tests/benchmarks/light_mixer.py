@@ -17,7 +17,8 @@ import measure
 import numpy as np
 
 from ltsh_addon.pipeline.lighting import KEPT_SUFFIX, KeptPicture
-from ltsh_addon.pipeline.relight import LightPictures, Mixer, MovedLights, light_pictures
+from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures
+from ltsh_addon.pipeline.moved_lights import MovedLights
 
 RESOLUTION = "960x540"
 

@@ -9,9 +9,21 @@ import pytest
 from fake_scene import run, wall
 
 from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.pipeline import lighting, relight
+from ltsh_addon.pipeline import lighting, moved_lights, relight
 from ltsh_addon.pipeline.lighting import KeptPicture
-from ltsh_addon.pipeline.relight import LightPictures, Mixer, MovedLights, light_pictures
+from ltsh_addon.pipeline.mixer import (
+    NOT_SHADED,
+    REST,
+    SHARED_OUT,
+    WEAKEST,
+    LightPictures,
+    Mixer,
+    Row,
+    _members,
+    _row,
+    light_pictures,
+)
+from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.shading import parallel
 from ltsh_addon.visibility import crew
 
@@ -70,7 +82,7 @@ def test_shadows_stay_while_all_lights_change_alike(capsys, monkeypatch, room, o
 def random_mixer(rows=5, size=(40, 30)):
     random = np.random.default_rng(7)
     layers = random.random((rows, *size, 3)).astype(np.float32) * 10.0 ** random.integers(-3, 4, (rows, 1, 1, 1))
-    names = [relight.Row(f"Light {number}", (f"Light {number}",)) for number in range(rows)]
+    names = [Row(f"Light {number}", (f"Light {number}",)) for number in range(rows)]
     return Mixer(LightPictures(tuple(names), layers, np.ones(size, np.float32), {})), layers
 
 
@@ -89,7 +101,7 @@ def test_any_order_of_changes_gives_the_same_bits():
 
 def test_pictures_of_lights_are_read_back(tmp_path):
     mixer, _ = random_mixer()
-    mixer.replace(2, relight.Row("Other", ("Other",)), np.full((40, 30, 3), 7.0))
+    mixer.replace(2, Row("Other", ("Other",)), np.full((40, 30, 3), 7.0))
     mixer.pictures.save(tmp_path / "lights.npz")
     found = LightPictures.load(tmp_path / "lights.npz")
     assert found.rows == mixer.rows and np.array_equal(found.layers, mixer.pictures.layers)
@@ -107,14 +119,14 @@ def test_lights_that_change_together_are_one_row(capsys, monkeypatch, room, out)
     kept = kept_in(out)
     lights = [replace(kept.extraction.lights[0], name=f"L{n // 2}", radiance=[1.0 + n] * 3) for n in range(6)]
     shadows = lighting.Shadows({}, ((0,), (1, 2), (3,), (4,), (5,)), {}, 0, "")
-    assert relight._members(lights, None) == [[0, 1], [2, 3], [4, 5]]
-    assert relight._members(lights, shadows) == [[0, 1, 2, 3], [4, 5]]
+    assert _members(lights, None) == [[0, 1], [2, 3], [4, 5]]
+    assert _members(lights, shadows) == [[0, 1, 2, 3], [4, 5]]
     many = [replace(lights[0], name=f"M{n}", radiance=[100.0 - n] * 3) for n in range(100)]
-    members = relight._members(many, None)
+    members = _members(many, None)
     assert len(members) == 64 and members[-1] == list(range(63, 100))
-    assert [len(own) for own in relight._members(many, None, 8)] == [1] * 7 + [93]
-    row = relight._row(replace(kept.extraction, lights=tuple(many)), members[-1])
-    assert row.name == "M63 and 36 more" and row.note == relight.WEAKEST
+    assert [len(own) for own in _members(many, None, 8)] == [1] * 7 + [93]
+    row = _row(replace(kept.extraction, lights=tuple(many)), members[-1])
+    assert row.name == "M63 and 36 more" and row.note == WEAKEST
 
 
 def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_group(capsys, monkeypatch, room, out):
@@ -126,7 +138,7 @@ def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_grou
     path = out / "render.samples.npz"
     lighting.keep_picture(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
     pictures = light_pictures(KeptPicture.load(path))
-    assert [row.name for row in pictures.rows][-1] == relight.REST and len(pictures.rows) == 4
+    assert [row.name for row in pictures.rows][-1] == REST and len(pictures.rows) == 4
     np.testing.assert_allclose(pictures.alpha, rest[""][..., 3], rtol=1e-6)
     plain = light_pictures(kept)
     bounced = pictures.layers[0] - plain.layers[0]
@@ -169,8 +181,8 @@ def test_bounced_light_follows_a_group_also_where_its_lights_change_differently(
     )
     pictures = light_pictures(KeptPicture.load(path))
     names = [row.name for row in pictures.rows]
-    assert names == ["Light 0", "Light 1", "Light 2", "Light group Sky", relight.REST]
-    assert pictures.rows[3].note == relight.NOT_SHADED
+    assert names == ["Light 0", "Light 1", "Light 2", "Light group Sky", REST]
+    assert pictures.rows[3].note == NOT_SHADED
     for changes, factors in (
         (("Light 1", "--power", "x3"), [1.0, 3.0, 1.0, 1.0, 1.0]),
         (("Light 0", "--power", "x2", "--light", "Light 1", "--power", "x2"), [2.0, 2.0, 1.0, 1.0, 1.0]),
@@ -199,7 +211,7 @@ def test_bounced_light_of_several_lights_is_shared_out(capsys, monkeypatch, room
     more = found.layers - plain.layers
     np.testing.assert_allclose(more.sum(axis=0), bounced, rtol=1e-5)
     assert (more[0] > 0.01).all() and (more[1] > 0.01).all() and (more[2] == 0.0).all()
-    assert found.facts["notes"] == [relight.SHARED_OUT.format("Key", "'Light 0', 'Light 1'")]
+    assert found.facts["notes"] == [SHARED_OUT.format("Key", "'Light 0', 'Light 1'")]
 
 
 def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
@@ -223,7 +235,7 @@ def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
 
 def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(capsys, monkeypatch, room, out):
     shade(capsys, monkeypatch, room, out, wall=wall(0.7, left=0.0))
-    monkeypatch.setattr(relight, "BLOCK_SAMPLES", 7)
+    monkeypatch.setattr(moved_lights, "BLOCK_SAMPLES", 7)
     alone = MovedLights.load(out / "shade.samples.npz")
     monkeypatch.setattr(crew, "SAMPLES_WORTH_A_CHILD", 0)
     monkeypatch.setattr(parallel, "cores", lambda: 3)

@@ -17,8 +17,8 @@ import numpy as np
 from bpy.app.handlers import persistent
 
 from ...pipeline.lighting import KeptPicture, shade_lights, trace_shadows
+from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
-from ...pipeline.relight import LightPictures, light_pictures
 from ...pipeline.render import finish
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError

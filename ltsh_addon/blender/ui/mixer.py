@@ -8,7 +8,7 @@ from typing import ClassVar
 import bpy
 import numpy as np
 
-from ...pipeline.relight import Row
+from ...pipeline.mixer import Row
 from ...scene import AreaLight, SceneError, error_line, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out

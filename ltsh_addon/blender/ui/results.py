@@ -12,7 +12,9 @@ import numpy as np
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
 from ...pipeline.lighting import KEPT_SUFFIX, KeptPicture
-from ...pipeline.relight import MIXER_FILE, LightPictures, Mixer, MovedLights, Row, tint
+from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, Row
+from ...pipeline.moved_lights import MovedLights
+from ...pipeline.relight import tint
 from ...scene import AreaLight, SceneError, SurfaceSamples
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known

@@ -16,7 +16,9 @@ from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, render, shade_scene
 from ltsh_addon.pipeline.lighting import KeptPicture
-from ltsh_addon.pipeline.relight import LightChange, MovedLights, light_pictures, relight
+from ltsh_addon.pipeline.mixer import light_pictures
+from ltsh_addon.pipeline.moved_lights import MovedLights
+from ltsh_addon.pipeline.relight import LightChange, relight
 from ltsh_addon.scene import PASSES, AreaLight
 
 SIZE, BLOCK = 32, 8  # pixels

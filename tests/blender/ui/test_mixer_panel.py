@@ -11,7 +11,7 @@ from recorded_layout import Layout, buttons, drawn, stand_in
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.ui import mixer, results
-from ltsh_addon.pipeline.relight import REST, LightPictures, Row
+from ltsh_addon.pipeline.mixer import REST, LightPictures, Row
 
 HEIGHT, WIDTH = 6, 10
 NAMES = ("Key", "Fill", "Lamp", REST)

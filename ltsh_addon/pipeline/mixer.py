@@ -1,0 +1,250 @@
+"""The light mixer: a picture as the sum of those of its lights, and a `Mixer` that changes them while one looks.
+
+Radiance is linear in that of each light: each of these pictures is multiplied by a factor per color.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..files import replacing
+from ..scene import AreaLight, Progress, error_line, listed
+from . import picture
+from .lighting import KeptPicture, Shadows, shade_lights
+from .relight import GRAIN, own_color
+
+MIXER_FILE = "lights.npz"
+# Rows of a mixer, and of large pictures: of more lights the weakest are one. Values of all of its pictures.
+MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 64, 8, 1 << 28
+REST = "Everything else"
+# Pairs of a sample and a row whose radiance is kept at a time.
+MOST_PAIRS = 1 << 23
+# Of pictures, that are summed at a time: as many as stay in the processor's cache.
+LINES = 16
+SHARED = "they share their shadow rays, so they change together"
+WEAKEST = "the weakest lights of the picture, which change together"
+NOT_OF_LIGHTS = (
+    "the background, what glows, and in finished pictures what lights in no light group bounce: they do not follow the "
+    "lights"
+)
+SHARED_OUT = "bounced light of light group {!r} is shared out among {} by their direct light"
+NOT_SHADED = "Cycles' light of a light group none of whose lights is shaded here"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a mixer changes as one: the lights called `lights`, or what hangs on no light where there are none."""
+
+    name: str
+    lights: tuple[str, ...]
+    color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of their light, the brightest channel 1
+    settings: dict[str, list[float]] = field(default_factory=dict)  # of those that are lights in Blender
+    light: dict | None = None  # record of the only one, where it is plain
+    note: str = ""
+    group: str = ""  # whose bounced light it has this share of
+    share: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class LightPictures:
+    """A picture as the sum of one for each row."""
+
+    rows: tuple[Row, ...]
+    layers: np.ndarray  # (R, H, W, 3) float32, row 0 on top
+    alpha: np.ndarray  # (H, W) float32
+    facts: dict  # "camera", "frame", "technique", "notes"
+
+    def save(self, path: Path) -> None:
+        """Write what `load` reads, at once or not at all. Raises OSError."""
+        document = {**self.facts, "rows": [asdict(row) for row in self.rows]}
+        with replacing(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, document=json.dumps(document), layers=self.layers, alpha=self.alpha)
+
+    @classmethod
+    def load(cls, path: Path) -> LightPictures:
+        """Raises OSError, and ValueError where the file is not what `save` writes."""
+        try:
+            with Path(path).open("rb") as file, np.load(file) as data:
+                facts, layers, alpha = json.loads(str(data["document"])), data["layers"], data["alpha"]
+            rows = tuple(
+                Row(**{**row, **{name: tuple(row[name]) for name in ("lights", "color", "share")}})
+                for row in facts.pop("rows")
+            )
+            if layers.ndim != 4 or layers.shape != (len(rows), *alpha.shape, 3):
+                raise ValueError(f"{len(rows)} rows, layers {layers.shape}, alpha {alpha.shape}")
+        except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{path}: is no file of the light mixer, or not whole ({error_line(error)})") from error
+        return cls(rows, layers, alpha, facts)
+
+
+def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> LightPictures:
+    """The pictures of the lights of `kept`, shaded anew by its most accurate table. Raises TableError, Cancelled."""
+    extraction, shadows = kept.extraction, kept.shadows
+    shape, technique = (extraction.film.height, extraction.film.width), kept.technique
+    most = min(max(MOST_VALUES // (4 * shape[0] * shape[1]), FEWEST_ROWS), MOST_ROWS)
+    members = _members(extraction.lights, shadows, most)
+    layers = np.zeros((len(members), *shape, 3), np.float32)
+    (table,) = picture.load_tables((technique,)).values()
+    most = max(1, MOST_PAIRS // max(1, len(extraction.samples)))
+    for first in range(0, len(members), most):
+        part = members[first : first + most]
+        share = first / len(members), len(part) / len(members)
+
+        def report(fraction, share=share):
+            return None if progress is None else progress("lights", share[0] + fraction * share[1])
+
+        layers[first : first + most] = _layers(kept, table, part, report)
+    rows = _with_bounces(kept, [_row(extraction, own) for own in members], members, layers)
+    for row, layer in zip(rows, layers, strict=True):
+        layer += bounced_light(kept, row)
+    for group, values in kept.rest.items():
+        if group and values.any() and all(row.group != group for row in rows):
+            rows.append(Row(f"Light group {group}", (), note=NOT_SHADED))
+            layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
+    notes = [GRAIN] * bool(kept.rest and kept.extraction.has_lens) + [
+        SHARED_OUT.format(group, listed(repr(row.name) for row in own))
+        for group in kept.rest
+        if group and len(own := [row for row in rows if row.group == group]) > 1
+    ]
+    rest = kept.rest.get("")
+    if rest is not None:
+        rows.append(Row(REST, (), note=NOT_OF_LIGHTS))
+        layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
+    alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
+    facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
+    return LightPictures(tuple(rows), layers, alpha, facts)
+
+
+def _members(lights: Sequence[AreaLight], shadows: Shadows | None, most: int = MOST_ROWS) -> list[list[int]]:
+    """Numbers of the lights of each of at most `most` rows: those of one name, and those that share their rays."""
+    root = {light.name: light.name for light in lights}
+
+    def first(name):
+        while root[name] != name:
+            root[name] = root[root[name]]
+            name = root[name]
+        return name
+
+    for own in shadows.numbers if shadows is not None else ():
+        for number in own[1:]:
+            root[first(lights[number].name)] = first(lights[own[0]].name)
+    members: dict[str, list[int]] = {}
+    for number, light in enumerate(lights):
+        members.setdefault(first(light.name), []).append(number)
+    rows = list(members.values())
+    if len(rows) <= most:
+        return rows
+    power = [sum(np.linalg.norm(lights[n].area_vector) * lights[n].radiance.sum() for n in own) for own in rows]
+    strong = set(np.argsort(power)[::-1][: most - 1].tolist())
+    weak = [number for row, own in enumerate(rows) if row not in strong for number in own]
+    return [*(own for row, own in enumerate(rows) if row in strong), weak]
+
+
+def _row(extraction, own: list[int]) -> Row:
+    """The row of the lights with the numbers `own`."""
+    lights = [extraction.lights[number] for number in own]
+    names, color = tuple(dict.fromkeys(light.name for light in lights)), tuple(own_color(lights).tolist())
+    known = extraction.light_settings
+    settings = {name: known[name] for name in names if name in known}
+    if len(names) > 1:
+        note = WEAKEST if len({tuple(light.radiance) for light in lights}) > 1 else SHARED
+        return Row(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
+    plain = len(lights) == 1 and not lights[0].detail and lights[0].pattern is None
+    return Row(names[0], names, color, settings, lights[0].record() if plain else None)
+
+
+def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.ndarray:
+    """Radiance (R, H, W, 3) of rows of lights times the exposure."""
+    extraction = kept.extraction
+    numbers = sorted(number for own in members for number in own)
+    row_of = {number: row for row, own in enumerate(members) for number in own}
+    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
+    shadows = None if kept.shadows is None else kept.shadows.of_lights(numbers)
+    passes = kept.options["passes"]
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
+    for name in passes:
+        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
+            image = extraction.film.image(extraction.exposure * values)
+            layers[int(group)] += kept.shown(name) * image
+    return layers
+
+
+def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[Row]:
+    """The rows with their shares of what their light groups bounce, by their `layers` of direct light."""
+    found = list(rows)
+    for group in filter(None, kept.rest):
+        own = [row for row, (first, *_) in enumerate(members) if kept.extraction.lights[first].group == group]
+        weights = layers[own].sum(axis=(1, 2), dtype=np.float64)
+        whole = weights.sum(axis=0)
+        for row, weight in zip(own, weights, strict=True):
+            share = np.divide(weight, whole, out=np.full(3, 1.0 / len(own)), where=whole > 0.0)
+            found[row] = replace(rows[row], group=group, share=tuple(share.tolist()))
+    return found
+
+
+def bounced_light(kept: KeptPicture, row: Row) -> np.ndarray:
+    """The part (H, W, 3) of the picture of a row that is bounced light; 0.0 where it has none."""
+    return (np.array(row.share) * kept.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
+
+
+class Mixer:
+    """The pictures of the lights, ready to be mixed: a change of one row costs one multiplication and one addition per
+    pixel and channel, because the sum of the others is kept."""
+
+    def __init__(self, pictures: LightPictures):
+        count, height, width, _ = pictures.layers.shape
+        self.rows, self.facts, self._width = pictures.rows, pictures.facts, width
+        # As images of Blender are: row 0 below, four channels one after another.
+        self._layers = np.zeros((count, height, width, 4), np.float32)
+        self._layers[..., :3] = pictures.layers[:, ::-1]
+        self._background = np.zeros((height, width, 4), np.float32)
+        self._background[..., 3] = pictures.alpha[::-1]
+        self._whole, self._others = self._background.copy(), np.empty_like(self._background)
+        self._factors = np.zeros((count, 3))
+        self._changing: int | None = None  # the row that changed last: `_others` is the sum of all others
+
+    @property
+    def pictures(self) -> LightPictures:
+        """What was given, and what came in its place since."""
+        layers, alpha = self._layers[:, ::-1, :, :3], self._background[::-1, :, 3]
+        return LightPictures(self.rows, layers, alpha, self.facts)
+
+    def replace(self, number: int, row: Row, layer: np.ndarray) -> None:
+        """Put another row, and its picture (H, W, 3), in the place of one."""
+        self.rows = (*self.rows[:number], row, *self.rows[number + 1 :])
+        self._layers[number, ..., :3] = layer[::-1]
+        self._factors[:], self._changing = np.nan, None
+
+    def mixed(self, factors: np.ndarray) -> np.ndarray:
+        """The sum (H, W, 4) of all rows times `factors` (R, 3), row 0 below; the next call overwrites it."""
+        factors = np.array(factors, dtype=float)
+        changed = np.flatnonzero((self._factors != factors).any(axis=1))
+        self._factors = factors
+        if len(changed) > 1:
+            self._changing = None
+            self._sum(self._whole, self._background, range(len(factors)))
+        elif len(changed) == 1:
+            (row,) = changed.tolist()
+            if row != self._changing:
+                self._changing = row
+                self._sum(self._others, self._background, [other for other in range(len(factors)) if other != row])
+            self._sum(self._whole, self._others, [row])
+        return self._whole
+
+    def _sum(self, out: np.ndarray, start: np.ndarray, rows: Sequence[int]) -> None:
+        """Set `out` to `start` and the `rows` times their factors."""
+        tiles = [np.tile(np.append(self._factors[row], 0.0).astype(np.float32), (self._width, 1)) for row in rows]
+        term = np.empty((LINES, self._width, 4), np.float32)
+        for first in range(0, len(out), LINES):
+            lines = slice(first, first + LINES)
+            out[lines] = start[lines]
+            for row, tile in zip(rows, tiles, strict=True):
+                if tile.any():
+                    out[lines] += np.multiply(self._layers[row, lines], tile, out=term[: len(out[lines])])

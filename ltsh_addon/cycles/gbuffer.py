@@ -199,7 +199,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
         for lobe in range(int(lengths.max(initial=0))):
             there = np.flatnonzero(same & (lengths[others] > lobe))
             pairs = starts[others[there]] + lobe, starts[leader[there]] + lobe
-            same[there] = _one_shading(samples, shines, *pairs, looseness)
+            same[there] = one_shading(samples, shines, *pairs, looseness)
         target[others[same]] = leader[same]
         free[others[same]] = False
     # From hits to their samples.
@@ -209,7 +209,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
     return kept, np.searchsorted(kept, of_sample)
 
 
-def _one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, looseness: float) -> np.ndarray:
+def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, looseness: float) -> np.ndarray:
     """Mask of pairs of samples that get one shading, or with a `looseness` above 1 one shadow; which `shines` (P,)."""
     same = np.ones(len(one), bool)
     for name in SAME:

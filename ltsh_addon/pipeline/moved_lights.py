@@ -1,33 +1,117 @@
-"""Lights of a finished picture that have moved: `MovedLights` shades them where they are, by their own rays alone."""
+"""Lights of a finished picture that have moved: `MovedLights` shades them where they are, by their own rays alone.
+
+A draft comes first: of every second pixel of every second row, and of all that differs from these, the others are
+between them. Then come all samples, block after block, those with the most light first.
+"""
 
 from __future__ import annotations
 
+import itertools
 import threading
+import time
 import weakref
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ..cycles.gbuffer import with_one_shadow
+from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..files import temporary_folder
-from ..scene import AreaLight
-from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_light
+from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..shading.light_polygons import has_lobe
+from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
 from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples
 from .mixer import Row, bounced_light
 
 # So many, that all processes take about as long; with fewer samples a block costs more than they do.
 BLOCKS, FEWEST_OF_BLOCK = 16, 1 << 11
+# Of a draft: the distance of its pixels, and the most rays of a sample.
+STEP, DRAFT_RAYS = 2, 32
+# Samples of a pixel of which one is looked for that is like another, and the least weight of those that are found.
+MOST_LIKE, LEAST_WEIGHT = 4, 0.5
+# Between two pictures that get better.
+SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Samples at `index` (Q,), and how all P follow from them: each is the sum of those with the numbers `sources`
+    (4, P) among them times `weights` (4, P), in light over color."""
+
+    index: np.ndarray
+    sources: np.ndarray
+    weights: np.ndarray
+    colors: dict[str, np.ndarray]  # by pass, (P, 3)
+
+    @classmethod
+    def of(cls, samples: SurfaceSamples, film: Film) -> Draft:
+        """Those of the pixels of a grid, and those that differ from all of them around."""
+        lobes, pixels = has_lobe(samples), film.width * film.height
+        order = np.argsort(film.pixel, kind="stable")
+        count = np.bincount(film.pixel, minlength=pixels)
+        first = np.cumsum(count) - count
+        x, y = film.pixel % film.width, film.pixel // film.width
+        is_own = (x % STEP == 0) & (y % STEP == 0)
+        shape = 4, len(samples)
+        like, weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
+        for corner, (right, below) in enumerate(itertools.product((0, 1), repeat=2)):
+            column, row = (STEP * (place // STEP + step) for place, step in ((x, right), (y, below)))
+            weight = (1.0 - np.abs(column - x) / STEP) * (1.0 - np.abs(row - y) / STEP)
+            there = ~is_own & (weight > 0.0) & (column < film.width) & (row < film.height)
+            pixel = np.where(there, row * film.width + column, 0)
+            for slot in range(MOST_LIKE):
+                one = np.flatnonzero(there & (count[pixel] > slot))
+                other = order[first[pixel[one]] + slot]
+                same = one_shading(samples, lobes[1], one, other, SHADOW_LOOSENESS)
+                same &= (lobes[:, one] == lobes[:, other]).all(axis=0)
+                like[corner, one[same]], weights[corner, one[same]] = other[same], weight[one[same]]
+                there[one[same]] = False
+        whole = weights.sum(axis=0)
+        is_own |= whole < LEAST_WEIGHT
+        weights /= np.maximum(whole, LEAST_WEIGHT)
+        weights[:, is_own] = np.array([1.0, 0.0, 0.0, 0.0])[:, None]
+        like[0, is_own] = index = np.flatnonzero(is_own)
+        number = np.zeros(len(samples), np.int32)
+        number[index] = np.arange(len(index))
+        specular = samples.specular_f0 + 0.05 * samples.specular_f90 + 0.05 * samples.dielectric
+        colors = {"specular": specular.astype(np.float32), "diffuse": samples.diffuse_albedo.astype(np.float32)}
+        return cls(index, number[like], weights, colors)
+
+    def all_samples(self, name: str, radiance: np.ndarray) -> np.ndarray:
+        """Radiance (P, 3) of a pass of all samples by that of the draft's, (Q, 3)."""
+        color = self.colors[name]
+        light = np.divide(radiance, color[self.index], out=np.zeros_like(radiance), where=color[self.index] > 0.0)
+        found = np.zeros_like(color)
+        for source, weight in zip(self.sources, self.weights, strict=True):
+            found += weight[:, None] * light[source]
+        return found * color
+
+
+def _coarse(film: Film) -> Film:
+    """The same samples in pixels as large as the grid of a draft is wide."""
+    width, height = (-(-size // STEP) for size in (film.width, film.height))
+    x, y = film.pixel % film.width, film.pixel // film.width
+    return replace(film, width=width, height=height, pixel=y // STEP * width + x // STEP)
+
+
+def _blocks(samples: SurfaceSamples, starting: SurfaceSamples, film: Film, place: np.ndarray) -> Iterator[tuple]:
+    """Yield blocks as of a `Setting`, each with which of the `samples` it has."""
+    order = np.argsort(place, kind="stable")
+    size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))
+    for first in range(0, max(len(starting), 1), size):
+        begin, end = np.searchsorted(place[order], (first, first + size))
+        own, part = order[begin:end], slice(first, first + size)
+        yield own, (samples.take(own), starting.take(part), film.take(part), place[own] - first)
 
 
 class MovedLights:
     """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
 
-    With the first of them processes start that keep the samples, so that others take half a second; `close` ends them.
-    Threads may share it.
+    With the first of them processes start that keep the samples, so that others take less; `close` ends them. Threads
+    may share it: who asks for a picture ends what others wait for, which raises Cancelled there.
     """
 
     def __init__(self, read: Callable[[], tuple[KeptPicture, Occluders | None]]):
@@ -36,7 +120,7 @@ class MovedLights:
         self._company, self._ending = None, ExitStack()
         # Also for who forgets to, and where Python ends.
         weakref.finalize(self, self._ending.close)
-        self._lock, self._is_ready = threading.Lock(), False
+        self._lock, self._is_ready, self._turn = threading.Lock(), False, 0
 
     @classmethod
     def load(cls, path: Path) -> MovedLights:
@@ -57,34 +141,88 @@ class MovedLights:
             threading.Thread(target=self._try, args=(light,), name="LTSH lights", daemon=True).start()
 
     def _try(self, light: AreaLight) -> None:
-        with suppress(Exception):  # who asks for a picture gets to know
-            self.picture(light)
+        # Who asks for a picture gets to know.
+        with suppress(Exception), closing(self.pictures(light)) as pictures:
+            next(pictures)
 
     def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, with what the `row` of it bounced before. Raises SceneError."""
+        turn = self._next_turn()
         with self._lock:
-            return self._picture(light, row)
+            light, task = self._prepared(light, turn)
+            values = self._nothing()
+            for _ in self._blocks_lit(light, task, self._whole, values, turn):
+                pass
+            return self._image(values, row)
 
-    def _picture(self, light: AreaLight, row: Row | None) -> np.ndarray:
+    def pictures(self, light: AreaLight, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
+        """Yield what `picture` returns, at first as a draft, at last as it is, and how much of it is done."""
+        turn = self._next_turn()
+        with self._lock:
+            light, task = self._prepared(light, turn)
+            values, quick = self._nothing(), task and replace(task, rays=min(task.rays, DRAFT_RAYS))
+            for _ in self._blocks_lit(light, quick, self._drafted, values, turn):
+                pass
+            for name, radiance in values.items():
+                values[name] = self._draft.all_samples(name, radiance[self._draft.index])
+            yield self._image(values, row), 0.0
+            light_of = {n: sum(values[name][self._own[n]].sum() for name in values) for n in self._whole}
+            shown, first = time.monotonic(), sorted(self._whole, key=light_of.__getitem__, reverse=True)
+            for done, _ in enumerate(self._blocks_lit(light, task, first, values, turn), 1):
+                if done == len(first) or time.monotonic() - shown > SECONDS:
+                    yield self._image(values, row), done / len(first)
+                    shown = time.monotonic()
+
+    def stop(self) -> None:
+        """Raise Cancelled where somebody waits for a picture."""
+        self._next_turn()
+
+    def _next_turn(self) -> int:
+        self._turn += 1
+        return self._turn
+
+    def _check(self, turn: int) -> None:
+        if turn != self._turn:
+            raise Cancelled("the light has moved again, or the picture was stopped")
+
+    def _prepared(self, light: AreaLight, turn: int):
+        """The light around the origin of the samples, and what finds its shares."""
+        self._check(turn)
         if self._company is None:
             self._start()
-        kept, film, task = self._kept, self._kept.extraction.film, None
+        kept = self._kept
         light = light.moved(-kept.extraction.origin)
-        if self._tracer is not None:
-            rays = rays_of_samples(kept.options["shadow_rays"], film)
-            task = task_of_light(self._starting, light, self._tracer, kept.options["passes"], rays)
-        found = self._company.lit(light, task)
-        image = np.zeros((film.height, film.width, 3), np.float32)
-        for name in kept.options["passes"]:
-            own = np.zeros((len(film.pixel), 3), np.float32)
-            own[self._order] = np.concatenate([radiance[name] for radiance in found])
-            image += kept.shown(name, moved=True) * film.image(kept.extraction.exposure * own)
+        if self._tracer is None:
+            return light, None
+        rays = rays_of_samples(kept.options["shadow_rays"], kept.extraction.film)
+        task = task_of_lights(self._starting, (light,), self._tracer, kept.options["passes"], rays)
+        # As many rays as the light gets beside the others in a new picture.
+        typical = {name: max(value, self._typical[name]) for name, value in task.typical.items()}
+        return light, replace(task, typical=typical)
+
+    def _nothing(self) -> dict[str, np.ndarray]:
+        return {name: np.zeros((self._count, 3), np.float32) for name in self._kept.options["passes"]}
+
+    def _blocks_lit(self, light, task, numbers: Sequence[int], values, turn: int) -> Iterator[None]:
+        """Put the radiance of blocks into `values`, (P, 3) by pass, one after another."""
+        for number, radiance in self._company.lit(light, task, numbers):
+            self._check(turn)
+            for name, found in radiance.items():
+                values[name][self._own[number]] = found
+            yield
+
+    def _image(self, values, row: Row | None) -> np.ndarray:
+        kept = self._kept
+        image = np.zeros((kept.extraction.film.height, kept.extraction.film.width, 3), np.float32)
+        for name, radiance in values.items():
+            image += kept.shown(name, moved=True) * kept.extraction.film.image(kept.extraction.exposure * radiance)
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:
         """End the processes; the next light starts others."""
+        self.stop()
         with self._lock:
-            self._company = None
+            self._company, self._is_ready = None, False
             self._ending.close()
 
     def _start(self) -> None:
@@ -96,22 +234,30 @@ class MovedLights:
         samples = kept.extraction.samples
         samples = replace(samples, position=samples.position - kept.extraction.origin)
         starting, place = samples, np.arange(len(samples))
+        # Which samples are neighbors is all that rays ask of their film.
+        film = film.unspread()
+        self._draft = draft = Draft.of(samples, film)
         if film.count is not None:
             starting, film, place = with_one_shadow(samples, film)
-        self._starting, self._order = starting, np.argsort(place, kind="stable")
-        # Which samples are neighbors is all that rays ask of their film.
-        film, blocks = film.unspread(), []
-        size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))
-        for first in range(0, max(len(starting), 1), size):
-            begin, end = np.searchsorted(place[self._order], (first, first + size))
-            own, part = self._order[begin:end], slice(first, first + size)
-            blocks.append((samples.take(own), starting.take(part), film.take(part), place[own] - first))
+        self._starting, self._count = starting, len(samples)
+        parts, place_of_draft = np.unique(place[draft.index], return_inverse=True)
+        quick = samples.take(draft.index), starting.take(parts), _coarse(film.take(parts)), place_of_draft
+        drafted = [(draft.index[own], block) for own, block in _blocks(*quick)]
+        whole = list(_blocks(samples, starting, film, place))
+        self._drafted, self._whole = range(len(drafted)), range(len(drafted), len(drafted) + len(whole))
+        self._own = [own for own, _ in (*drafted, *whole)]
+        blocks = dict(enumerate(block for _, block in (*drafted, *whole)))
         (table,) = picture.load_tables((kept.technique,)).values()
+        passes, lights = (
+            tuple(kept.options["passes"]),
+            [one.moved(-kept.extraction.origin) for one in kept.extraction.lights],
+        )
         with ExitStack() as stack:
             self._tracer = None
             if self._occluders is not None:
                 folder = stack.enter_context(temporary_folder())
                 self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
-            self._company = Company(Setting(tuple(blocks), table, tuple(kept.options["passes"])), self._tracer)
+                self._typical = task_of_lights(starting, lights, self._tracer, passes, DRAFT_RAYS).typical
+            self._company = Company(Setting(blocks, table, passes), self._tracer)
             stack.callback(self._company.close)
             self._ending.callback(stack.pop_all().close)

@@ -490,15 +490,21 @@ class Keeper(Child):
         super().__init__()
 
     def put(self, question) -> None:
-        """Ask; the answer is what the next `get` returns."""
+        """Ask; `poll` returns the answer."""
         self._questions.put(question)
 
-    def get(self):
-        """An answer, None where the child is gone."""
-        while self._thread.is_alive() or not self._answers.empty():
-            with suppress(Empty):
-                return self._answers.get(timeout=PATIENCE_SECONDS)
+    def take_back(self):
+        """A question that the child has not been asked yet, None where there is none."""
+        with suppress(Empty):
+            return self._questions.get_nowait()
         return None
+
+    def answers(self, seconds: float) -> list:
+        """All answers since; where there are none, wait some seconds for one."""
+        found = []
+        while (answer := self.poll(0.0 if found else seconds)) is not None:
+            found.append(answer)
+        return found
 
     def poll(self, seconds: float):
         """An answer, None where there is none within some seconds."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from .crew import Company, Mate, Setting
 from .directions import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import BLOCK_SAMPLES, Visibility, task_of_light, visible_shares
+from .ratio import BLOCK_SAMPLES, Visibility, task_of_lights, visible_shares
 from .rays import Tracer, open_tracer
 from .starts import Starts
 
@@ -27,6 +27,6 @@ __all__ = [
     "Visibility",
     "open_tracer",
     "shared_numbers",
-    "task_of_light",
+    "task_of_lights",
     "visible_shares",
 ]

@@ -212,19 +212,19 @@ SAMPLES_WORTH_A_CHILD = 1 << 13
 
 @dataclass(frozen=True)
 class Setting:
-    """Blocks of samples that one light after another lights, and how.
+    """Blocks of samples, by number, that one light after another lights, and how.
 
     A block has samples (B), around the origin of the occluders, those (Q) that rays start from, their film, and of
     which of them each of the former takes its shares, (B,).
     """
 
-    blocks: tuple[tuple[SurfaceSamples, SurfaceSamples, Film, np.ndarray], ...]
+    blocks: dict[int, tuple[SurfaceSamples, SurfaceSamples, Film, np.ndarray]]
     table: LookupTable
     passes: tuple[str, ...]
 
 
 class LitBlocks:
-    """Answers a light, and the task that finds its shares, with radiance (B, 3) by pass of each block.
+    """Answers a light, and the task that finds its shares, with radiance (B, 3) by pass of a block.
 
     `setting` comes with the occluders and the library that traces; None: everything is seen.
     """
@@ -234,18 +234,19 @@ class LitBlocks:
         self._tracer = tracer
         if tracer is None and occluders is not None:
             self._tracer = open_tracer(occluders, [library])
-        self._starts: list = [None] * len(self._setting.blocks)
+        self._starts: dict = {}
 
-    def shade(self, message) -> list[dict[str, np.ndarray]]:
-        """The answer."""
-        return [self._lit(number, *message) for number in range(len(self._setting.blocks))]
+    def shade(self, message) -> tuple[int, int, dict[str, np.ndarray]]:
+        """The answer to (run, number, light, task): run, number, radiance."""
+        run, number, light, task = message
+        return run, number, self._lit(number, light, task)
 
     def _lit(self, number: int, light: AreaLight, task) -> dict[str, np.ndarray]:
         own, (samples, starting, film, place) = self._setting, self._setting.blocks[number]
         radiance = {name: np.zeros((len(samples), 3), np.float32) for name in own.passes}
         shares = dict.fromkeys(own.passes, np.float32(1.0))
         if task is not None:
-            if self._starts[number] is None:
+            if number not in self._starts:
                 self._starts[number] = self._tracer.starts(starting)
             found = task.shares(starting, film, self._starts[number], self._tracer)
             shares = {name: getattr(found, name)[0][place, None] for name in own.passes}
@@ -262,29 +263,57 @@ class Company:
     """
 
     def __init__(self, setting: Setting, tracer):
-        self._setting, self._tracer = setting, tracer
         occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
         count = min(parallel.cores(), len(setting.blocks))
         cannot_help = parallel.interpreter() is None or (tracer is not None and library is None)
-        if cannot_help or sum(len(block[0]) for block in setting.blocks) < SAMPLES_WORTH_A_CHILD:
+        if cannot_help or sum(len(block[0]) for block in setting.blocks.values()) < SAMPLES_WORTH_A_CHILD:
             count = 1
-        self._parts = [replace(setting, blocks=setting.blocks[first::count]) for first in range(count)]
-        self._own = LitBlocks((self._parts[0], occluders, library), tracer)
+        # This process knows all blocks: what others have not begun when it has done its own it does for them.
+        self._own, self._count, self._run = LitBlocks((setting, occluders, library), tracer), count, 0
+        parts = [{n: block for n, block in setting.blocks.items() if n % count == own} for own in range(1, count)]
         self._children = [
-            parallel.Keeper("visibility.crew.LitBlocks", worker.packed((part, occluders, library)))
-            for part in self._parts[1:]
+            parallel.Keeper(
+                "visibility.crew.LitBlocks", worker.packed((replace(setting, blocks=part), occluders, library))
+            )
+            for part in parts
         ]
 
-    def lit(self, light: AreaLight, task) -> list[dict[str, np.ndarray]]:
-        """What the blocks reflect of a light, see `LitBlocks`."""
-        for child in self._children:
-            child.put((light, task))
-        found = [self._own.shade((light, task))]
-        for part, child in zip(self._parts[1:], self._children, strict=True):
-            answer = child.get()
-            # Where the child is gone this process does its part.
-            found.append(LitBlocks((part, None, None), self._tracer).shade((light, task)) if answer is None else answer)
-        return [found[number % len(found)][number // len(found)] for number in range(len(self._setting.blocks))]
+    def lit(self, light: AreaLight, task, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """Yield what the blocks `numbers` reflect of a light, see `LitBlocks`, the first ones first, about.
+
+        Who stops to ask leaves no work behind but what has begun.
+        """
+        self._run += 1
+        missing, own = set(numbers), deque()
+        for number in numbers:
+            child = number % self._count
+            message = self._run, number, light, task
+            if child == 0:
+                own.append(message)
+            else:
+                self._children[child - 1].put(message)
+        try:
+            while missing:
+                message = own.popleft() if own else self._taken_back()
+                found = [] if message is None else [self._own.shade(message)]
+                for child in self._children:
+                    is_idle = message is None and not found
+                    found += child.answers(parallel.PATIENCE_SECONDS if is_idle else 0.0)
+                for run, number, radiance in found:
+                    if run == self._run and number in missing:
+                        missing.remove(number)
+                        yield number, radiance
+                if message is None and not found:
+                    # What a process that is gone had begun.
+                    gone = [number for number in missing if self._children[number % self._count - 1].is_gone]
+                    own.extend((self._run, number, light, task) for number in gone)
+        finally:
+            while self._taken_back() is not None:
+                pass
+
+    def _taken_back(self):
+        """A message that no process has begun with, None where there is none."""
+        return next((message for child in self._children if (message := child.take_back()) is not None), None)
 
     def close(self) -> None:
         """End the other processes."""

@@ -215,9 +215,11 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer, starts=N
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 
 
-def task_of_light(samples: SurfaceSamples, light: AreaLight, tracer, passes: Sequence[str], rays: int) -> ShadowTask:
-    """What finds the shares of one light, at most `rays` for each of the `samples`, as in `visible_shares`."""
-    (emitters, _), passes = emitters_of((light,), tracer), tuple(passes)
+def task_of_lights(
+    samples: SurfaceSamples, lights: Sequence[AreaLight], tracer, passes: Sequence[str], rays: int
+) -> ShadowTask:
+    """What finds the shares of `lights`, at most `rays` for each of the `samples`, as in `visible_shares`."""
+    (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), False)
     return replace(task, typical=typical_radiance(samples, task, tracer)[0])
 

@@ -56,6 +56,9 @@ MOST_NOISE, AROUND = 0.06, 4
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
+# What direct light will take is told from squares of so many pixels on a side that have such shares of its samples. The
+# time grows with the samples to a power of at least LEAST_POWER, at most 1. Of what is left it may take so much.
+SQUARE, PROBES, LEAST_POWER, DIRECT_SHARE = 8, (0.01, 0.04), 0.5, 0.6
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -129,14 +132,11 @@ def finish(
     with temporary_folder() as folder, kept_blender(folder):
         comparison = _ours(options, where, clock, progress)
         shaded(comparison)
-        spent = clock.seconds()
-        film = comparison.film
-        reserve = (
-            (LAST_SECONDS + MORE_SECONDS * (_denoisings(comparison.extraction) - 1)) * film.width * film.height / 1e6
-        )
-        seconds = None if options.budget is None else max(options.budget - spent - reserve, 0.0)
+        seconds = _left(options, comparison.extraction, clock)
         width, height = options.resolution or (None, None)
-        job = child_job(client.FinishedJob, options, **where, width=width, height=height, seconds=seconds)
+        edges = not (comparison.extraction.has_lens or comparison.extraction.kept.everything)
+        own = {"width": width, "height": height, "seconds": seconds, "edges": edges}
+        job = child_job(client.FinishedJob, options, **where, **own)
         cycles = client.render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles, options.denoise == "on")
@@ -154,11 +154,7 @@ def finish(
                 f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
                 "or let the world shine"
             )
-        if options.budget is not None and clock.seconds() > MOST_OVER * options.budget:
-            report["warnings"].append(
-                f"the picture took {clock.seconds():.1f} s of processor time, the budget is {options.budget:g} s; give "
-                "it more, or fewer pixels"
-            )
+        report["warnings"] += _too_long(options, comparison.extraction, cycles, clock)
         seconds = {
             **comparison.extraction.seconds,
             "techniques": {name: result.seconds for name, result in comparison.results.items()},
@@ -172,8 +168,33 @@ def finish(
     return Finished(combined, rest, layers, channels, report, seconds, kept, comparison, cycles)
 
 
+def _left(options: RenderOptions, extraction, clock: _ProcessorClock) -> float | None:
+    """Processor seconds of a budget that are left until denoising, None without a budget."""
+    if options.budget is None:
+        return None
+    million = extraction.film.width * extraction.film.height / 1e6
+    reserve = (LAST_SECONDS + MORE_SECONDS * (_denoisings(extraction) - 1)) * million
+    return max(options.budget - clock.seconds() - reserve, 0.0)
+
+
+def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock) -> list[str]:
+    """The warning about a picture that took longer than its budget."""
+    took = clock.seconds()
+    if options.budget is None or took <= MOST_OVER * options.budget:
+        return []
+    # Starting Blender, opening the file, a few samples of Cycles, denoising.
+    least = extraction.processor_seconds - extraction.direct_seconds + cycles.least_seconds + clock.stages["denoise"]
+    if least > options.budget:
+        found = f"takes at least {least:.1f} s of processor time, however few samples, and took {took:.1f} s"
+    else:
+        found = f"took {took:.1f} s of processor time, of at least {least:.1f} s with nothing but a few samples"
+    return [f"the picture {found}; the budget is {options.budget:g} s: give it more, or fewer pixels"]
+
+
 def _denoisings(extraction) -> int:
     """How many pictures `_rest` denoises at most: two for each way to take passes, and one for each light group."""
+    if extraction.kept.everything:
+        return 1
     ways = np.unique([mask.ravel() for mask in extraction.kept.by_pass.values()], axis=1)
     return 2 * ways.shape[1] + len({light.group for light in extraction.lights if light.group})
 
@@ -197,7 +218,7 @@ class _ProcessorClock:
     def end(self, stage: str, of_child: float = 0.0) -> None:
         """A stage has ended, for which a child, which has not, took so many seconds."""
         self._others += of_child
-        self.stages[stage] = self.seconds() - sum(self.stages.values())
+        self.stages[stage] = self.stages.get(stage, 0.0) + self.seconds() - sum(self.stages.values())
 
     def seconds(self) -> float:
         return self._now() - self._start + self._others
@@ -220,20 +241,86 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
         return picture.Comparison(own, extraction, {}, None)
-    shadows = _shadows(options, extraction, progress)
-    clock.end("shadows")
+    with lighting.ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
+        how = _How(options, own, tables, tracer)
+        extraction = how.affordable(extraction, _left(options, extraction, clock))
+        clock.end("choice")
+        if extraction.kept.everything:
+            return picture.Comparison(own, extraction, {}, None)
+        extraction = client.ended(extraction)
+        clock.end("extraction")
+        shadows = how.shadows(extraction, progress)
+        clock.end("shadows")
     results = picture.evaluated(tables, extraction, shadows, own, progress)
     clock.end("shading")
     return picture.Comparison(own, extraction, results, shadows)
 
 
-def _shadows(options: RenderOptions, extraction, progress) -> lighting.Shadows:
-    """The shares of the lights that the samples see: points of a pixel that see about the same share their rays."""
-    if extraction.has_lens:
-        return lighting.trace_shadows(extraction, PASSES, _rays(options, extraction), progress)
-    samples, film, place = with_one_shadow(extraction.samples, extraction.film)
-    seen = replace(extraction, samples=samples, film=film)
-    return lighting.trace_shadows(seen, PASSES, _rays(options, seen), progress).take(place)
+@dataclass(frozen=True)
+class _How:
+    """How direct light is made."""
+
+    options: RenderOptions
+    own: PictureOptions
+    tables: dict
+    tracer: lighting.ShadowTracer
+
+    def shadows(self, extraction, progress=None) -> lighting.Shadows:
+        """The shares of the lights that the samples see: points of a pixel that see about the same share their rays."""
+        samples, film, place = extraction.samples, extraction.film, slice(None)
+        if not extraction.has_lens:
+            samples, film, place = with_one_shadow(samples, film)
+        rays = lighting.rays_of_samples(_rays(self.options, replace(extraction, samples=samples, film=film)), film)
+        return self.tracer.trace(samples, PASSES, rays, film=film, progress=progress).take(place)
+
+    def affordable(self, extraction, seconds: float | None):
+        """With the points of a pixel, each but once, that processor `seconds` allow; None: with all of them."""
+        from ..blender.process import client
+
+        # Cycles will look at the scene about as long as was done here.
+        allowed = None if seconds is None else DIRECT_SHARE * (seconds - extraction.direct_seconds)
+        if allowed is not None and allowed <= 0.0:
+            return self._left_to_cycles(extraction)
+        points, whole = extraction.film.sub_samples, client.with_points(extraction, extraction.film.sub_samples)
+        if allowed is None or len(whole.samples) == 0:
+            return whole
+        number, took = self._probe(whole, PROBES[0])
+        if took * len(whole.samples) <= allowed * number:
+            return whole
+        one, power = np.count_nonzero(extraction.point == 0), LEAST_POWER
+        if took * (one / number) ** power <= allowed:
+            first, (number, took) = (number, took), self._probe(whole, PROBES[1])
+            power = np.log(took / first[1]) / np.log(max(number / first[0], 1.1))
+            power = float(np.clip(power, LEAST_POWER, 1.0))
+        most = number * (allowed / took) ** (1.0 / power)
+        if len(whole.samples) <= most:
+            return whole
+        if most < one or extraction.has_lens:
+            return self._left_to_cycles(extraction)
+        # Each point that a pixel gets beside its first makes about as many samples.
+        return client.with_points(extraction, 1 + int((points - 1) * (most - one) / (len(whole.samples) - one)))
+
+    def _left_to_cycles(self, extraction):
+        from ..blender.process import client
+
+        everything = (*extraction.kept.everything, client.too_small(self.options.budget))
+        return replace(extraction, kept=replace(extraction.kept, everything=everything))
+
+    def _probe(self, extraction, share: float) -> tuple[int, float]:
+        """How many samples of a few squares of the picture there are, and the processor seconds that they take."""
+        from ..blender.process import client
+
+        film, start = extraction.film, time.process_time()
+        row, column = np.divmod(film.pixel, film.width)
+        square = row // SQUARE * film.width + column // SQUARE
+        chosen = np.random.default_rng(round(1.0 / share)).permutation(film.width * film.height)
+        count = np.cumsum(np.bincount(square, minlength=len(chosen))[chosen])
+        there = np.isin(square, chosen[: 1 + np.searchsorted(count, share * len(square))])
+        part = replace(extraction, samples=extraction.samples.take(there), film=film.take(there))
+        part = client.ended(part)
+        shadows = self.shadows(part)
+        picture.evaluated(self.tables, part, shadows, self.own, None)
+        return int(np.count_nonzero(there)), time.process_time() - start
 
 
 def _rays(options: RenderOptions, extraction) -> int:

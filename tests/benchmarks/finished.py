@@ -42,7 +42,7 @@ def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=T
     with kept_blender(own):
         # As much as starting Blender, opening the file and denoising take.
         left = None if seconds is None else max(seconds - START, 0.1)
-        job = client.FinishedJob(path, None, None, None, None, *SIZE, samples, left)
+        job = client.FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
         made = client.render_finished(job, own)
     image = read_layer(made.channels, "Combined", "RGB")
     if denoise:

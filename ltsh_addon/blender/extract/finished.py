@@ -37,7 +37,7 @@ REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmis
 
 def render_finished(job: dict, folder: Path, progress) -> dict:
     """Do the `job` (see `client.FinishedJob`), write EXRs into `folder`; the manifest as a dictionary."""
-    warnings: list[str] = []
+    warnings, started, seconds = [], time.process_time(), job["seconds"]
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])
     scene = scene_named(job["scene_name"])
@@ -49,11 +49,12 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     everything = _kept_by_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
-    has_edges = not (everything or camera.data.dof.use_dof)
-    seconds = job["seconds"]
-    if seconds is not None and has_edges:
-        seconds = max(seconds - EDGE_SECONDS * width * height / 1e6, 0.0)
-    files = _render_chunks(scene, layer, folder, {**job, "seconds": seconds}, progress)
+    has_edges, end = job["edges"] and not (everything or camera.data.dof.use_dof), None
+    if seconds is not None:
+        reserve = EDGE_SECONDS * width * height / 1e6 if has_edges else 0.0
+        end = started + SPENT * max(seconds - reserve, 0.0)
+    files, least = _render_chunks(scene, layer, folder, job["cycles_samples"], end, progress)
+    has_edges = has_edges and (end is None or time.process_time() < started + seconds)
     if has_edges:
         _render_edges(scene, layer, folder, progress)
     return {
@@ -61,6 +62,7 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
         "camera": camera.name,
         "layer": layer.name,
         "files": files,
+        "least_seconds": least - started,
         "edges": [EDGES, EDGE_SAMPLES[1]] if has_edges else None,
         "film_transparent": scene.render.film_transparent,
         "dropped": dropped,
@@ -123,17 +125,15 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
     layer.cycles.denoising_store_passes = True
 
 
-def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list]:
-    """[file name in `folder`, samples in it]: the samples of the job, or as many as its seconds allow, or those of the
-    file in one go with all that it says of them."""
-    cycles, files, done = scene.cycles, [], 0
-    samples, seconds = job["cycles_samples"], job["seconds"]
-    if samples is None and seconds is None:
+def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[list[list], float]:
+    """[file name in `folder`, samples in it]: so many samples, or as many as there is time for until the processor time
+    `end`, or those of the file in one go with all that it says of them; and the processor time after the first file."""
+    cycles, files, done, first = scene.cycles, [], 0, 0.0
+    if samples is None and end is None:
         render_exr(scene, folder / "cycles_0.exr")
-        return [["cycles_0.exr", layer.samples or cycles.samples]]
+        return [["cycles_0.exr", layer.samples or cycles.samples]], time.process_time()
     layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
     cycles.use_sample_subset = True
-    end = None if seconds is None else time.process_time() + SPENT * seconds
     chunk = min(FIRST, samples) if end is None else PROBE
     while samples is None or done < samples:
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
@@ -143,6 +143,7 @@ def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list
         cycles.sample_offset, cycles.sample_subset_length = done, chunk
         files.append([f"cycles_{len(files)}.exr", chunk])
         render_exr(scene, folder / files[-1][0])
+        first = first or time.process_time()
         done += chunk
         each = (clock() - started) / chunk
         if end is not None:
@@ -154,7 +155,7 @@ def _render_chunks(scene, layer, folder: Path, job: dict, progress) -> list[list
         else:
             chunks = min(MOST_CHUNKS, max(1, round(each * (samples - done) / CHUNK_SECONDS)))
             chunk = max(1, min(-(-(samples - done) // chunks), samples - done))
-    return files
+    return files, first
 
 
 def _render_edges(scene, layer, folder: Path, progress) -> None:

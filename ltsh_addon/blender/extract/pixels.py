@@ -73,7 +73,6 @@ def render_pixel_samples(
 
 # Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
 FINISHED_LENS = 32
-TOO_SMALL = "the budget is too small for it"
 # Processor seconds that direct light takes: in all, and for a point of a pixel; the latter grows by so much with each
 # light, up to so many. Of a budget, shares that points may take, and all of direct light.
 START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.2, 6e-6, 0.125
@@ -261,6 +260,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])
+    opened = time.process_time()
     scene = scene_named(job["scene_name"])
     render_settings.go_to_frame(scene, job["frame"])
     camera = render_settings.choose_camera(scene, job["camera"])
@@ -278,12 +278,13 @@ def extract(job: dict, folder: Path, progress) -> dict:
             scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
         )
         if budget is not None and not has_lens:
-            count = min(affordable_points(budget, pixels, len(inventory.lights)), count)
+            left = budget - (time.process_time() - opened)
+            count = min(affordable_points(left, pixels, len(inventory.lights)), count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")
     if count == 0:
-        inventory.kept.everything.append(f"{TOO_SMALL}, {budget:g} s")
+        inventory.kept.everything.append(client.too_small(budget))
     has_shadows = inventory.occluders is not None
     if has_shadows:
         inventory.occluders.save(folder / OCCLUDERS)
@@ -293,6 +294,8 @@ def extract(job: dict, folder: Path, progress) -> dict:
     lens.use_dof = has_lens
     offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
+        # Where all is left to Cycles nothing is to be shaded.
+        count = 0 if inventory.kept.everything else count
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
     with world_behind(scene, inventory.behind if job["rest"] and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if job["rest"] else ()), *job["indices"])
@@ -326,6 +329,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,
+        "direct_seconds": time.process_time() - opened,
     }
 
 

@@ -66,6 +66,11 @@ class KeptByCycles:
     warnings: tuple[str, ...]  # about what is shaded in place of it
 
 
+def too_small(budget: float) -> str:
+    """Why a finished picture leaves everything to Cycles."""
+    return f"the budget is too small for it, {budget:g} s"
+
+
 # Materials, or other reasons, that an error names.
 REASONS = 5
 # Smoother surfaces show the patches of a world.
@@ -116,7 +121,12 @@ class Extraction:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     light_settings: dict[str, list[float]] = field(default_factory=dict)
     processor_seconds: float = 0.0  # of the child
+    direct_seconds: float = 0.0  # of these what came after the file was open
     has_lens: bool = False  # depth of field: samples are seen through different points of the lens
+    # Of a finished picture, for `with_points`: which point of its pixel each sample (P,) is, and of points the weights
+    # (N, D, D) as of `Film.shared`.
+    point: np.ndarray | None = None
+    weights: np.ndarray | None = None
 
     @property
     def rest(self) -> np.ndarray | None:
@@ -152,22 +162,17 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             if options.rest:
                 rest.add(gbuffer.not_reflected(channels, manifest["passes"], manifest["film_transparent"]))
 
-        samples, film, warnings, problems = _read_samples(manifest, folder, look)
+        samples, film, point, warnings, problems = _read_samples(manifest, folder, look)
         lights = lights_of(manifest["lights"])
         warnings += gbuffer.rounded_positions(samples.position[has_lobe(samples).any(axis=0)], lights)
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
         kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
-        # Points of a blurred pixel may be far from each other.
-        if options.for_finished and not manifest["has_lens"] and len(samples):
-            samples, film = gbuffer.merged(samples, film)
         # In the file, where double precision tells positions apart.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
-        if kept is None or not kept.everything:
-            samples, film = _ended(samples, film, lights, options.for_finished)
-        return Extraction(
+        found = Extraction(
             lights=lights,
             samples=samples,
             film=film,
@@ -184,7 +189,11 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             origin=np.array(manifest["origin"]),
             **{name: manifest[name] for name in UNCHANGED},
             processor_seconds=manifest["processor_seconds"],
+            direct_seconds=manifest["direct_seconds"],
+            point=point if options.for_finished else None,
+            weights=np.array(manifest["weights"]) if manifest["weights"] else None,
         )
+        return found if options.for_finished else ended(found)
 
 
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
@@ -193,21 +202,38 @@ def build_demo(path: Path, *, progress: Progress | None = None) -> None:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
-def _ended(samples, film, lights, is_quick: bool) -> tuple[SurfaceSamples, Film]:
-    """The samples ended at the horizons of Cycles, and their film."""
+def with_points(extraction: Extraction, count: int) -> Extraction:
+    """The first `count` points of each pixel of a finished picture, of which one stands for all on a smooth surface."""
+    samples, film = extraction.samples, extraction.film
+    if count < film.sub_samples:
+        kept = extraction.point < count
+        samples, film = samples.take(kept), replace(film.take(kept), sub_samples=count)
+        if extraction.weights is not None:
+            seen = np.isfinite(film.whole)
+            film = film.unspread().shared(extraction.weights[:count], extraction.point[kept], seen)
+    # Points of a blurred pixel may be far from each other.
+    if not extraction.has_lens and len(samples):
+        samples, film = gbuffer.merged(samples, film)
+    return replace(extraction, samples=samples, film=film, point=None, weights=None)
+
+
+def ended(extraction: Extraction) -> Extraction:
+    """The same with samples ended at the horizons of Cycles."""
+    samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
-    samples, index = end_at_horizons_of_cycles(samples, lights, hit, is_quick=is_quick)
+    is_quick = extraction.kept is not None
+    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=is_quick)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
         first &= film.first[index]
-    return samples, replace(film.take(index), first=None if first.all() else first)
+    return replace(extraction, samples=samples, film=replace(film.take(index), first=None if first.all() else first))
 
 
 def _read_samples(
     manifest: dict, folder: Path, look: Callable[[dict[str, np.ndarray]], None]
-) -> tuple[SurfaceSamples, Film, list[str], list[str]]:
-    """Samples and film of all sample renders, warnings, and the problem where most of what is seen is not shaded;
-    `look` gets the channels of each render."""
+) -> tuple[SurfaceSamples, Film, np.ndarray, list[str], list[str]]:
+    """Samples and film of all sample renders, the number of the render of each sample, warnings, and the problem where
+    most of what is seen is not shaded; `look` gets the channels of each render."""
     width, height = manifest["width"], manifest["height"]
     materials = manifest["unshaded"]
     renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
@@ -221,11 +247,11 @@ def _read_samples(
         unshaded += gbuffer.unshaded_hits(channels, len(materials))
         look(channels)
     samples, film = gbuffer.join(renders, width, height)
+    numbers = np.repeat(np.arange(len(renders)), [len(pixel) for _, pixel in renders])
     if manifest["weights"]:
-        numbers = np.repeat(np.arange(len(renders)), [len(pixel) for _, pixel in renders])
         film = film.shared(np.array(manifest["weights"]), numbers, _rendered_pixels(manifest))
     if not renders:
-        return samples, film, [], []
+        return samples, film, numbers, [], []
     warnings = []
     if unusable:
         what = "transparent surfaces in front of others, or not finite, or too far away"
@@ -239,10 +265,10 @@ def _read_samples(
         share, camera = f"{100.0 * lost / seen:.3g} %", manifest["camera"]
         reasons = [materials[number] for number in np.argsort(-unshaded, kind="stable") if unshaded[number]]
         reasons = listed([*reasons, *warnings[: (unusable > 0) + (unnamed > 0)]], REASONS, "; ")
-        return samples, film, warnings, [f"{share} of what camera {camera!r} sees is not shaded: {reasons}"]
+        return samples, film, numbers, warnings, [f"{share} of what camera {camera!r} sees is not shaded: {reasons}"]
     if len(samples) == 0:
         warnings.append(f"camera {manifest['camera']!r} sees no surface that can be shaded")
-    return samples, film, warnings, []
+    return samples, film, numbers, warnings, []
 
 
 def _rendered_pixels(manifest: dict) -> np.ndarray:
@@ -358,6 +384,7 @@ class FinishedJob:
     cycles_samples: int | None
     seconds: float | None  # of processor time, in place of samples
     scripts: bool = False  # run those of the file
+    edges: bool = True  # what shines in sight also apart, with few jagged edges
 
 
 @dataclass(frozen=True)
@@ -374,6 +401,7 @@ class CyclesPicture:
     camera: str
     frame: int
     processor_seconds: float
+    least_seconds: float  # of these what no picture of the scene takes less than
 
 
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
@@ -396,6 +424,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         camera=manifest["camera"],
         frame=manifest["frame"],
         processor_seconds=manifest["processor_seconds"],
+        least_seconds=manifest["least_seconds"],
     )
 
 

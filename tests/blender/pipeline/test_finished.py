@@ -1,6 +1,7 @@
 """A finished picture is what Cycles renders: each kind of path alone, nothing twice, nothing lost."""
 
 import json
+import re
 from dataclasses import replace
 
 import bpy
@@ -432,10 +433,10 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
-    found = {
-        budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)).report for budget in (0.01, 4.0)
-    }
-    small, large = found.values()
+    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 4.0)}
+    small, large = (one.report for one in made.values())
+    # Of what shines in sight only what stands beside our light is rendered apart.
+    assert not made[0.01].cycles.shining and set(made[4.0].cycles.shining) == {"emission", "background"}
     # However small it is, every part has something.
     assert small["cycles_samples"] >= 2 and small["sub_samples"] >= 1
     assert small["cycles_samples"] < large["cycles_samples"]
@@ -444,7 +445,60 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     assert small["finished"]["share_of_ours"] == {"specular": 0.0, "diffuse": 0.0}
     assert any("too small" in line for line in small["warnings"])
     assert large["finished"]["share_of_ours"]["diffuse"] == 1.0
-    assert any("the budget is 0.01 s" in line for line in small["warnings"])
+    (line,) = (line for line in small["warnings"] if "the budget is 0.01 s:" in line)
+    least, took = (float(text.partition(" s")[0]) for text in re.split("at least|took", line)[1:])
+    assert 0.0 < least <= took
+
+
+@pytest.mark.parametrize(
+    ("each", "power", "points"),
+    [
+        (1e-5, 1.0, 5),  # seconds of a sample: all of them
+        (1.6e-3, 1.0, range(2, 5)),
+        (0.028, 0.6, range(2, 5)),
+        (0.01, 1.0, 0),
+        (1.0, 0.5, 0),
+    ],
+)
+def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_for(
+    tmp_path, monkeypatch, each, power, points
+):
+    floor_and_ball(gray(), 1)
+    options = client.ExtractOptions(parts.save(tmp_path / "room.blend"), sub_samples=5, for_finished=True, shadows="on")
+    extraction = client.extract(options)
+    looks = []
+
+    def seconds_of(self, part, share):
+        looks.append(share)
+        count = max(round(share * len(part.samples)), 1)
+        return count, each * count**power
+
+    monkeypatch.setattr(render._How, "_probe", seconds_of)
+    how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), None, {}, None)
+    seconds = 3.0 + extraction.direct_seconds
+    found = how.affordable(extraction, seconds)
+    if points == 0:
+        assert any("too small" in line for line in found.kept.everything)
+        return
+    assert not found.kept.everything
+    assert each * len(found.samples) ** power <= render.DIRECT_SHARE * 3.0
+    assert found.film.sub_samples in (points if isinstance(points, range) else [points])
+    # The cheap one is looked at once.
+    assert len(looks) == (1 if points == 5 else 2)
+    assert how.affordable(extraction, 0.0).kept.everything and how.affordable(extraction, None).film.sub_samples == 5
+
+
+def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):
+    floor_and_ball(gray(), 1)
+    path = parts.save(tmp_path / "room.blend")
+    many, few = (client.extract(client.ExtractOptions(path, sub_samples=count, for_finished=True)) for count in (6, 3))
+    first, whole = client.with_points(many, 3), client.with_points(few, 3)
+    assert len(many.samples) > len(few.samples) > len(first.samples) > 0
+    np.testing.assert_array_equal(first.film.pixel, whole.film.pixel)
+    np.testing.assert_allclose(first.samples.position, whole.samples.position, atol=1e-6)
+    values = np.random.default_rng(3).random((len(first.samples), 3))
+    np.testing.assert_allclose(first.film.image(values), whole.film.image(values), atol=1e-12)
+    np.testing.assert_allclose(first.film.coverage(), whole.film.coverage(), atol=1e-12)
 
 
 def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):

@@ -14,6 +14,8 @@ from .images import GRAY, ImageTexture
 from .lobes import LOBE_AOVS, Hits, samples_of_lobes
 from .uv import Texels
 
+# What the texels that Cycles' bake leaves out have in its maps and its radiance.
+NOT_BAKED = -1e9
 # Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
 SMALLEST_BAKED_COSINE = 0.2
 # And then to this one from the face.

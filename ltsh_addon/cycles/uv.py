@@ -33,6 +33,13 @@ class Texels:
     barycentric: np.ndarray  # (Q, 3) weights of the triangle's corners, none negative
     covers: int  # how often texels were covered, all together
     overlaps: int  # how many of them were covered more than once
+    unbaked: int = 0  # how many more Cycles left out
+
+    def baked(self, is_baked: np.ndarray) -> Texels:
+        """Those that Cycles baked, by `is_baked` (Q,)."""
+        unbaked = int(np.count_nonzero(~is_baked))
+        kept = self.index[is_baked], self.triangle[is_baked], self.barycentric[is_baked]
+        return Texels(*kept, self.covers, self.overlaps, unbaked)
 
 
 @dataclass(frozen=True)

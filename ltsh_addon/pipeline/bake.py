@@ -17,7 +17,7 @@ import numpy as np
 
 from .. import imaging
 from ..cycles import uv
-from ..cycles.texels import BakeMaterial, BakeView, TexelMesh, texel_samples
+from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
@@ -217,7 +217,7 @@ class ObjectBaker:
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; how many texels there were."""
-        options, covered, covers, overlaps, unshaded, lit = self.options, 0, 0, 0, 0, False
+        options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
@@ -236,6 +236,7 @@ class ObjectBaker:
                 covered += len(texels.index)
                 covers += texels.covers
                 overlaps += texels.overlaps
+                unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
                 lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
                 planes.put(first, min(rows, height - first), texels, _channels(layers))
@@ -247,7 +248,7 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
-        return {**found, "unshaded_texels": unshaded, "is_lit": lit}
+        return {**found, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
 
     def _threads(self) -> int:
         """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
@@ -372,7 +373,12 @@ class TilePoints:
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
-        return self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
+        texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
+        if not self._at_centers:
+            return texels
+        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
+        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -513,6 +519,12 @@ def _report(options, manifest, records) -> dict:
             if share > 0.0:
                 share = f"{100 * share:.3g} %"
                 warnings.append(f"object {record['name']!r}: {share} of its texels are covered more than once")
+            if tile["unbaked_texels"]:
+                share = f"{100 * tile['unbaked_texels'] / (tile['texels'] + tile['unbaked_texels']):.3g} %"
+                warnings.append(
+                    f"object {record['name']!r}: {share} of its texels are left out, because Cycles bakes nothing "
+                    "there: apply the modifiers"
+                )
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],
@@ -540,7 +552,7 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
 
 _ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
 _TILE = {
-    **dict.fromkeys(("texels", "unshaded_texels", "covered_times", "overlapping_texels"), NUMBER),
+    **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
     "is_lit": bool,
     "texture?": file_name,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},

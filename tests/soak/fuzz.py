@@ -463,7 +463,7 @@ def build_bake(output: Path) -> None:
             "diffuse": {"noise": 0.01, "techniques": {"ltc": {"unbiased_squared_error": 1e-4, "unbiased_error": 0.01}}}
         }
         tile = {"file": f"{name}.exr", "texels": 9, "covered_times": 9, "overlapping_texels": 0, "errors": errors}
-        tile |= {"unshaded_texels": 0, "is_lit": True}
+        tile |= {"unshaded_texels": 0, "unbaked_texels": 0, "is_lit": True}
         found = {"name": name, "uv": "UVMap", "outside": 0.0, "tiles": {"1001": tile}}
         report = {"scene": "room.blend", "frame": 1, "size": [64, 64], "view": "camera", "problems": [], "warnings": [],
                   "versions": versions, "objects": [found]}  # fmt: skip

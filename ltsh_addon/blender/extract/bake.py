@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...cycles.texels import BakeView, TexelMesh
+from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
 from ...cycles.uv import tiles_of
 from ...files import save_array
 from ...scene import FARTHEST, SceneError, error_line, light_records, listed
@@ -36,7 +36,6 @@ from .origin import middle_of, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
-NOT_BAKED = -1e9
 # Texels that Cycles' bake spreads its samples over, from side to side: a whole one since Blender 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
@@ -182,8 +181,8 @@ class ObjectBake:
         self.scene, self.ob, self.uv_name, self.plans = scene, ob, uv_name, plans
         if uv_name not in ob.data.uv_layers:
             raise ObjectError(
-                f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers, where textures cannot be baked: "
-                "apply the modifiers"
+                f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers that make instances as well, where "
+                "textures cannot be baked: apply the modifiers"
             )
         active = ob.data.uv_layers.active_index
         layer = ob.data.uv_layers.new(name=UV_LAYER, do_init=False)
@@ -374,6 +373,7 @@ def _open(job: dict) -> BakeScene:
     seen_from = job["view"] if isinstance(job["view"], str) else tuple(np.subtract(job["view"], origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job["shadows"] == "on"
+    _apply_modifiers(scene, objects, job["uv"])
     inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name), origin, has_shadows)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
@@ -420,6 +420,78 @@ def _look_from(scene, camera, wanted) -> None:
     if not isinstance(wanted, str):
         camera.location, camera.delta_location = wanted, (0.0, 0.0, 0.0)
     bpy.context.view_layer.update()
+
+
+def _apply_modifiers(scene, objects, uv_name: str | None) -> None:
+    """Give objects the mesh that their modifiers make, where these bring in places on the UV map or materials of other
+    meshes (booleans, arrays with caps, geometry nodes): Cycles' bake takes both from the object's own mesh."""
+    probed = {}
+    for ob in objects:
+        if ob.type == "MESH" and ob.library is None and ob.data.library is None and len(ob.modifiers):
+            layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
+            probed[ob] = "" if layer is None else _probe(ob.data, layer)
+    if not probed:
+        return
+
+    def visit(depsgraph):
+        instancers = {item.parent.original for item in depsgraph.object_instances if item.is_instance and item.parent}
+        return {
+            ob: _evaluated_copy(ob, depsgraph)
+            for ob, probe in probed.items()
+            if ob not in instancers and not _bakes_from_own_mesh(ob, depsgraph, uv_name, probe)
+        }
+
+    made = with_render_depsgraph(scene, visit)
+    for ob, probe in probed.items():
+        if probe:
+            ob.data.uv_layers.remove(ob.data.uv_layers[probe])
+    for ob, mesh in made.items():
+        ob.data = mesh
+        for modifier in [modifier for modifier in ob.modifiers if modifier.type != "PARTICLE_SYSTEM"]:
+            ob.modifiers.remove(modifier)
+
+
+def _probe(mesh, layer) -> str:
+    """The name of a new UV map of `mesh`: `layer`, moved as `Block.placed` moves it."""
+    name, active = layer.name, mesh.uv_layers.active_index
+    probe = mesh.uv_layers.new(name=UV_LAYER, do_init=False)
+    if probe is None:
+        return ""
+    mesh.uv_layers.active_index = active
+    probe.uv.foreach_set("vector", _probed(_uv_of(mesh.uv_layers[name], len(mesh.loops))).ravel())
+    return probe.name
+
+
+def _probed(uv: np.ndarray) -> np.ndarray:
+    return (uv * (1.0, 4.0) - (0.0, 1.0)).astype(np.float32)
+
+
+def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
+    """Whether the UV map that stands in the object's own mesh is the one it is rendered with, and so the materials."""
+    evaluated = ob.evaluated_get(depsgraph)
+    if [slot.material and slot.material.original for slot in evaluated.material_slots] != [
+        slot.material for slot in ob.material_slots
+    ]:
+        return False
+    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
+    try:
+        layers = mesh.uv_layers
+        layer = layers.get(uv_name) if uv_name else layers.active
+        if layer is None or not probe:
+            return layer is None or layer.name in ob.data.uv_layers
+        found, count = layers.get(probe), len(mesh.loops)
+        return found is not None and np.allclose(_uv_of(found, count), _probed(_uv_of(layer, count)), atol=1e-4)
+    finally:
+        evaluated.to_mesh_clear()
+
+
+def _evaluated_copy(ob, depsgraph):
+    """A mesh of its own of what the modifiers of an object make, generated coordinates as before."""
+    evaluated = ob.evaluated_get(depsgraph)
+    mesh = bpy.data.meshes.new_from_object(evaluated, preserve_all_data_layers=True, depsgraph=depsgraph)
+    mesh.use_auto_texspace = False
+    mesh.texspace_location, mesh.texspace_size = ob.data.texspace_location, ob.data.texspace_size
+    return mesh
 
 
 def _inspect(scene, objects, uv_name, folder, origin, with_occluders):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scene_parts
 from bake_scenes import SIZE, baked, save, start
+from material_scenes import Build
 from scene_parts import add_plane, principled
 
 from ltsh_addon.blender.process import blender_process
@@ -68,6 +69,75 @@ def test_linked_objects_are_named_with_their_library_and_linked_materials_are_ba
 def test_faces_without_area_on_the_texture_leave_the_others_as_they_are(odd):
     covered = odd[1]["Half without area.exr"]["coverage.hit"]
     assert covered[SIZE // 2 :, : SIZE // 2].all() and covered.sum() == SIZE**2 / 4
+
+
+def cut_cube():
+    """A cube, left on the UV map, out of which a red sphere, right on it, is cut."""
+    ob = scene_parts.add_mesh("Cut", *box())
+    ob.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 0.25, 0, 0.25, 1, 0, 1] * 6))
+    ob.data.materials.append(principled("Gray", Roughness=0.6)[0])
+    red = principled("Red", Base_Color=(0.8, 0.1, 0.1, 1.0), Roughness=0.6)[0]
+    cutter = scene_parts.add_sphere(red, radius=0.6, smooth=False, location=(0.0, 0.0, 0.5), segments=16)
+    cutter.hide_render = True
+    uv = np.empty(2 * len(cutter.data.loops), np.float32)
+    cutter.data.uv_layers.active.uv.foreach_get("vector", uv)
+    cutter.data.uv_layers.active.uv.foreach_set("vector", uv * np.tile(np.float32([0.5, 1.0]), len(uv) // 2) + 0.5)
+    modifier = ob.modifiers.new("Boolean", "BOOLEAN")
+    modifier.object, modifier.solver = cutter, "EXACT"
+    modifier.material_mode = "TRANSFER"
+    return ob
+
+
+def box():
+    """Corners and faces of a cube of side 1."""
+    corners = [(x - 0.5, y - 0.5, z - 0.5) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    return corners, [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+
+
+def warped_plane():
+    """A plane whose texture shows other places than its own UV map says."""
+    made = Build("Checked")
+    shader, wave = made.shader("BsdfPrincipled", Roughness=0.6), made.new("ShaderNodeTexWave", Scale=0.2, Detail=0.0)
+    made.link(wave.outputs["Color"], shader.node.inputs["Base Color"])
+    made.show(shader)
+    ob = add_plane(made.material, name="Warped")
+    modifier = ob.modifiers.new("UV Warp", "UV_WARP")
+    modifier.uv_layer, modifier.scale, modifier.offset = ob.data.uv_layers[0].name, (0.5, -0.7), (0.1, 0.0)
+    return ob
+
+
+def mapped_by_nodes():
+    """A plane without a UV map, which its modifier gives it."""
+    ob = add_plane(principled("Plain", Roughness=0.6)[0], name="Nodes", location=(0.0, 0.0, 0.2))
+    name = ob.data.uv_layers[0].name
+    ob.data.uv_layers.remove(ob.data.uv_layers[0])
+    group = bpy.data.node_groups.new("Map", "GeometryNodeTree")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    first, last = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    store, place = group.nodes.new("GeometryNodeStoreNamedAttribute"), group.nodes.new("GeometryNodeInputPosition")
+    store.domain, store.data_type = "CORNER", "FLOAT2"
+    store.inputs["Name"].default_value = name
+    for start_, end in ((first.outputs[0], store.inputs["Geometry"]), (store.outputs[0], last.inputs[0])):
+        group.links.new(start_, end)
+    group.links.new(place.outputs[0], next(item for item in store.inputs if item.name == "Value" and item.enabled))
+    ob.modifiers.new("Nodes", "NODES").node_group = group
+    return ob
+
+
+@pytest.mark.parametrize("make", [cut_cube, warped_plane, mapped_by_nodes])
+def test_uv_maps_and_materials_that_modifiers_bring_in_are_baked_as_by_cycles(make, tmp_path):
+    """Gray diffuse light is exact; Cycles' noise of 512 samples of a light that is seen as a whole is below 2 %."""
+    start()
+    ob = make()
+    options = {"objects": (ob.name,), "uv": "UVMap", "passes": ("diffuse",), "error": True, "cycles_samples": 512}
+    report, files = baked(save(tmp_path), tmp_path / "out", **options, sub_samples=4)
+    assert report["problems"] == [] and not [line for line in report["warnings"] if "left out" in line]
+    layers = files[f"{ob.name}.exr"]
+    covered = layers["coverage.hit"] > 0.0
+    ours, cycles = layers["ltsh4.diffuse"][covered], layers["cycles.diffuse"][covered]
+    assert cycles.min() >= 0.0 and cycles.mean() > 0.01
+    assert np.linalg.norm(ours - cycles) <= 0.02 * np.linalg.norm(cycles)
 
 
 def test_light_groups_are_layers_and_each_is_the_light_of_its_own_lights(tmp_path):

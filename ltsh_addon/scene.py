@@ -480,15 +480,16 @@ class Film:
     """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
     `sub_samples` samples, of which those that hit nothing are absent. Where a surface has several lobes, `first` (P,)
     is true for one sample of each hit; left out: for all. Where samples stand for several, `count` (P,) says for how
-    many; left out: one each. Where pixels share their samples, `spread` (P, D, D) are the weights of each in the pixels
-    around its own, rows from top to bottom, and `whole` (H, W) their sums, with those of samples that are absent."""
+    many, below 1 where a pixel has more than others; left out: one each. Where pixels share their samples, `spread`
+    (P, D, D) are the weights of each in the pixels around its own, rows from top to bottom, and `whole` (H, W) their
+    sums, with those of samples that are absent."""
 
     width: int
     height: int
     pixel: np.ndarray  # (P,) integers
     sub_samples: int = 1
     first: np.ndarray | None = None  # (P,) bool
-    count: np.ndarray | None = None  # (P,) integers
+    count: np.ndarray | None = None  # (P,)
     spread: np.ndarray | None = None
     whole: np.ndarray | None = None
 
@@ -497,6 +498,18 @@ class Film:
         own = {name: getattr(self, name) for name in ("first", "count", "spread")}
         own = {name: None if values is None else values[index] for name, values in own.items()}
         return replace(self, pixel=self.pixel[index], **own)
+
+    def with_more(self, more: Film) -> Film:
+        """The samples of this film, and those of another of the same pixels."""
+        arrays = {name: (getattr(self, name), getattr(more, name)) for name in ("pixel", "first", "count", "spread")}
+        joined = {name: None if one is None else np.concatenate([one, other]) for name, (one, other) in arrays.items()}
+        return replace(self, whole=more.whole, **joined)
+
+    def has_more(self) -> np.ndarray:
+        """The pixels (H, W) with more samples than `sub_samples`, which `with_more` has brought."""
+        first = self.pixel if self.first is None else self.pixel[self.first]
+        count = np.bincount(first, minlength=self.width * self.height)
+        return count.reshape(self.height, self.width) > self.sub_samples
 
     def unspread(self) -> Film:
         """The same samples, each in its own pixel alone."""
@@ -537,11 +550,14 @@ class Film:
     def shared(self, weights: np.ndarray, sub_sample: np.ndarray, seen: np.ndarray) -> Film:
         """The film whose pixels share their samples, by weights (N, D, D) of those with the number `sub_sample` (P,);
         rendered were the pixels `seen` (H, W)."""
-        every = replace(self, pixel=np.flatnonzero(seen))
-        total = np.broadcast_to(weights.sum(axis=0), (len(every.pixel), *weights.shape[1:]))
-        whole = every._sums(np.ones((len(every.pixel), 1)), total)[..., 0]
+        whole = self.sums_around(np.flatnonzero(seen), weights.sum(axis=0))
         spread = weights.astype(np.float32)[sub_sample]
         return replace(self, spread=spread, whole=np.where(seen, whole, np.inf))
+
+    def sums_around(self, pixel: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Sums (H, W) of the same weights (D, D) of each `pixel` (Q,) in the pixels around its own."""
+        every = replace(self, pixel=pixel)
+        return every._sums(np.ones((len(pixel), 1)), np.broadcast_to(weights, (len(pixel), *weights.shape)))[..., 0]
 
     def reached(self, mask: np.ndarray) -> np.ndarray:
         """The pixels (H, W) that have samples of those of the `mask` (H, W)."""

@@ -237,6 +237,23 @@ def balanced_points(kind: str, width: float, count: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, 2)), np.stack([half, -half], axis=1).reshape(-1, 2)])[:count]
 
 
+def camera_rays(scene, matrix) -> list | None:
+    """Where the rays of a picture start, and where they go, (2, 3, 3): at its top left corner, and what one pixel to
+    the right and one down add; `matrix` is that of the camera. None for panoramas."""
+    lens, (width, height) = scene.camera.data, picture_size(scene)
+    if lens.type not in {"PERSP", "ORTHO"}:
+        return None
+    frame = np.array(lens.view_frame(scene=scene), dtype=np.float64)
+    top_right, _, bottom_left, top_left = frame * ([1.0, 1.0, 0.0] if lens.type == "ORTHO" else 1.0)
+    steps = np.stack([top_left, (top_right - top_left) / width, (bottom_left - top_left) / height])
+    border = render_border(scene)
+    if border is not None and border.cropped:
+        steps[0] += border.left * steps[1] + border.top * steps[2]
+    matrix, still = np.array(matrix.normalized(), dtype=np.float64), np.zeros((2, 3))
+    steps, center = steps @ matrix[:3, :3].T, np.stack([matrix[:3, 3], *still])
+    return [center + steps, np.stack([-matrix[:3, 2], *still])] if lens.type == "ORTHO" else [center, steps]
+
+
 def sub_pixel_offsets(scene, count: int, points=filter_points):
     """What `points` returns for the scene's own filter. To be called outside `pinned_pixel_filter`, which replaces
     it."""

@@ -6,8 +6,10 @@ per pixel and file, so nothing is averaged across an edge.
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -172,7 +174,8 @@ def with_one_shadow(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples
 
 def _together(film: Film, kept: np.ndarray, place: np.ndarray) -> Film:
     """The film of the samples `kept` (Q,), each of which stands for those with its `place` (P,)."""
-    count = np.bincount(place, weights=film.count, minlength=len(kept)).astype(int)
+    count = np.bincount(place, weights=film.count, minlength=len(kept))
+    count = count if film.count is not None and film.count.dtype.kind == "f" else count.astype(int)
     own = replace(film.take(kept), count=count)
     if film.spread is None:
         return own
@@ -235,6 +238,132 @@ def _means(values: np.ndarray, place: np.ndarray, count: np.ndarray) -> np.ndarr
     """Means (Q, 3) of the rows of `values` (P, 3) by their `place` (P,)."""
     sums = [np.bincount(place, weights=column, minlength=len(count)) for column in values.T]
     return np.stack(sums, axis=1) / count[:, None]
+
+
+# Points of a pixel take all but place and view from a sample of the pixel, or of those around it, whose surface is flat
+# and goes through them: no more rad are between its normals, or off its plane. Among these a pixel across it counts as
+# much as so many pixels along it. A pixel whose center is not where its sample says, in pixels, or with a point on no
+# such surface, stays as it is.
+FLAT, ACROSS, OFF_CENTER = 4e-3, 10.0, 0.1
+
+
+@dataclass(frozen=True)
+class FinerPoints:
+    """More points of a pixel than a picture is rendered with."""
+
+    starts: np.ndarray  # (3, 3) m, of the ray at the top left corner, and what a pixel right and one down add
+    directions: np.ndarray  # (3, 3) the same, of any length
+    offsets: np.ndarray  # (N, 2) pixels right and up of the center
+    weights: np.ndarray | None  # (N, D, D) as of `Film.shared`
+    sums: np.ndarray | None = None  # (D, D) of the weights of a pixel without more points
+
+    @classmethod
+    def of(cls, values: dict) -> FinerPoints:
+        """That of a manifest."""
+        return cls(**{name: None if value is None else np.array(value, float) for name, value in values.items()})
+
+    def rays(self, pixel: np.ndarray, offsets: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins and unit directions (Q, 3) of rays through `offsets` (Q, 2) of pixels (Q,); and how wide a pixel is
+        (Q,) one m away."""
+        place = np.stack([np.ones(len(pixel)), pixel % width + 0.5, pixel // width + 0.5], axis=1)
+        place[:, 1:] += offsets * [1.0, -1.0]
+        origin, direction = place @ self.starts, place @ self.directions
+        length = np.linalg.norm(direction, axis=1, keepdims=True)
+        return origin, direction / length, np.linalg.norm(self.directions[1]) / length[:, 0]
+
+
+def finer(
+    samples: SurfaceSamples, film: Film, points: FinerPoints, pixels: dict[str, np.ndarray], met: Callable
+) -> tuple[SurfaceSamples, Film, np.ndarray]:
+    """Samples at the first `number` (E,) of the `points` of each `pixel` (E,) of which it is known what they show,
+    their film, and mask (P,) of the `samples` whose place they take.
+
+    `met(origins, directions)` is as of `visibility.rays.Tracer.first_met`.
+    """
+    known, (pixels, number) = _Hits.of(samples, film), (pixels["pixel"], pixels["number"])
+    center, direction, width = points.rays(pixels, np.zeros((len(pixels), 2)), film.width)
+    distance, is_behind = met(center, direction)
+    is_there = np.isfinite(distance) & ~is_behind
+    reach = np.maximum(width * np.where(is_there, distance, 0.0), np.linalg.norm(points.starts[1]))
+    off = known.nearest(_along(center, direction, distance), pixels, is_there)[1]
+    sure = (off <= OFF_CENTER * reach) | (~is_there & ~is_behind)
+    pixels, number = pixels[sure], number[sure]
+    row = np.repeat(np.arange(len(pixels)), number)
+    pixel, point = pixels[row], np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+    origin, direction, _ = points.rays(pixel, points.offsets[point], film.width)
+    distance, is_behind = met(origin, direction)
+    is_there = np.isfinite(distance) & ~is_behind
+    place = _along(origin, direction, distance)
+    hit = known.nearest(place, pixel, is_there)[0]
+    for down, right in itertools.product((-1, 0, 1), repeat=2):
+        column = pixel % film.width + right
+        others = is_there & (hit < 0) & (column >= 0) & (column < film.width)
+        around = known.nearest(place, pixel + down * film.width + right, others)[0]
+        hit = np.where(hit < 0, around, hit)
+    is_fine = np.bincount(row, is_behind | (is_there & (hit < 0)), len(pixels)) == 0.0
+    chosen = np.flatnonzero(is_fine[row] & (hit >= 0))
+    lengths = known.lengths[hit[chosen]]
+    of_point, first = np.repeat(chosen, lengths), np.repeat(np.cumsum(lengths) - lengths, lengths)
+    index = np.repeat(known.starts[hit[chosen]], lengths) + np.arange(len(of_point)) - first
+    own = row[of_point]
+    values = {"pixel": pixel[of_point], "count": film.sub_samples / number[own]}
+    values["first"] = None if film.first is None else film.first[index]
+    if film.spread is not None:
+        # Whatever their number, together they weigh the same.
+        whole, columns = film.sub_samples * points.weights.mean(axis=0), points.weights.reshape(len(points.weights), -1)
+        sums = np.stack([np.bincount(row, column[point], len(pixels)) for column in columns.T], axis=1)
+        scale = np.divide(whole.ravel(), sums, out=np.zeros(sums.shape), where=sums > 0.0)
+        spread = np.where(sums > 0.0, 0.0, whole.ravel() / number[:, None])[own] + scale[own] * columns[point[of_point]]
+        values["spread"] = spread.reshape(-1, *whole.shape).astype(np.float32)
+        values["whole"] = film.whole + film.sums_around(pixels[is_fine], whole - points.sums)
+    found = replace(samples.take(index), position=place[of_point], view=-direction[of_point])
+    return found, replace(film, **values), np.isin(film.pixel, pixels[is_fine])
+
+
+def _along(origin, direction, distance):
+    return origin + direction * np.where(np.isfinite(distance), distance, 0.0)[:, None]
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """The hits of samples: the first sample of each (H,), and how many it has; those of a pixel."""
+
+    samples: SurfaceSamples
+    starts: np.ndarray
+    lengths: np.ndarray
+    is_flat: np.ndarray  # (P,) of the samples: none of their normals are others a little farther on
+    order: np.ndarray  # (H,) by pixel
+    first: np.ndarray  # (W * H,) place in the order of the first of a pixel
+    number: np.ndarray  # (W * H,) of a pixel
+
+    @classmethod
+    def of(cls, samples: SurfaceSamples, film: Film) -> _Hits:
+        """Those of a film."""
+        starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
+        number = np.bincount(film.pixel[starts], minlength=film.width * film.height)
+        order = np.argsort(film.pixel[starts], kind="stable")
+        normals = (samples.normal, samples.diffuse_normal, samples.smooth_normal)
+        is_flat = np.all([np.abs(one - samples.geometric_normal).max(axis=1) < FLAT for one in normals], axis=0)
+        lengths = np.diff(starts, append=len(samples))
+        return cls(samples, starts, lengths, is_flat, order, np.cumsum(number) - number, number)
+
+    def nearest(self, place: np.ndarray, pixel: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of points (Q, 3) the hit in a pixel (Q,) on the same surface, -1 for none or without the `mask`; and how far
+        it is."""
+        hit, apart, least = np.full(len(pixel), -1), np.full(len(pixel), np.inf), np.full(len(pixel), np.inf)
+        rows = np.flatnonzero(mask & (pixel >= 0) & (pixel < len(self.number)))
+        for step in range(int(self.number[pixel[rows]].max(initial=0))):
+            rows = rows[self.number[pixel[rows]] > step]
+            other = self.order[self.first[pixel[rows]] + step]
+            sample = self.starts[other]
+            between = place[rows] - self.samples.position[sample]
+            length = np.linalg.norm(between, axis=1)
+            off = np.abs((between * self.samples.geometric_normal[sample]).sum(axis=1))
+            score = ACROSS * off + length
+            is_near = (off <= FLAT * length + 1e-6) & (score < least[rows])
+            better = np.flatnonzero(is_near & self.is_flat[sample])
+            hit[rows[better]], least[rows[better]], apart[rows[better]] = other[better], score[better], length[better]
+        return hit, apart
 
 
 def coarse_meshes(samples: SurfaceSamples) -> list[str]:

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from .. import shading, visibility
+from ..cycles.gbuffer import finer
 from ..files import replacing, temporary_folder
 from ..scene import (
     REFERENCE,
@@ -62,6 +63,11 @@ class Shadows:
     def take(self, index: np.ndarray) -> Shadows:
         """Those of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
+
+    def with_more(self, kept: np.ndarray, more: Shadows) -> Shadows:
+        """Those of the samples of the mask `kept` (P,), and others; what the film shows is as before."""
+        shares = {name: np.concatenate([one[:, kept], more.shares[name]], 1) for name, one in self.shares.items()}
+        return replace(self, shares=shares, rays=self.rays + more.rays, seconds=self.seconds + more.seconds)
 
     def of_lights(self, numbers: Sequence[int]) -> Shadows:
         """Those of the lights with the sorted `numbers`, which hold all or none of those that share their rays."""
@@ -112,6 +118,12 @@ class ShadowTracer:
     def starts(self, samples: SurfaceSamples) -> visibility.Starts:
         """Where rays from `samples` start, the same for all lights."""
         return self._tracer.starts(replace(samples, position=samples.position - self._origin))
+
+    def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
+        """As of `gbuffer.finer`."""
+        samples = replace(samples, position=samples.position - self._origin)
+        found, film, replaced = finer(samples, film, points, pixels, self._tracer.first_met)
+        return replace(found, position=found.position + self._origin), film, replaced
 
     def trace(
         self,

@@ -23,6 +23,8 @@ MOST_FRAMES = 100_000
 MOST_CYCLES_SAMPLES = 2 << 24
 TEXTURE_SIDES = (64, 8192)
 SHADOW_RAYS = 8, 1024
+# Points at most of a pixel of a finished picture that an edge runs through.
+EDGE_POINTS = 64
 MOST_REFINEMENTS = 4096
 MOST_MARGIN = 512
 # Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.

@@ -7,7 +7,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -229,6 +229,13 @@ class Result:
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # where `shading` has shadows
 
+    def with_more(self, kept: np.ndarray, more: Result) -> Result:
+        """The samples of the mask `kept` (P,), and those of another; of neither a subset."""
+        seconds = {name: value + more.seconds[name] for name, value in self.seconds.items()}
+        own = [(self.shading, more.shading), (self.unshadowed, more.unshadowed)]
+        shaded = [None if one is None else one.with_more(kept, other) for one, other in own]
+        return Result(shaded[0], seconds, None, shaded[1])
+
 
 def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Result]:
     """The results of all techniques, of which `tables` (see `prepare`) has the names."""
@@ -314,6 +321,15 @@ class Comparison:
     @property
     def film(self) -> Film:
         return self.extraction.film
+
+    def with_more(self, kept: np.ndarray, more: Comparison) -> Comparison:
+        """The samples of the mask `kept` (P,), and those of another of the same scene and film."""
+        one, other = self.extraction, more.extraction
+        samples = SurfaceSamples.joined([one.samples.take(kept), other.samples])
+        film = one.film.take(kept).with_more(other.film)
+        results = {name: result.with_more(kept, more.results[name]) for name, result in self.results.items()}
+        shadows = None if self.shadows is None else self.shadows.with_more(kept, more.shadows)
+        return replace(self, extraction=replace(one, samples=samples, film=film), results=results, shadows=shadows)
 
     @property
     def cycles(self) -> dict[str, np.ndarray]:

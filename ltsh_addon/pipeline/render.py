@@ -34,7 +34,7 @@ from ..imaging.exr import write_channels
 from ..scene import PASSES, Cancelled, Progress, listed
 from ..shading.parallel import cores
 from . import lighting, picture
-from .options import SHADOW_RAYS, PictureOptions, RenderOptions, child_job
+from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 
 # Names of the passes of Cycles in `pass_names`: light and color of each pass of ours.
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
@@ -54,11 +54,14 @@ MOST_NOISE, AROUND = 0.06, 4
 # nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge, where that is more
 # than a share of the light; the mean of so many pixels around each.
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
+# Points that a pixel with an edge gets at least. Of all samples so many more for such pixels, and less where these
+# would take more than a share of what is left of a budget.
+FEWEST_POINTS, MOST_FINER, FINER_SHARE = 8, 1.0, 0.3
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
 # What direct light will take is told from squares of so many pixels on a side that have such shares of its samples. The
-# time grows with the samples to a power of at least LEAST_POWER, at most 1. Of what is left it may take so much.
-SQUARE, PROBES, LEAST_POWER, DIRECT_SHARE = 8, (0.01, 0.04), 0.5, 0.6
+# time grows with the samples to a power from 0.5 to 1, seldom to more than 0.85. Of what is left it may take so much.
+SQUARE, PROBES, POWERS, DIRECT_SHARE = 8, (0.01, 0.04), (0.5, 0.85, 1.0), 0.6
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -236,7 +239,8 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
         cycles_samples=2,
     )  # fmt: skip
     size = {"width": width, "height": height, "seconds": options.budget}
-    job = child_job(client.ExtractOptions, own, **where, **size, cycles_samples=0, for_finished=True)
+    size |= {"cycles_samples": 0, "for_finished": True, "edge_points": EDGE_POINTS}
+    job = child_job(client.ExtractOptions, own, **where, **size)
     extraction = client.extract(job, progress=progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.kept.everything:
@@ -251,9 +255,15 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
         clock.end("extraction")
         shadows = how.shadows(extraction, progress)
         clock.end("shadows")
-    results = picture.evaluated(tables, extraction, shadows, own, progress)
-    clock.end("shading")
-    return picture.Comparison(own, extraction, results, shadows)
+        results = picture.evaluated(tables, extraction, shadows, own, progress)
+        clock.end("shading")
+        comparison = picture.Comparison(own, extraction, results, shadows)
+        if extraction.finer is not None:
+            left, took = _left(options, extraction, clock), clock.stages["shadows"] + clock.stages["shading"]
+            more = MOST_FINER if left is None else min(FINER_SHARE * left / took, MOST_FINER)
+            comparison = how.with_fine_edges(comparison, more, progress)
+            clock.end("edges")
+    return comparison
 
 
 @dataclass(frozen=True)
@@ -285,13 +295,14 @@ class _How:
         if allowed is None or len(whole.samples) == 0:
             return whole
         number, took = self._probe(whole, PROBES[0])
-        if took * len(whole.samples) <= allowed * number:
+        least, usual, largest = POWERS
+        if took * (len(whole.samples) / number) ** usual <= allowed:
             return whole
-        one, power = np.count_nonzero(extraction.point == 0), LEAST_POWER
+        one, power = np.count_nonzero(extraction.point == 0), least
         if took * (one / number) ** power <= allowed:
             first, (number, took) = (number, took), self._probe(whole, PROBES[1])
             power = np.log(took / first[1]) / np.log(max(number / first[0], 1.1))
-            power = float(np.clip(power, LEAST_POWER, 1.0))
+            power = float(np.clip(power, least, largest))
         most = number * (allowed / took) ** (1.0 / power)
         if len(whole.samples) <= most:
             return whole
@@ -321,6 +332,54 @@ class _How:
         shadows = self.shadows(part)
         picture.evaluated(self.tables, part, shadows, self.own, None)
         return int(np.count_nonzero(there)), time.process_time() - start
+
+    def with_fine_edges(self, comparison: picture.Comparison, more: float, progress) -> picture.Comparison:
+        """The same with more points of the pixels that edges of diffuse light run through: those of shadows, and of
+        what is seen; at most `more` times as many as there are."""
+        extraction, film = comparison.extraction, comparison.film
+        light = comparison.images[next(iter(comparison.results)), "diffuse"].mean(axis=-1)
+        bend = (_bend(light) * _certain(comparison.shadows, "diffuse")).ravel()
+        covered = np.minimum(film.coverage(), 1.0).ravel()
+        pixel = np.flatnonzero((bend > 0.0) & ~extraction.kept.by_pass["diffuse"].ravel() & (covered > 0.0))
+        number = _numbers_of_points(bend[pixel], covered[pixel], more * len(film.pixel))
+        chosen = number > film.sub_samples
+        if not chosen.any():
+            return comparison
+        pixels = {"pixel": pixel[chosen], "number": number[chosen]}
+        samples, own, replaced = self.tracer.finer(extraction.samples, film, extraction.finer, pixels)
+        if len(samples) == 0:
+            return comparison
+        fine = replace(extraction, samples=samples, film=own)
+        shadows = self.tracer.trace(samples, PASSES, SHADOW_RAYS[0], film=own, progress=progress)
+        results = picture.evaluated(self.tables, fine, shadows, self.own, progress)
+        return comparison.with_more(~replaced, picture.Comparison(self.own, fine, results, shadows))
+
+
+def _numbers_of_points(bend: np.ndarray, covered: np.ndarray, most: float) -> np.ndarray:
+    """How many points (Q,) pixels get, by how much light bends there and what share of them is `covered` (Q,), at most
+    so many together: the error of an edge falls with their number to the power -0.75."""
+    worth = bend**0.8
+    least, largest = 0.0, EDGE_POINTS / max(worth.max(initial=0.0), 1e-30) * 1e3
+    for _ in range(40):
+        middle = 0.5 * (least + largest)
+        number = _whole_numbers(middle * worth)
+        least, largest = (middle, largest) if (number * covered).sum() <= most else (least, middle)
+    return _whole_numbers(least * worth)
+
+
+def _whole_numbers(wanted: np.ndarray) -> np.ndarray:
+    """At most EDGE_POINTS, 0 where it is too few."""
+    return np.where(wanted >= FEWEST_POINTS, np.minimum(wanted, EDGE_POINTS), 0.0).astype(int)
+
+
+def _bend(light: np.ndarray) -> np.ndarray:
+    """How much (H, W) light bends from pixel to pixel, 0 where that is little of it."""
+    grid, (height, width) = np.pad(light, 1, mode="edge"), light.shape
+    rows = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    # Opposite neighbors of the nine.
+    bend = np.max([np.abs(one + other - 2.0 * light) for one, other in zip(rows[:4], rows[:4:-1], strict=True)], axis=0)
+    bend[bend < LEAST_BEND * _around(light, AROUND_EDGE)] = 0.0
+    return bend
 
 
 def _rays(options: RenderOptions, extraction) -> int:
@@ -388,12 +447,7 @@ def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
 def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
     """The weight (H, W) of a pass of ours (H, W, 3) beside Cycles' own: half of it at edges, but where much more than
     those is between both, which is noise of Cycles."""
-    light = ours.mean(axis=-1)
-    grid, (height, width) = np.pad(light, 1, mode="edge"), light.shape
-    rows = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-    # Opposite neighbors of the nine.
-    bend = np.max([np.abs(one + other - 2.0 * light) for one, other in zip(rows[:4], rows[:4:-1], strict=True)], axis=0)
-    bend[bend < LEAST_BEND * _around(light, AROUND_EDGE)] = 0.0
+    bend = _bend(ours.mean(axis=-1))
     between = _around(np.square((ours - direct).mean(axis=-1)), AROUND_EDGE)
     edge = _around(np.square(EDGE_ERROR * bend), AROUND_EDGE)
     return 1.0 - 0.5 * np.minimum(np.divide(edge, between, out=np.zeros_like(edge), where=between > 0.0), 1.0)
@@ -416,7 +470,9 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
                 certain = _certain(comparison.shadows, name)
             image = comparison.images[next(iter(comparison.results)), name]
             if is_denoised and not comparison.extraction.has_lens and name == "diffuse":
-                weight = _beside(certain[..., None] * image, _share_of(certain, light.astype(np.float64) * color))
+                of_cycles = _share_of(certain, light.astype(np.float64) * color)
+                weight = _beside(certain[..., None] * image, of_cycles)
+                weight = np.where(comparison.film.has_more(), 1.0, weight)
             share = np.where(is_taken, certain * weight, 0.0)
             values = comparison.extraction.exposure * getattr(result.shading, name)
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)

@@ -179,6 +179,16 @@ class Shading:
         """Sum (P, 3) over the passes and light groups."""
         return sum(part.sum(axis=0) for part in (self.specular, self.diffuse) if part is not None)
 
+    def with_more(self, kept: np.ndarray, more: Shading) -> Shading:
+        """The samples of the mask `kept` (P,), and those of another with the same groups and passes."""
+
+        def joined(name, axis):
+            one, other = getattr(self, name), getattr(more, name)
+            return None if one is None else np.concatenate([np.compress(kept, one, axis), other], axis)
+
+        axes = {"specular": 1, "diffuse": 1, "quadrature_error": 0}
+        return Shading(self.groups, **{name: joined(name, axis) for name, axis in axes.items()})
+
 
 class OwnTechnique(Protocol):
     """A technique of the user: anything with this method, and a `name` if it shall have another than its class."""

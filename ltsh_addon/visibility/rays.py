@@ -366,6 +366,22 @@ class Tracer:
             index = index[shares[index] > 0.0]
         shares[index] = 0.0
 
+    def first_met(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (R,) in m rays go along unit `directions` (R, 3) until something blocks them, inf where nothing does;
+        and where something transparent is in their way before (R,)."""
+        found = np.full((2, len(origins)), np.inf, np.float32)
+        rays = [np.asarray(values, np.float32) for values in (origins, directions)]
+        masks, chunk = np.full(len(origins), ALL_RAYS, np.uint32), self._caster.chunk
+        with self._lock:
+            for is_clear in np.flatnonzero(self._caster.has):
+                for start in range(0, len(origins), chunk):
+                    part = slice(start, start + chunk)
+                    own = [values[part] for values in rays]
+                    near, far = np.zeros(len(own[0]), np.float32), np.full(len(own[0]), np.inf, np.float32)
+                    hits = self._caster.closest(bool(is_clear), *own, near, far, masks[part])
+                    found[is_clear, start + hits.ray] = hits.distance
+        return found[0], found[1] < found[0]
+
     def mask_of(self, light: str) -> int:
         """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
         return self.occluders.mask_of(light)

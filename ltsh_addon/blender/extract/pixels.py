@@ -26,6 +26,7 @@ from ..materials.aovs import (
 )
 from ..process import client
 from ..render_settings import (
+    camera_rays,
     enable_passes,
     filter_name,
     pinned_pixel_filter,
@@ -297,6 +298,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         # Where all is left to Cycles nothing is to be shaded.
         count = 0 if inventory.kept.everything else count
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
+    finer = _finer(scene, job["edge_points"]) if for_finished and has_shadows and count and not has_lens else None
     with world_behind(scene, inventory.behind if job["rest"] and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if job["rest"] else ()), *job["indices"])
         # Lights in sight are part of the rest.
@@ -326,6 +328,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "samples": samples,
         "has_lens": has_lens,
         "weights": None if weights is None else weights[: len(samples)].tolist(),
+        "finer": finer,
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,
@@ -340,6 +343,24 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
     else:
         let_shadow_rays_through(inventory.made_opaque)
     scene.world = inventory.world
+
+
+def _finer(scene, count: int) -> dict | None:
+    """What more points of a pixel take (see `gbuffer.FinerPoints`), None for a camera whose rays are not known."""
+
+    def visit(depsgraph):
+        return camera_rays(scene, scene.camera.evaluated_get(depsgraph).matrix_world)
+
+    rays = with_render_depsgraph(scene, visit)
+    offsets, weights = sub_pixel_offsets(scene, count, shared_points)
+    if rays is None:
+        return None
+    return {
+        "starts": rays[0].tolist(),
+        "directions": rays[1].tolist(),
+        "offsets": offsets.tolist(),
+        "weights": None if weights is None else weights.tolist(),
+    }
 
 
 def scene_named(name: str | None):

@@ -53,6 +53,7 @@ class ExtractOptions:
     indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
     shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
     for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
+    edge_points: int = 0  # of a pixel of a finished picture that an edge runs through
     seconds: float | None = None  # of processor time for the whole picture, which limits its sub-samples
 
 
@@ -127,6 +128,7 @@ class Extraction:
     # (N, D, D) as of `Film.shared`.
     point: np.ndarray | None = None
     weights: np.ndarray | None = None
+    finer: gbuffer.FinerPoints | None = None  # of pixels at edges, around `origin`
 
     @property
     def rest(self) -> np.ndarray | None:
@@ -187,6 +189,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             kept=kept,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
+            finer=gbuffer.FinerPoints.of(manifest["finer"]) if manifest.get("finer") else None,
             **{name: manifest[name] for name in UNCHANGED},
             processor_seconds=manifest["processor_seconds"],
             direct_seconds=manifest["direct_seconds"],
@@ -214,7 +217,10 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
     # Points of a blurred pixel may be far from each other.
     if not extraction.has_lens and len(samples):
         samples, film = gbuffer.merged(samples, film)
-    return replace(extraction, samples=samples, film=film, point=None, weights=None)
+    finer = extraction.finer
+    if finer is not None and extraction.weights is not None:
+        finer = replace(finer, sums=extraction.weights[:count].sum(axis=0))
+    return replace(extraction, samples=samples, film=film, finer=finer, point=None, weights=None)
 
 
 def ended(extraction: Extraction) -> Extraction:

@@ -474,6 +474,7 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
         return count, each * count**power
 
     monkeypatch.setattr(render._How, "_probe", seconds_of)
+    monkeypatch.setattr(render, "POWERS", (0.5, 1.0, 1.0))
     how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), None, {}, None)
     seconds = 3.0 + extraction.direct_seconds
     found = how.affordable(extraction, seconds)
@@ -486,6 +487,34 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     # The cheap one is looked at once.
     assert len(looks) == (1 if points == 5 else 2)
     assert how.affordable(extraction, 0.0).kept.everything and how.affordable(extraction, None).film.sub_samples == 5
+
+
+@pytest.mark.parametrize("lens", ["PERSP", "ORTHO"])
+def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_path, monkeypatch):
+    """Two boards above a floor, seen by a shifted camera, a part of whose picture is rendered."""
+    scene = parts.empty_scene(36, 48)
+    for location, size in (((0.0, 0.0, 0.0), 8.0), ((0.3, 0.2, 0.8), 0.9), ((-0.7, -0.4, 0.4), 0.5)):
+        parts.add_plane(gray()(), size=size, location=location, rotation=(0.0, 0.0, 0.5))
+    camera = parts.add_camera((0.0, -4.5, 3.5), (0.9, 0.0, 0.0)).data
+    camera.type, camera.ortho_scale, camera.shift_x, camera.sensor_fit = lens, 4.0, 0.1, "VERTICAL"
+    settings = scene.render
+    settings.pixel_aspect_x, settings.use_border, settings.use_crop_to_border = 1.5, True, True
+    settings.border_min_x, settings.border_max_y = 0.2, 0.9
+    parts.add_area_light(location=(0.8, -1.0, 3.0), size=0.05)
+    path = parts.save(tmp_path / "room.blend")
+    job = client.FinishedJob(path, *(None,) * 6, 256, None)
+    (tmp_path / "true").mkdir()
+    found = client.render_finished(job, tmp_path / "true")
+    light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
+    pictures = []
+    for more in (render.MOST_FINER, 0.0):
+        monkeypatch.setattr(render, "MOST_FINER", more)
+        made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=3, cycles_samples=4)).comparison
+        pictures.append((made.images["ltsh4", "diffuse"], made.film.has_more()))
+    (fine, is_fine), (coarse, is_coarse) = pictures
+    assert np.count_nonzero(is_fine) > 60 and not is_coarse.any()
+    error, before = (np.linalg.norm((one - light * color)[is_fine]) for one in (fine, coarse))
+    assert error < 0.6 * before
 
 
 def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):

@@ -137,12 +137,12 @@ class MovedLights:
     def get_ready(self, light: AreaLight) -> None:
         """Begin, once and in a thread, with what the first picture takes; `light` is any of those that there are."""
         if not self._is_ready:
-            self._is_ready = True
-            threading.Thread(target=self._try, args=(light,), name="LTSH lights", daemon=True).start()
+            pictures = self.pictures(light)
+            threading.Thread(target=self._try, args=(pictures,), name="LTSH lights", daemon=True).start()
 
-    def _try(self, light: AreaLight) -> None:
+    def _try(self, pictures) -> None:
         # Who asks for a picture gets to know.
-        with suppress(Exception), closing(self.pictures(light)) as pictures:
+        with suppress(Exception), closing(pictures):
             next(pictures)
 
     def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
@@ -157,7 +157,10 @@ class MovedLights:
 
     def pictures(self, light: AreaLight, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield what `picture` returns, at first as a draft, at last as it is, and how much of it is done."""
-        turn = self._next_turn()
+        self._is_ready = True
+        return self._pictures(light, row, self._next_turn())
+
+    def _pictures(self, light, row, turn):
         with self._lock:
             light, task = self._prepared(light, turn)
             values, quick = self._nothing(), task and replace(task, rays=min(task.rays, DRAFT_RAYS))

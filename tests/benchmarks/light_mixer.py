@@ -3,13 +3,14 @@
 python tests/benchmarks/light_mixer.py [--folder DIR] [--lights N]
 
 Prints milliseconds of a change, all in this thread: of the light that was changed before, of another one, of all;
-seconds until a picture can be mixed, and of a light that has moved, of this process + others. The picture is made once
-and stays in --folder.
+seconds until a picture can be mixed; those of a light that has moved, its draft and all, of this process + others. The
+picture is made once and stays in --folder.
 """
 
 import argparse
 import os
 import time
+from contextlib import closing
 from pathlib import Path
 
 import many_lights
@@ -74,13 +75,30 @@ def main():
     moved = MovedLights.load(kept_file)
     for number, text in enumerate(("the first time", "again", "again")):
         light = kept.extraction.lights[0].moved(np.array([0.5, 0.2 * number, 0.0]))
-        others = measure.children(os.getpid())
-        before = sum(map(measure.processor_seconds, others))
-        _, wall, own = timed(lambda light=light: moved.picture(light))
-        others = measure.children(os.getpid())
-        theirs = sum(map(measure.processor_seconds, others)) - before
-        print(f"a moved light, {text}: {wall:.2f} s, {own:.2f} + {theirs:.2f} s of processor time")
+        print(f"a moved light, {text}: {shaded(moved, light)}")
     moved.close()
+
+
+def shaded(moved, light) -> str:
+    """What the draft of a light takes, how far it is off, and what its picture takes."""
+    before = spent()
+    with closing(moved.pictures(light)) as pictures:
+        draft = next(pictures)[0].copy()
+        half = spent()
+        *_, (picture, _) = pictures
+    end = spent()
+    off = np.linalg.norm(draft - picture) / np.linalg.norm(picture)
+    (wall, own, theirs), (whole, all_own, all_theirs) = (np.subtract(now, before) for now in (half, end))
+    return (
+        f"draft {wall:.2f} s, {own:.2f} + {theirs:.2f} s of processor time, {100.0 * off:.1f} % off; "
+        f"all {whole:.2f} s, {all_own:.2f} + {all_theirs:.2f}"
+    )
+
+
+def spent() -> tuple[float, float, float]:
+    """Seconds on the clock, of processor time of this process, and of those that it has started."""
+    others = measure.children(os.getpid())
+    return time.perf_counter(), time.process_time(), sum(map(measure.processor_seconds, others))
 
 
 if __name__ == "__main__":

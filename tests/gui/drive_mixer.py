@@ -63,21 +63,38 @@ def applied(rig):
     rig.shot("5_applied.png")
 
 
-def moved(rig, picture="6_moved.png"):
+def moved(rig, picture="6_moved"):
     name = hands.settings().mixed[0].name
     bpy.data.objects[name].location.x += 1.0
     # Meanwhile a thread gets ready what shades it.
     yield 5
-    start = time.perf_counter()
-    hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
-    rig.fact("a moved light, the first time, s", round(time.perf_counter() - start, 2))
+    yield from updated(rig, "the first time", picture)
     bpy.data.objects[name].location.x -= 0.5
     yield 1
-    start = time.perf_counter()
-    hands.operate(rig, bpy.ops.ltsh.update_moved_lights, kind="IMAGE_EDITOR")
-    rig.fact("a moved light, once more, s", round(time.perf_counter() - start, 2))
+    yield from updated(rig, "once more", picture)
+
+
+def updated(rig, when, picture):
+    """The button: a draft, then the picture; how long they take, and the window does not answer."""
+    mixer, results, scene = hands.module("ui.mixer"), hands.module("ui.results"), bpy.context.scene
+    before = results.mixed_pixels(scene).copy()
+    rows, draft, longest = results.mixer_of(scene).rows, None, 0.0
+    start = last = time.perf_counter()
+    hands.operate(rig, bpy.ops.ltsh.update_moved_lights, "INVOKE_DEFAULT", kind="IMAGE_EDITOR")
+    while mixer._updating["update"] is not None and last - start < 300.0:
+        yield 0.01
+        now = time.perf_counter()
+        longest, last = max(longest, now - last - 0.01), now
+        if draft is None and results.mixer_of(scene).rows is not rows:
+            draft = now - start
+            rig.shot(f"{picture}_draft.png")
+            last = time.perf_counter()
+    rig.fact(f"{picture}, {when}: draft, end, longest without an answer, s",
+             [draft and round(draft, 2), round(last - start, 2), round(longest, 2)])  # fmt: skip
+    rig.check(mixer._updating["update"] is None, "moved lights are shaded")
+    rig.check((results.mixed_pixels(scene) != before).mean() > 0.05, "and seen where they are")
     yield 1
-    rig.shot(picture)
+    rig.shot(f"{picture}.png")
 
 
 def rendered(rig):
@@ -94,5 +111,5 @@ def rendered(rig):
     yield 2
     rig.shot("8_render_mixed.png")
     before = results.mixed_pixels(bpy.context.scene).copy()
-    yield from moved(rig, "9_render_moved.png")
+    yield from moved(rig, "9_render_moved")
     rig.check((results.mixed_pixels(bpy.context.scene) != before).mean() > 0.05, "a light of the render was moved")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import ClassVar
 
@@ -9,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...pipeline.mixer import Row
-from ...scene import AreaLight, SceneError, error_line, listed
+from ...scene import AreaLight, Cancelled, SceneError, error_line, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
 from ..lights.linking import Receivers
@@ -19,6 +20,9 @@ from .panels import draw_text, gray, in_both_places, split_names
 UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
 # By what share of its distance and size a light may be elsewhere that has not moved.
 UNMOVED = 1e-5
+TIMER_SECONDS = 0.1
+# The moved lights that are shaded now; None where there are none.
+_updating: dict = {"update": None}
 
 
 def plain_lights(depsgraph) -> dict[str, AreaLight]:
@@ -157,9 +161,21 @@ class _Mixer:
         row = layout.row(align=True)
         row.operator("ltsh.reset_mixer", icon="LOOP_BACK")
         row.operator("ltsh.apply_mixer", icon="CHECKMARK")
-        layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
+        _draw_update(layout)
         for note in notes(context.scene):
             draw_text(gray(layout), context, note, "INFO")
+
+
+def _draw_update(layout) -> None:
+    """The button that shades moved lights, or in its place how much of that is done."""
+    update = _updating["update"]
+    if update is None:
+        layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
+        return
+    row = layout.row(align=True)
+    text = f"{100.0 * update.done:.0f} %" if update.done else "Draft"
+    row.progress(factor=update.done, text=text)
+    row.operator("ltsh.cancel_moved_lights", text="", icon="X")
 
 
 def notes(scene) -> list[str]:
@@ -260,22 +276,106 @@ def _reason_not_to_apply(ob, values, given: dict) -> str:
 
 
 class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
-    """Shade lights that have been moved or resized since the picture where they are now; the others stay"""
+    """Shade lights that have been moved or resized since the picture where they are now; the others stay.
+    A draft is shown first; lights that are moved meanwhile are followed"""
 
     bl_idname = "ltsh.update_moved_lights"
     bl_label = UPDATE
 
+    @classmethod
+    def poll(cls, context):
+        if _updating["update"] is not None:
+            cls.poll_message_set("Moved lights are being shaded")
+            return False
+        return super().poll(context)
+
+    def invoke(self, context, event):
+        if not self._begin(context):
+            return {"CANCELLED"}
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
+        manager.modal_handler_add(self)
+        comparison.redraw_panels()
+        return {"RUNNING_MODAL"}
+
     def execute(self, context):
-        moved = moved_rows(context, results.mixer_of(context.scene).rows)
+        """Without a window, from scripts: waits for the end."""
+        self._timer = None
+        if not self._begin(context):
+            return {"CANCELLED"}
+        while not self._update.is_finished:
+            self._update.take()
+            time.sleep(TIMER_SECONDS)
+        return self._finish(context)
+
+    def modal(self, context, event):
+        update, scene = self._update, self._scene()
+        if _updating["update"] is not update or scene is None or results.mixer_of(scene) is not update.mixer:
+            # The cross, another picture, another file.
+            update.stop()
+            return self._finish(context)
+        if event.type == "ESC" and event.value == "PRESS":
+            update.stop()
+            return self._finish(context)
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        if any(_stands_elsewhere(bpy.data.objects.get(light.name), light.record()) for light in update.moved.values()):
+            update.stop()
+            if not self._begin(context):
+                return self._finish(context)
+        elif update.take():
+            comparison.refresh(scene)
+        if self._update.is_finished:
+            return self._finish(context)
+        comparison.redraw_panels()
+        return {"PASS_THROUGH"}
+
+    def cancel(self, context):
+        """Blender ends the operator, for its window was closed."""
+        self._update.stop()
+        self._finish(context)
+
+    def _scene(self):
+        """The scene of the picture, also after it was renamed; None where it was removed."""
+        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
+
+    def _begin(self, context) -> bool:
+        scene = context.scene
+        moved = moved_rows(context, results.mixer_of(scene).rows)
         if not moved:
             self.report({"INFO"}, "No light of the picture has moved")
-            return {"CANCELLED"}
+            return False
         try:
-            results.update_moved(context.scene, moved)
-        except (OSError, ValueError, SceneError) as error:
+            self._update = _updating["update"] = results.Update(scene, moved)
+        except SceneError as error:
             self.report({"ERROR"}, error_line(error))
-            return {"CANCELLED"}
-        comparison.refresh(context.scene)
+            return False
+        self._scene_uid = scene.session_uid
+        return True
+
+    def _finish(self, context):
+        update = self._update
+        if _updating["update"] is update:
+            _updating["update"] = None
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+        if update.error is not None and not isinstance(update.error, Cancelled):
+            self.report({"ERROR"}, error_line(update.error))
+        scene = self._scene()
+        if scene is not None and results.mixer_of(scene) is update.mixer:
+            comparison.refresh(scene)
+        comparison.redraw_panels()
+        return {"FINISHED"} if update.error is None else {"CANCELLED"}
+
+
+class LTSH_OT_cancel_moved_lights(bpy.types.Operator):
+    """Show the lights as they were before"""
+
+    bl_idname = "ltsh.cancel_moved_lights"
+    bl_label = "Cancel"
+
+    def execute(self, context):
+        _updating["update"] = None
         return {"FINISHED"}
 
 
@@ -286,5 +386,6 @@ CLASSES = (
     LTSH_OT_reset_mixer,
     LTSH_OT_apply_mixer,
     LTSH_OT_update_moved_lights,
+    LTSH_OT_cancel_moved_lights,
 )
 register, unregister = bpy.utils.register_classes_factory(CLASSES)

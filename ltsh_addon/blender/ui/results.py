@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+import queue
+import threading
+from contextlib import closing, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -264,20 +266,69 @@ def end_processes() -> None:
         bpy.app.timers.unregister(end_processes)
 
 
-def update_moved(scene, moved: dict[int, AreaLight]) -> None:
-    """Shade lights of the mixer anew, by the numbers of their rows, and write them to the picture's files.
+class Update:
+    """Lights of the mixer of a scene that have moved, by the numbers of their rows: a thread shades them where they
+    are, first as drafts; `take` shows what is new.
 
-    Raises OSError, ValueError, SceneError.
+    Raises SceneError.
     """
-    mixer = mixer_of(scene)
-    for number, light in moved.items():
-        layer = _moved_lights(scene).picture(light, mixer.rows[number])
-        mixer.replace(number, replace(mixer.rows[number], light=light.record()), layer)
-    _end_later()
-    if scene.name not in _rendered:
-        path = result_of(scene).folder / MIXER_FILE
-        mixer.pictures.save(path)
-        _mixer["stamp"] = str(path), path.stat().st_mtime_ns
+
+    def __init__(self, scene, moved: dict[int, AreaLight]):
+        self.mixer, self.moved, self.done = mixer_of(scene), moved, 0.0
+        self.is_finished, self.error = False, None
+        self._path = None if scene.name in _rendered else result_of(scene).folder / MIXER_FILE
+        self._source, self._made = _moved_lights(scene), queue.SimpleQueue()
+        layers = self.mixer.pictures.layers
+        self._before = {number: (self.mixer.rows[number], layers[number].copy()) for number in moved}
+        threading.Thread(target=self._work, name="LTSH moved lights", daemon=True).start()
+
+    def _work(self) -> None:
+        error = None
+        try:
+            for place, (number, light) in enumerate(self.moved.items()):
+                with closing(self._source.pictures(light, self._before[number][0])) as pictures:
+                    for layer, share in pictures:
+                        self._made.put((number, layer, (place + share) / len(self.moved)))
+        except Exception as found:
+            error = found
+        self._made.put((None, error, 1.0))
+
+    def take(self) -> bool:
+        """Put what is new into the mixer, and where that is all, into its file; True where anything was."""
+        newest = {}
+        while not self.is_finished and not self._made.empty():
+            number, found, self.done = self._made.get()
+            if number is None:
+                self.is_finished, self.error = True, found
+            else:
+                newest[number] = found
+        for number, layer in newest.items():
+            row = replace(self._before[number][0], light=self.moved[number].record())
+            self.mixer.replace(number, row, layer)
+        if newest:
+            _end_later()
+        if self.error is not None:
+            self._take_back()
+        elif self.is_finished and self._path is not None:
+            self._save()
+        return bool(newest) or self.is_finished
+
+    def stop(self) -> None:
+        """End the thread soon, and show these lights as they were."""
+        self.is_finished = True
+        self._source.stop()
+        self._take_back()
+
+    def _take_back(self) -> None:
+        for number, (row, layer) in self._before.items():
+            self.mixer.replace(number, row, layer)
+
+    def _save(self) -> None:
+        try:
+            self.mixer.pictures.save(self._path)
+            _mixer["stamp"] = str(self._path), self._path.stat().st_mtime_ns
+        except OSError as error:
+            self.error = error
 
 
 def get_ready(scene, row: Row) -> None:

@@ -63,11 +63,10 @@ class Window:
         return self.timers[-1]
 
 
-class Hand(operators._JobOperator):
-    """An operator of a job that a test invokes and hands events to; `reports` are what it told."""
+class Events:
+    """What an operator gets that a test invokes and hands events to; `reports` are what it told."""
 
-    def __init__(self, command="compare"):
-        self.command, self.bl_label = command, {"compare": "Compare with Cycles"}.get(command, command)
+    def __init__(self):
         self.context, self.reports, self.outcome = Window(), [], None
 
     def report(self, kinds, text):
@@ -93,6 +92,14 @@ class Hand(operators._JobOperator):
             self.send()
             time.sleep(0.02)
         return self
+
+
+class Hand(Events, operators._JobOperator):
+    """An operator of a job."""
+
+    def __init__(self, command="compare"):
+        super().__init__()
+        self.command, self.bl_label = command, {"compare": "Compare with Cycles"}.get(command, command)
 
 
 def ended(job) -> bool:

@@ -110,7 +110,7 @@ def stand_in(panel) -> type:
     """A class with the methods of `panel` that can be instantiated, which Blender's own panels cannot."""
     found = object
     for kind in reversed(panel.__mro__):
-        if not kind.__module__.startswith(("bpy", "builtins")):
+        if not kind.__module__.startswith(("bpy", "_bpy", "builtins")):
             cell = types.CellType()
             values = vars(kind).items()
             members = {name: _bound_to(value, cell) for name, value in values if callable(value) or name == "key"}

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from job_window import image_pixels
+from job_window import Events, image_pixels
 from recorded_layout import Layout, buttons, drawn, stand_in
 
 from ltsh_addon import imaging
@@ -243,6 +243,47 @@ def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
     # Noise at the edges of shadows is of other rays.
     assert np.sqrt(np.square(found - expected).sum() / np.square(expected).sum()) < 0.01
     assert np.sqrt(np.square(before - expected).sum() / np.square(expected).sum()) > 0.05
+
+
+class MovedLights(Events, stand_in(mixer.LTSH_OT_update_moved_lights)):
+    """The operator of the button."""
+
+
+def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded):
+    scene, fill = shaded
+    scene.ltsh.mode = "MIX"
+    before = shown()
+    fill.location.x = 0.3
+    bpy.context.view_layer.update()
+    hand = MovedLights().start()
+    names = buttons(drawn(mixer.LTSH_PT_IMAGE_mixer))
+    assert "ltsh.cancel_moved_lights" in names and "ltsh.update_moved_lights" not in names
+    assert not mixer.LTSH_OT_update_moved_lights.poll(bpy.context)
+    update = mixer._updating["update"]
+    hand.until(lambda: not np.array_equal(shown(), before))
+    draft = shown()
+    # Moved once more: what was made so far is of another place.
+    fill.location.x = -0.2
+    bpy.context.view_layer.update()
+    hand.until(lambda: mixer._updating["update"] is not update)
+    assert not np.array_equal(draft, before) and hand.outcome == {"RUNNING_MODAL"}
+    hand.until(lambda: False)
+    assert hand.outcome == {"FINISHED"} and hand.reports == [] and hand.context.timers == []
+    found = shown()
+    assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
+    # Esc: as it was.
+    fill.location.x = 0.6
+    bpy.context.view_layer.update()
+    hand = MovedLights().start()
+    hand.until(lambda: not np.array_equal(shown(), found))
+    assert hand.send("ESC", "PRESS") == {"FINISHED"} and np.array_equal(shown(), found)
+    # The cross, and another file.
+    for end in (bpy.ops.ltsh.cancel_moved_lights, results.forget_renders):
+        hand = MovedLights().start()
+        end()
+        hand.until(lambda: False)
+        assert np.array_equal(shown(), found) and mixer._updating["update"] is None and hand.context.timers == []
+    assert bpy.ops.ltsh.shade() == {"FINISHED"}
 
 
 def test_pictures_without_kept_lights_say_so(shaded):

@@ -128,7 +128,7 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
 def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[list[list], float]:
     """[file name in `folder`, samples in it]: so many samples, or as many as there is time for until the processor time
     `end`, or those of the file in one go with all that it says of them; and the processor time after the first file."""
-    cycles, files, done, first = scene.cycles, [], 0, 0.0
+    cycles, files, done, first, seed = scene.cycles, [], 0, 0.0, scene.cycles.seed
     if samples is None and end is None:
         render_exr(scene, folder / "cycles_0.exr")
         return [["cycles_0.exr", layer.samples or cycles.samples]], time.process_time()
@@ -139,8 +139,12 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
         clock = time.process_time if end is not None else time.monotonic
         started = clock()
-        cycles.samples = done + chunk if samples is None else samples
-        cycles.sample_offset, cycles.sample_subset_length = done, chunk
+        if samples is None:
+            # Each file is whole in itself: of a part of more samples the noise is not spread as evenly.
+            cycles.samples, cycles.seed, offset = chunk, (seed + len(files)) % 2**31, 0
+        else:
+            cycles.samples, offset = samples, done
+        cycles.sample_offset, cycles.sample_subset_length = offset, chunk
         files.append([f"cycles_{len(files)}.exr", chunk])
         render_exr(scene, folder / files[-1][0])
         first = first or time.process_time()

@@ -1,5 +1,6 @@
 """A finished picture is what Cycles renders: each kind of path alone, nothing twice, nothing lost."""
 
+import itertools
 import json
 import re
 from dataclasses import replace
@@ -487,6 +488,16 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     # The cheap one is looked at once.
     assert len(looks) == (1 if points == 5 else 2)
     assert how.affordable(extraction, 0.0).kept.everything and how.affordable(extraction, None).film.sub_samples == 5
+
+
+def test_the_files_of_a_budget_share_no_noise(tmp_path):
+    floor_and_ball(gray(), 1)
+    job = client.FinishedJob(parts.save(tmp_path / "room.blend"), *(None,) * 7, 1.0, edges=False)
+    samples = client.render_finished(job, tmp_path).samples
+    files = [imaging.read_layers(path) for path in sorted(tmp_path.glob("cycles_*.exr"))]
+    noise = [layers["ViewLayer.Combined"] - layers["ViewLayer.Combined"].mean() for layers in files]
+    assert len(noise) >= 2 and samples > 10
+    assert all(not np.array_equal(one, other) for one, other in itertools.combinations(noise, 2))
 
 
 @pytest.mark.parametrize("lens", ["PERSP", "ORTHO"])

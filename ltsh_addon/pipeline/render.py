@@ -55,8 +55,9 @@ MOST_NOISE, AROUND = 0.06, 4
 # than a share of the light; the mean of so many pixels around each.
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
 # Points that a pixel with an edge gets at least. Of all samples so many more for such pixels, and less where these
-# would take more than a share of what is left of a budget.
-FEWEST_POINTS, MOST_FINER, FINER_SHARE = 8, 1.0, 0.3
+# would take more than a share of what is left of a budget. Where more than a share of the pixels has edges they are the
+# detail of surfaces, and the samples of Cycles that the time buys are worth more.
+FEWEST_POINTS, MOST_FINER, FINER_SHARE, MOST_EDGES = 8, 1.0, 0.3, 0.3
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
 # What direct light will take is told from squares of so many pixels on a side that have such shares of its samples. The
@@ -341,6 +342,8 @@ class _How:
         bend = (_bend(light) * _certain(comparison.shadows, "diffuse")).ravel()
         covered = np.minimum(film.coverage(), 1.0).ravel()
         pixel = np.flatnonzero((bend > 0.0) & ~extraction.kept.by_pass["diffuse"].ravel() & (covered > 0.0))
+        if len(pixel) > MOST_EDGES * len(bend):
+            return comparison
         number = _numbers_of_points(bend[pixel], covered[pixel], more * len(film.pixel))
         chosen = number > film.sub_samples
         if not chosen.any():

@@ -518,8 +518,8 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
     found = client.render_finished(job, tmp_path / "true")
     light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
     pictures = []
-    for more in (render.MOST_FINER, 0.0):
-        monkeypatch.setattr(render, "MOST_FINER", more)
+    for most in (1.0, 0.0):
+        monkeypatch.setattr(render, "MOST_EDGES", most)
         made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=3, cycles_samples=4)).comparison
         pictures.append((made.images["ltsh4", "diffuse"], made.film.has_more()))
     (fine, is_fine), (coarse, is_coarse) = pictures

@@ -46,7 +46,7 @@ REST = "rest"
 # take for a million pixels, and those of each further denoising.
 SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, MORE_SECONDS = 9, 17, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
-SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.05, 6e-7, 0.1
+SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
 # Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
 # from so many pixels around each.
 MOST_NOISE, AROUND = 0.06, 4

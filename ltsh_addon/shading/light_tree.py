@@ -1,15 +1,15 @@
 """Many lights at once: what is far away, faces away or counts little is taken together.
 
 The lights of a group are the leaves of a tree. A tile of neighboring samples takes, of every branch, the coarsest node
-that is small, or whose error is at most ERROR of what the tile gets of the group: far fewer than there are lights. A
-node is then one point, two or four, which have the mean and the variances of its brightness; how its lights face is
-taken as uniform around their mean. The error is estimated as the light of the node times the fourth power of its size
-by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that hold for
-the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in the tail
-of an "ltsh" lobe get its true value there, as `tails` has it. Leaves that are yet too large are
-looked at again in smaller tiles, where there are many of them; what is left are polygons, shaded together. On smooth
-surfaces ten samples of a tile tell what the others get, but of nodes that are near. (Walter et al. 2005, "Lightcuts",
-for tiles in place of points, doi:10.1145/1073204.1073318.)
+that is small, or whose error is at most ERROR of what the tile gets of the group on average: far fewer than there are
+lights. A node is then one point, two or four, which have the mean and the variances of its brightness; how its lights
+face is taken as uniform around their mean. The error is estimated as the light of the node times the fourth power of
+its size by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that
+hold for the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in
+the tail of an "ltsh" lobe get its true value there, as `tails` has it. Leaves that are yet too large are looked at
+again in smaller tiles, where there are many of them; what is left are polygons, shaded together. On smooth surfaces ten
+samples of a tile tell what the others get, but of nodes that are near. (Walter et al. 2005, "Lightcuts", for tiles in
+place of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations
@@ -422,6 +422,8 @@ class _Pairs:
         self.change = np.minimum(seen + turn, 1.0)
         self.are_points = size < POINT
         self.light[self.is_dark] = 0.0
+        # Of a tile that is large beside its distance few samples get so much; this is about the mean.
+        self.mean = self.light / (1.0 + (radius / np.maximum(nearest, reach)) ** 2)
         self.crossed = self.light * crossed
         self.error = self.light * FOURTH_ORDER * np.minimum(size, 1.0) ** 4 + self.crossed
 
@@ -479,7 +481,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
     tiles = Tiles.of(lobes, position, [chosen[part] for part in parts])
     cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
     coarse = _refined(tree, tiles, lambda pairs: pairs.size < COARSE)
-    light = np.bincount(coarse.tile, coarse.light, len(parts))
+    light = np.bincount(coarse.tile, coarse.mean, len(parts))
     most = ERROR[is_specular] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
     pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (
@@ -495,7 +497,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
             own = own.take(~smooth)
         if not smooth.all():
             total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
-    light = np.bincount(pairs.tile[~near], pairs.light[~near], len(parts))
+    light = np.bincount(pairs.tile[~near], pairs.mean[~near], len(parts))
     near, left, tile, node, finer = pairs.take(near), [], [], [], []
     for number, own in near.by_tile():
         if len(own.node) <= MANY_LEAVES:
@@ -509,7 +511,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
         columns, light = zip(*finer, strict=True)
         pairs = _Pairs(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
         pairs = pairs.take(~pairs.is_dark)
-        light = light + np.bincount(pairs.tile, pairs.light, len(finer))
+        light = light + np.bincount(pairs.tile, pairs.mean, len(finer))
         near = pairs.are_near(FINER_LEAF_ERROR * light[pairs.tile])
         for number, own in pairs.take(~near).by_tile():
             part = columns[number]

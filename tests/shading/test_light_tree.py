@@ -127,6 +127,19 @@ def test_uneven_surfaces_need_few_near_lights_whole(monkeypatch):
     assert few < 0.6 * sum(counts) and relative_error(found, expected) < OFF
 
 
+@pytest.mark.parametrize("name", ["diffuse", "specular"])
+def test_few_samples_between_many_lights_get_the_light_of_each(name, monkeypatch):
+    """Tiles of 10 m hardly above which lights are: of each few samples are near, and no bound is their light."""
+    samples, lights = floor_samples(300, 0.3), lowered(many_lights(600), 1.7)
+    options = {"passes": [name], "workers": 1}
+    found = getattr(shading.shade(samples, lights, "ltsh4", **options), name)
+    # The tails of lobes are true where lights are points: specular light is compared with that of a fine tree.
+    monkeypatch.setattr(*((float32, "FEWEST", 1000) if name == "diffuse" else (light_tree, "TILE", (10, 10))))
+    monkeypatch.setattr(light_tree, "ERROR", (1e-5, 1e-5))
+    expected = getattr(shading.shade(samples, lights, "ltsh4", **options), name)
+    assert relative_error(found, expected) < OFF
+
+
 @pytest.mark.parametrize("shape", ["RECTANGLE", "TRIANGLE", "HEXAGON", "narrow", "DISK"])
 def test_lights_shaded_together_are_those_of_each(shape, monkeypatch):
     """Of leaves that no tile takes as points, whatever their shape."""

@@ -11,6 +11,7 @@ DRAWINGS = 5
 
 
 def main(rig):
+    image = yield from image_drawn(rig)
     yield from hands.open_panel(rig)
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = 1920, 1080
     hands.settings().techniques, hands.settings().cycles_samples = {"ltc", "ltsh4"}, 4
@@ -44,10 +45,26 @@ def main(rig):
     yield 3
     # Every step brings a new picture of 1080p to the graphics card, which may be a program: only told, not checked.
     pulse.stop(rig, "dragging the line")
-    rig.check(max(pulse.longest_work for pulse in pulses) < LONGEST, f"the main thread never works for {LONGEST} s")
-    longest = max(pulse.longest for pulse in pulses) - drawing
+    work = max(pulse.longest_work for pulse in pulses) - image.longest_work
+    rig.check(work < LONGEST, f"the main thread never works for {LONGEST} s, beside drawing an image")
+    longest = max(pulse.longest for pulse in pulses) - max(drawing, image.longest)
     rig.check(longest < LONGEST, f"the window answers within {LONGEST} s and the time to draw it")
     rig.shot("1080p.png")
+
+
+def image_drawn(rig):
+    """The pulse while Blender draws any image of 1080p for the first time."""
+    image = bpy.data.images.new("Any", 1920, 1080, float_buffer=True)
+    area = max(bpy.context.window_manager.windows[0].screen.areas, key=lambda area: area.width * area.height)
+    kind, pulse = area.type, hands.Pulse()
+    area.type = "IMAGE_EDITOR"
+    area.spaces.active.image = image
+    yield 4
+    pulse.stop(rig, "any image")
+    area.type = kind
+    bpy.data.images.remove(image)
+    yield 1
+    return pulse
 
 
 def open_results(rig):

@@ -6,6 +6,7 @@ import atexit
 import logging
 import re
 import shutil
+import time
 from pathlib import Path
 
 import bpy
@@ -27,7 +28,7 @@ def save_scene_copy(path: Path) -> None:
         save_working_copy(path)
 
 
-TIMER_SECONDS = 0.1
+TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 _running: dict = {"job": None}
 
 
@@ -142,11 +143,13 @@ class _JobOperator:
 
     def _show_some_results(self, context) -> bool:
         """Show a part of what is new, as much as the window may wait for: large files are read one at a time. True
-        where something was shown."""
+        where something was, or will be."""
         scene, job = self._scene(), self._job
         if scene is None or job.shown == len(job.results):
             return False
         if not self._opened:
+            if not results.is_mixer_read(job.results[job.shown]):
+                return True
             results.show(scene, job.results[job.shown])
             self._opened = True
         elif not comparison.read_a_picture(scene):
@@ -160,7 +163,7 @@ class _JobOperator:
 
     def _show_all_results(self, context) -> None:
         while self._show_some_results(context):
-            pass
+            time.sleep(WAITING_SECONDS)
 
     def _end_timer(self, context) -> None:
         if self._timer is not None:

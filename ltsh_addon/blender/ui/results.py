@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 import threading
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -216,6 +217,8 @@ def _stored(settings, key: str, value: str):
 
 # Of the picture that was asked for last, and what shades lights that have moved.
 _mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}
+# What threads read of it, by its stamp.
+_readings: dict[tuple, Future] = {}
 # Of final renders by the name of their scene, as long as nothing else is shown; they are in no file.
 _rendered: dict[str, tuple[Mixer, MovedLights | None]] = {}
 # Bytes of the samples of a final render that stay for lights that move, and seconds that their processes wait for one.
@@ -235,11 +238,27 @@ def mixer_of(scene) -> Mixer | None:
         if _mixer["stamp"] != stamp:
             end_processes()
             _mixer.update(stamp=stamp, mixer=None, moved=None)
-            _mixer["mixer"] = Mixer(LightPictures.load(path))
+            reading = _readings.pop(stamp, None)
+            _readings.clear()
+            _mixer["mixer"] = Mixer(LightPictures.load(path)) if reading is None else reading.result()
     except (OSError, ValueError):
         end_processes()
         _mixer.update(stamp=None, mixer=None, moved=None)
     return _mixer["mixer"]
+
+
+def is_mixer_read(folder: Path) -> bool:
+    """Whether `mixer_of` knows the results in `folder` at once: a thread begins to read what it takes."""
+    path = folder / MIXER_FILE
+    try:
+        stamp = str(path), path.stat().st_mtime_ns
+    except OSError:
+        return True
+    if _mixer["stamp"] != stamp and stamp not in _readings:
+        pool = ThreadPoolExecutor(1, "LTSH mixer")
+        _readings[stamp] = pool.submit(lambda: Mixer(LightPictures.load(path)))
+        pool.shutdown(wait=False)
+    return _mixer["stamp"] == stamp or _readings[stamp].done()
 
 
 def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:

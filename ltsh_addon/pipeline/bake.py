@@ -22,7 +22,7 @@ from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..shading.parallel import cores
-from ..visibility import Occluders
+from ..visibility import Occluders, ShadowSampling
 from . import lighting, picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
@@ -99,7 +99,7 @@ def _shadow_tracer(options, manifest, folder):
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]), np.array(manifest["origin"]), is_baked=True)
+    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]), np.array(manifest["origin"]))
 
 
 def _check(options: BakeOptions) -> None:
@@ -282,7 +282,8 @@ class ObjectBaker:
             workers = 1 if self._threads() > 1 else None
             rows = min(block_rows(options), options.size[1] - first)
             film = Film(options.size[0], rows, texels.index[texel])
-            shadows = self.tracer.trace(samples, sorted(passes), rays, film=film, workers=workers)
+            sampling = ShadowSampling(sorted(passes), rays, film, is_baked=True)
+            shadows = self.tracer.trace(samples, sampling, workers=workers)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)

@@ -95,11 +95,8 @@ def rays_of_samples(rays: int, film: Film) -> int:
 class ShadowTracer:
     """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
 
-    def __init__(
-        self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray, is_baked: bool = False
-    ):
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
         self.warnings: list[str] = []
-        self._is_baked = is_baked
         self._occluders, self._origin = occluders, origin
         self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
 
@@ -115,10 +112,6 @@ class ShadowTracer:
     def __exit__(self, *error):
         return self._ending.__exit__(*error)
 
-    def starts(self, samples: SurfaceSamples) -> visibility.Starts:
-        """Where rays from `samples` start, the same for all lights."""
-        return self._tracer.starts(replace(samples, position=samples.position - self._origin))
-
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
         """As of `gbuffer.finer`."""
         samples = replace(samples, position=samples.position - self._origin)
@@ -128,29 +121,18 @@ class ShadowTracer:
     def trace(
         self,
         samples: SurfaceSamples,
-        passes: Sequence[str],
-        rays: int,
+        sampling: visibility.ShadowSampling,
         *,
-        film: Film | None = None,
         workers: int | None = None,
         progress: Progress | None = None,
-        starts: visibility.Starts | None = None,
     ) -> Shadows:
         """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
         found = visibility.visible_shares(
-            samples,
-            self._lights,
-            self._tracer,
-            passes=passes,
-            rays=rays,
-            film=film,
-            is_baked=self._is_baked,
-            workers=workers,
-            progress=progress,
-            starts=starts,
+            samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
         )
+        passes, film = sampling.passes, sampling.film
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
@@ -165,9 +147,10 @@ class ShadowTracer:
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
     """The shares of the lights of an `Extraction` that its samples see, of which those that stand for few points of
     their pixel get few of the `rays`."""
-    samples, film = extraction.samples, extraction.film
+    film = extraction.film
+    sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        return tracer.trace(samples, passes, rays_of_samples(rays, film), film=film, progress=progress)
+        return tracer.trace(extraction.samples, sampling, progress=progress)
 
 
 def shade_lights(

@@ -33,6 +33,7 @@ from ..imaging.denoise import NoDenoiser, open_denoiser
 from ..imaging.exr import write_channels
 from ..scene import PASSES, Cancelled, Progress, listed
 from ..shading.parallel import cores
+from ..visibility import ShadowSampling
 from . import lighting, picture
 from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 
@@ -282,7 +283,7 @@ class _How:
         if not extraction.has_lens:
             samples, film, place = with_one_shadow(samples, film)
         rays = lighting.rays_of_samples(_rays(self.options, replace(extraction, samples=samples, film=film)), film)
-        return self.tracer.trace(samples, PASSES, rays, film=film, progress=progress).take(place)
+        return self.tracer.trace(samples, ShadowSampling(PASSES, rays, film), progress=progress).take(place)
 
     def affordable(self, extraction, seconds: float | None):
         """With the points of a pixel, each but once, that processor `seconds` allow; None: with all of them."""
@@ -353,7 +354,7 @@ class _How:
         if len(samples) == 0:
             return comparison
         fine = replace(extraction, samples=samples, film=own)
-        shadows = self.tracer.trace(samples, PASSES, SHADOW_RAYS[0], film=own, progress=progress)
+        shadows = self.tracer.trace(samples, ShadowSampling(PASSES, SHADOW_RAYS[0], own), progress=progress)
         results = picture.evaluated(self.tables, fine, shadows, self.own, progress)
         return comparison.with_more(~replaced, picture.Comparison(self.own, fine, results, shadows))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from .crew import Company, Mate, Setting
 from .directions import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import BLOCK_SAMPLES, Visibility, task_of_lights, visible_shares
+from .ratio import BLOCK_SAMPLES, ShadowSampling, Visibility, task_of_lights, visible_shares
 from .rays import Tracer, open_tracer
 from .starts import Starts
 
@@ -21,6 +21,7 @@ __all__ = [
     "OccluderMesh",
     "Occluders",
     "Setting",
+    "ShadowSampling",
     "Starts",
     "Tracer",
     "Transparency",

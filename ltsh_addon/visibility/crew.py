@@ -32,7 +32,7 @@ class Errand:
 
 
 class ChildSide:
-    """Answers each block (samples, film, starts) with what the task finds."""
+    """Answers each block (samples, film) with what the task finds."""
 
     def __init__(self, errand: Errand):
         self._task, self._tracer = errand.task, open_tracer(errand.occluders, [errand.library])
@@ -125,7 +125,7 @@ class KeptBlocks:
         if number not in blocks:
             blocks[number] = *block, self._tracer.starts(block[0])
         samples, film, starts = blocks[number]
-        return run, number, task.shares(replace(samples, geometric_normal=normal), film, starts, self._tracer)
+        return run, number, task.shares(replace(samples, geometric_normal=normal), film, self._tracer, starts)
 
 
 def _kept_of(kept: dict[tuple, dict], key: tuple) -> dict:
@@ -176,8 +176,7 @@ class Mate:
                     yield number, shares
 
     def _message(self, task, number, block, is_whole):
-        samples, film, _ = block
-        return self._run, task, self.key, number, (samples, film) if is_whole else None, samples.geometric_normal
+        return self._run, task, self.key, number, block if is_whole else None, block[0].geometric_normal
 
     def _ask(self, task, number, block):
         sent = {} if self.key is None else _kept_of(self._sent, self.key)
@@ -248,7 +247,7 @@ class LitBlocks:
         if task is not None:
             if number not in self._starts:
                 self._starts[number] = self._tracer.starts(starting)
-            found = task.shares(starting, film, self._starts[number], self._tracer)
+            found = task.shares(starting, film, self._tracer, self._starts[number])
             shares = {name: getattr(found, name)[0][place, None] for name in own.passes}
         if any(share.any() for share in shares.values()):
             lit = shade(samples, [light], own.table, passes=own.passes, workers=1)

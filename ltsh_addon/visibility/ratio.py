@@ -112,37 +112,42 @@ class Visibility:
         return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
 
 
+@dataclass(frozen=True)
+class ShadowSampling:
+    """How the shares of samples are found. Raises ValueError."""
+
+    passes: Sequence[str] = PASSES
+    # At most so many for a pair of a sample and a light: 8 to 1024, in eights. From 16 on pairs that are much brighter
+    # than the picture get four times as many, 1024 at most.
+    rays: int = 256
+    film: Film | None = None  # tells which samples are neighbors; None: those before and after
+    is_baked: bool = False  # each pass by itself: Cycles chooses rays by its lobes alone
+
+    def __post_init__(self):
+        if not PROBES <= self.rays <= MOST_RAYS:
+            raise ValueError(f"shadow rays are {self.rays}, expected {PROBES} to {MOST_RAYS}")
+
+
 def visible_shares(
     samples: SurfaceSamples,
     lights: Sequence[AreaLight],
     tracer,
+    sampling: ShadowSampling = ShadowSampling(),
     *,
-    passes: Sequence[str] = PASSES,
-    rays: int = 256,
-    film: Film | None = None,
-    is_baked: bool = False,
-    workers: int | None = None,
+    workers: int | crew.Mate | None = None,
     progress: Progress | None = None,
-    starts: Starts | None = None,
-    mate: crew.Mate | None = None,
 ) -> Visibility:
-    """The shares of P samples, with at most `rays` for each pair of a sample and a light: 8 to 1024, in eights; from 16
-    on four times as many, 1024 at most, for pairs that are much brighter than the picture.
+    """The shares of P samples. `tracer` is as `visibility.open_tracer` returns it.
 
-    `film` says which samples are neighbors; left out: those before and after. Where the passes are baked, each by
-    itself, Cycles chooses rays by its lobes alone. `tracer` is as `visibility.open_tracer`
-    returns it. `workers` processes (None: all cores) give the same result bit for bit; few samples are left to this
-    process. `progress` may return False to stop: Cancelled is raised. `starts` are as of `tracer.starts(samples)`, for
-    callers that know them. A `mate` of the tracer takes the place of `workers`.
+    `workers` processes (None: all cores; or a Mate of the tracer) give the same result bit for bit; few samples are
+    left to this process. `progress` may return False to stop: Cancelled is raised.
     """
-    if not PROBES <= rays <= MOST_RAYS:
-        raise ValueError(f"shadow rays are {rays}, expected {PROBES} to {MOST_RAYS}")
-    (emitters, numbers), passes = emitters_of(lights, tracer), tuple(passes)
-    film = None if film is None else film.unspread()
+    (emitters, numbers), passes = emitters_of(lights, tracer), tuple(sampling.passes)
+    film = None if sampling.film is None else sampling.film.unspread()
     typical = dict.fromkeys(passes, 1.0)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, typical, is_baked)
+    task = ShadowTask(emitters, passes, sampling.rays // PROBES * PROBES, typical, sampling.is_baked)
     start = time.thread_time()
-    typical, looked_at = typical_radiance(samples, task, tracer, starts)
+    typical, looked_at = typical_radiance(samples, task, tracer)
     seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
     task = replace(task, typical=typical)
     shape = len(emitters), len(samples)
@@ -150,12 +155,12 @@ def visible_shares(
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     mixed, traced = np.zeros(shape, bool), 0
     blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
-    parts = (tuple(None if one is None else one.take(block) for one in (samples, film, starts)) for block in blocks)
+    parts = (tuple(None if one is None else one.take(block) for one in (samples, film)) for block in blocks)
     is_worth = seconds > SECONDS_WORTH_A_CHILD
-    if mate is None:
-        found_parts = crew.run(task, tracer, list(parts), workers if is_worth else 1, progress)
+    if isinstance(workers, crew.Mate):
+        found_parts = workers.run(task, list(parts), is_worth, progress)
     else:
-        found_parts = mate.run(task, list(parts), is_worth, progress)
+        found_parts = crew.run(task, tracer, list(parts), workers if is_worth else 1, progress)
     for number, found in found_parts:
         block = blocks[number]
         for name in passes:
@@ -176,8 +181,8 @@ class ShadowTask:
     typical: dict[str, float]
     is_baked: bool
 
-    def shares(self, samples: SurfaceSamples, film: Film | None, starts: Starts | None, tracer) -> Visibility:
-        """Those of a block, all in this thread."""
+    def shares(self, samples: SurfaceSamples, film: Film | None, tracer, starts: Starts | None = None) -> Visibility:
+        """Those of a block, all in this thread; `starts` as of `tracer.starts(samples)`, where they are known."""
         shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
@@ -205,12 +210,12 @@ class ShadowTask:
         return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
 
 
-def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer, starts=None) -> tuple[dict[str, float], int]:
+def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple[dict[str, float], int]:
     """By pass, the root mean square of what samples reflect, from some of them and the first rays alone; how many."""
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
     chosen = slice(None, None, -(-len(samples) // most) or 1)
     some = samples.take(chosen)
-    found = replace(task, rays=PROBES).shares(some, None, None if starts is None else starts.take(chosen), tracer)
+    found = replace(task, rays=PROBES).shares(some, None, tracer)
     squares = {name: np.square(found.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 

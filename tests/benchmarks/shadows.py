@@ -206,7 +206,7 @@ class Measured:
         for number in range(count):
             tracer, samples = self.tracer(number)
             with tracer:
-                found.append(tracer.trace(samples, PASSES, rays, film=self.extraction.film))
+                found.append(tracer.trace(samples, visibility.ShadowSampling(PASSES, rays, self.extraction.film)))
         return [self._images({name: self._of_lights(shadows, name) for name in PASSES}) for shadows in found], found
 
     def exact_specular(self, shadows):
@@ -403,9 +403,8 @@ def ray_counts(scene: Measured):
             grown = time.process_time()
             timed = TimedTracer(tracer._tracer)
             samples = replace(samples, position=samples.position - scene.extraction.origin)
-            found = visibility.visible_shares(
-                samples, tracer._lights, timed, rays=rays, film=scene.extraction.film, workers=1
-            )
+            sampling = visibility.ShadowSampling(rays=rays, film=scene.extraction.film)
+            found = visibility.visible_shares(samples, tracer._lights, timed, sampling, workers=1)
             end = time.process_time()
         rows[rays] = end - start, found.rays
         numpy_share = (end - grown) / timed.seconds - 1.0 if timed.seconds else math.nan

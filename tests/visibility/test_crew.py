@@ -33,7 +33,7 @@ def scene(monkeypatch):
         samples, film = floor(40)
 
         def shares(**options):
-            return ratio.visible_shares(samples, [panel()], tracer, rays=32, film=film, **options)
+            return ratio.visible_shares(samples, [panel()], tracer, ratio.ShadowSampling(rays=32, film=film), **options)
 
         yield shares, started, tracer
 

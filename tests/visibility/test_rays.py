@@ -9,7 +9,15 @@ from occluder_scenes import answers, random_occluders, random_rays, samples_on, 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.cycles.images import EXTENSIONS, INTERPOLATIONS
 from ltsh_addon.scene import PASSES, AreaLight, SceneError
-from ltsh_addon.visibility import OccluderMesh, Occluders, Transparency, open_tracer, rays, visible_shares
+from ltsh_addon.visibility import (
+    OccluderMesh,
+    Occluders,
+    ShadowSampling,
+    Transparency,
+    open_tracer,
+    rays,
+    visible_shares,
+)
 from ltsh_addon.visibility.occluders import cut_outs
 
 
@@ -440,7 +448,7 @@ def test_a_convex_lamp_does_not_stand_in_its_own_light(libraries, rows):
     position = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * radius], axis=1)
     lights = glowing_faces(lamp)
     with open_tracer(Occluders((floor, lamp), [0, 1], [np.eye(3, 4)] * 2), libraries) as tracer:
-        found = visible_shares(surface_samples(position, up, up), lights, tracer, rays=64, workers=1)
+        found = visible_shares(surface_samples(position, up, up), lights, tracer, ShadowSampling(rays=64), workers=1)
     assert len(found.numbers) == (1 if rows == 8 else len(lights))
     # Of faces that are seen nearly edge-on, rounding decides, and they give next to no light.
     offsets = np.array([[light.corners - place for place in position] for light in lights])

@@ -38,7 +38,7 @@ def ceiling(count=100, color=(1.0, 0.5, 0.25), **changes):
 
 
 def shadows_of(samples, lights, tracer, film=None, **options):
-    found = ratio.visible_shares(samples, lights, tracer, film=film, workers=1, **options)
+    found = ratio.visible_shares(samples, lights, tracer, ratio.ShadowSampling(film=film), workers=1, **options)
     shares = {name: getattr(found, name) for name in PASSES}
     return lighting.Shadows(shares, found.numbers, {}, found.rays, "")
 
@@ -89,7 +89,7 @@ def test_shares_are_0_in_the_dark_and_1_in_the_open():
     samples, film = floor(16)
     for light in (ceiling(99), ceiling(99, affects_specular=False)):
         for tracer, share in ((OPEN, 1.0), (WALL, 0.0)):
-            found = ratio.visible_shares(samples, light, tracer, film=film)
+            found = ratio.visible_shares(samples, light, tracer, ratio.ShadowSampling(film=film))
             assert found.diffuse.shape == (1, 256) and found.of_lights("diffuse").shape == (99, 256)
             assert (found.diffuse == share).all()
             assert (found.specular == (share if light[0].affects_specular else 1.0)).all()

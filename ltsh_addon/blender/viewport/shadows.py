@@ -12,7 +12,7 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
-from ...visibility import Mate, Occluders, Tracer, open_tracer, shared_numbers, visible_shares
+from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, shared_numbers, visible_shares
 from ..process.blender_process import embree_libraries
 from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
@@ -79,7 +79,7 @@ class ShadowRays:
         width, height = gbuffer.size
         tracer = self._tracing.around(view.origin)
         film = Film(width, height, pixel)
-        found = visible_shares(samples, (*lights, *sides), tracer, rays=self._rays, film=film)
+        found = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
         count = len(lights) + bool(sides)
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
@@ -190,6 +190,7 @@ class _Request:
         place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
         groups = shared_numbers(lights, tracer)
         step = BATCH if self.level == 1 else len(groups)
+        sampling = ShadowSampling(rays=self.rays, film=film)
         for start in range(0, len(groups), step):
             chosen = [number for group in groups[start : start + step] for number in group]
             try:
@@ -197,9 +198,8 @@ class _Request:
                     samples,
                     [lights[number] for number in chosen],
                     tracer,
-                    rays=self.rays,
-                    film=film,
-                    mate=self.tracing.mate,
+                    sampling,
+                    workers=self.tracing.mate,
                     progress=progress,
                 )
             except Cancelled:

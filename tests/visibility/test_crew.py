@@ -68,9 +68,9 @@ def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch
             if number == 2:
                 # What was asked last is not waited for, and is not taken for an answer later on.
                 with pytest.raises(Cancelled):
-                    shares(mate=mate, progress=lambda stage, share: share < 0.5)
+                    shares(workers=mate, progress=lambda stage, share: share < 0.5)
             mate.key, _ = key, asked.clear()
-            found = shares(mate=mate)
+            found = shares(workers=mate)
             while mate._child is not None and not mate._is_up:  # the first time this process may do it all
                 mate._answers(wait=True)
             for name in PASSES:
@@ -83,7 +83,7 @@ def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch
         assert len(started) == 1 and started[0].poll() is None
         started[0].kill()
         started[0].wait()
-        np.testing.assert_array_equal(shares(mate=mate).diffuse, alone.diffuse)
+        np.testing.assert_array_equal(shares(workers=mate).diffuse, alone.diffuse)
     finally:
         mate.close()
     assert len(started) == 1

@@ -38,7 +38,7 @@ def ceiling(count=100, color=(1.0, 0.5, 0.25), **changes):
 
 
 def shadows_of(samples, lights, tracer, film=None, **options):
-    found = ratio.visible_shares(samples, lights, tracer, ratio.ShadowSampling(film=film), workers=1, **options)
+    found = ratio.visible_shares(samples, lights, tracer, ratio.ShadowSampling(film=film, **options), workers=1)
     shares = {name: getattr(found, name) for name in PASSES}
     return lighting.Shadows(shares, found.numbers, {}, found.rays, "")
 

@@ -40,6 +40,8 @@ class Transparency:
     extension: str = "REPEAT"  # one of EXTENSIONS
     interpolation: str = "Linear"  # one of INTERPOLATIONS
     outside: float = 1.0  # what stands for the image beside it, where `extension` is CLIP
+    # Places and shares, both increasing or the shares decreasing: those of the image are looked up after interpolation.
+    curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self):
         if not 0.0 <= self.share <= 1.0:
@@ -58,8 +60,12 @@ class Transparency:
             return np.full(len(triangle), self.share, np.float32)
         a, b, c = np.moveaxis(self.uv[triangle], 1, 0)
         u, v = u[:, None], v[:, None]
-        found = np.clip(self._image_at((1.0 - u - v) * a + u * b + v * c), 0.0, 1.0)
-        return (self.share * found).astype(np.float32)
+        return self.shares_of(self._image_at((1.0 - u - v) * a + u * b + v * c))
+
+    def shares_of(self, values) -> np.ndarray:
+        """Shares (...) for values (...) of the image."""
+        found = values if self.curve is None else np.interp(values, *self.curve)
+        return (self.share * np.clip(found, 0.0, 1.0)).astype(np.float32)
 
     def _image_at(self, uv):
         height, width = self.image.shape
@@ -201,7 +207,7 @@ class Occluders:
             if clear is None:
                 about.append(None)
                 continue
-            record = {name: getattr(clear, name) for name in ("share", "extension", "interpolation", "outside")}
+            record = {name: getattr(clear, name) for name in _OF_CLEAR}
             if clear.image is not None:
                 images.setdefault(id(clear.image), clear.image)
                 record["image"] = list(images).index(id(clear.image))
@@ -239,6 +245,7 @@ class Occluders:
         return cls(tuple(meshes), **instances, **own)
 
 
+_OF_CLEAR = "share", "extension", "interpolation", "outside", "curve"
 _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
 
 
@@ -295,10 +302,10 @@ def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
 
 def _cut_out(mesh, most, drops_clear):
     clear = mesh.transparency
-    values = clear.share * np.clip(clear.image, 0.0, 1.0)
-    kinds = [_Counts.of(values <= 0.0, clear, clear.outside <= 0.0)]
+    values, outside = clear.shares_of(clear.image), clear.shares_of(clear.outside)
+    kinds = [_Counts.of(values <= 0.0, clear, outside <= 0.0)]
     if drops_clear:
-        kinds.append(_Counts.of(values >= 1.0, clear, clear.share * clear.outside >= 1.0))
+        kinds.append(_Counts.of(values >= 1.0, clear, outside >= 1.0))
     overlap, left = _overlaps(mesh), Parts(np.arange(len(mesh.triangles)), np.tile(_WHOLE, (len(mesh.triangles), 1, 1)))
     blocking, mixed, count = [], [], 0
     for level in range(_LEVELS + 1):

@@ -18,7 +18,7 @@ from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, 
 from ..evaluated import SURFACE_TYPES, is_rendered, owner_of, read_values
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
-from ..materials.values import Value, combined, constant, is_gray, is_srgb, product, value_at
+from ..materials.values import Curved, Value, combined, constant, curved_at, is_gray, is_srgb, product, value_at
 from ..render_settings import cycles_setting
 
 # Stands for the place of occluders that are not points.
@@ -183,7 +183,9 @@ class _Collector:
         if live_link(surface) is None:
             # Volumes are not shaded, which is said elsewhere.
             return None if live_link(output.inputs["Volume"]) is None else _Clear(constant(1.0))
-        value = _share_at(surface)
+        value, curve = _share_at(surface), None
+        if isinstance(value, Curved):
+            value, curve = value.value, (value.places, value.numbers)
         if value is None:
             self._note("it is transparent in a way that is not read here, and blocks as if it were opaque", material)
             return None
@@ -197,14 +199,14 @@ class _Collector:
         if image is None:
             self._note("only Cycles knows the colors of its image, it blocks as if it were opaque", material)
             return None
-        return _Clear(value) if image.max() > 0.0 else None
+        return _Clear(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
 
     def _image(self, value: Value) -> np.ndarray | None:
-        """Shares (H, W) of the light that the image of `value` lets through."""
+        """What `value` is for the pixels (H, W) of its image."""
         use = value.image
         key = (use.image.session_uid, value.matrix[0].tobytes(), value.offset[0].tobytes())
         if key not in self._images:
-            self._images[key] = _shares_of_image(value)
+            self._images[key] = _values_of_image(value)
         return self._images[key]
 
     # Hair of particle systems:
@@ -258,6 +260,7 @@ class _Clear:
     """Share of light that a material lets through."""
 
     value: Value
+    curve: tuple | None = None  # as of `Transparency`
 
     def transparency(self, uv_of, image_of) -> Transparency:
         """For triangles; `uv_of(name)` are their corners on a UV map, `image_of(value)` the shares of an image."""
@@ -271,11 +274,12 @@ class _Clear:
             uv=uv.astype(np.float32),
             extension=use.extension,
             interpolation="Closest" if use.closest else "Linear",
-            outside=float(np.clip(self.value.offset[0], 0.0, 1.0)),
+            outside=float(self.value.offset[0]),
+            curve=self.curve,
         )
 
 
-def _share_at(socket, groups: tuple = ()) -> Value | None:
+def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
     """Share of light that the shader at the input `socket` lets through, as shadow rays see it; None: unknown."""
     source = source_of(socket, groups)
     if source is None or source.node is None:
@@ -284,40 +288,55 @@ def _share_at(socket, groups: tuple = ()) -> Value | None:
     if node.bl_idname == CLEAR:
         return value_at(node.inputs["Color"], groups)
     if node.bl_idname == PRINCIPLED:
-        alpha = value_at(node.inputs["Alpha"], groups)
-        return combined(constant(1.0), alpha, 1.0, -1.0)
+        return _sum(constant(1.0), curved_at(node.inputs["Alpha"], groups), 1.0, -1.0)
     if node.bl_idname not in (MIX, ADD):
         return constant(0.0)
     parts = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == ADD:
-        return combined(*parts, 1.0, 1.0)
-    if all(part is not None and part.is_constant and not part.offset.any() for part in parts):
+        return _sum(*parts, 1.0, 1.0)
+    if all(_is_constant(part) and not part.offset.any() for part in parts):
         return parts[0]  # whatever the factor is
     factor = _factor_at(node.inputs[0], groups)
     if factor is None:
         return None
-    if factor.is_constant:
+    if _is_constant(factor):
         share = float(np.clip(factor.offset[0], 0.0, 1.0))
         # What is not there need not be known.
         if share in (0.0, 1.0):
             return parts[int(share)]
-        return combined(*parts, 1.0 - share, share)
+        return _sum(*parts, 1.0 - share, share)
     first, second = parts
-    if first is None or second is None or not (first.is_constant and second.is_constant):
+    if not (_is_constant(first) and _is_constant(second)):
         return None
+    if isinstance(factor, Curved):
+        begin, end = (float(part.offset.mean()) for part in parts)
+        return factor.mapped(end - begin, begin)
     return combined(first, product(factor, constant(second.offset - first.offset)), 1.0, 1.0)
 
 
-def _factor_at(socket, groups) -> Value | None:
+def _is_constant(value: Value | Curved | None) -> bool:
+    return isinstance(value, Value) and value.is_constant
+
+
+def _sum(first, second, first_share: float, second_share: float) -> Value | Curved | None:
+    """As `combined`; None unless what is not curved is constant beside what is."""
+    pairs = (first, first_share, second, second_share), (second, second_share, first, first_share)
+    for one, share, other, other_share in pairs:
+        if isinstance(one, Curved):
+            return one.mapped(share, other_share * float(other.offset.mean())) if _is_constant(other) else None
+    return combined(first, second, first_share, second_share)
+
+
+def _factor_at(socket, groups) -> Value | Curved | None:
     """The factor of a Mix Shader node; shadow rays are of one kind alone."""
     source = source_of(socket, groups)
     if source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeLightPath":
         name = source.socket.name
         return constant(float(name == "Is Shadow Ray")) if name.startswith("Is ") else None
-    return value_at(socket, groups)
+    return curved_at(socket, groups)
 
 
-def _shares_of_image(value: Value) -> np.ndarray | None:
+def _values_of_image(value: Value) -> np.ndarray | None:
     image = value.image.image
     colors_count = bool(np.any(value.matrix[:, :3]))
     srgb = is_srgb(image)
@@ -334,8 +353,7 @@ def _shares_of_image(value: Value) -> np.ndarray | None:
     if colors_count and srgb:
         colors = pixels[..., :3]
         pixels[..., :3] = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
-    shares = pixels @ value.matrix[0].astype(np.float32) + np.float32(value.offset[0])
-    return np.clip(shares, 0.0, 1.0)
+    return pixels @ value.matrix[0].astype(np.float32) + np.float32(value.offset[0])
 
 
 def _is_displaced(material) -> bool:

@@ -113,6 +113,75 @@ def constant_inputs(source: Source, *names) -> list[np.ndarray] | None:
     return [value.offset for value in values] if all(value and value.is_constant for value in values) else None
 
 
+@dataclass(frozen=True)
+class Curved:
+    """A number that hangs on `value`, a gray one, by lines between `numbers` at `places`, none of which turn back."""
+
+    value: Value
+    places: tuple[float, ...]
+    numbers: tuple[float, ...]
+
+    def mapped(self, factor: float, offset: float) -> Curved:
+        """`factor` times this plus `offset`."""
+        return Curved(self.value, self.places, tuple(factor * number + offset for number in self.numbers))
+
+
+def curved_at(socket, groups: tuple = ()) -> Value | Curved | None:
+    """As `value_at`, also where a threshold or a color ramp follows, which is looked up after interpolation."""
+    value, source = value_at(socket, groups), source_of(socket, groups)
+    if value is not None or source is None or source.node is None:
+        return value
+    if source.node.bl_idname == "ShaderNodeMath":
+        return _curved_math(source)
+    return _curved_ramp(source) if source.node.bl_idname == "ShaderNodeValToRGB" else None
+
+
+def _curved_math(source: Source) -> Curved | None:
+    node = source.node
+    first, second = (curved_at(node.inputs[number], source.groups) for number in (0, 1))
+    if not isinstance(second, Value) or not second.is_constant:
+        # 1 - x and the like.
+        if isinstance(second, Curved) and isinstance(first, Value) and first.is_constant:
+            number = float(first.offset[0])
+            found = {"SUBTRACT": (-1.0, number), "ADD": (1.0, number), "MULTIPLY": (number, 0.0)}.get(node.operation)
+            return None if found is None else second.mapped(*found)
+        return None
+    number = float(second.offset[0])
+    if isinstance(first, Curved):
+        found = {"SUBTRACT": (1.0, -number), "ADD": (1.0, number), "MULTIPLY": (number, 0.0)}.get(node.operation)
+        return None if found is None else first.mapped(*found)
+    if first is None:
+        return None
+    number = np.float32(number)
+    if node.operation == "GREATER_THAN":
+        return Curved(first, (float(number), float(np.nextafter(number, np.float32(np.inf)))), (0.0, 1.0))
+    if node.operation == "LESS_THAN":
+        return Curved(first, (float(np.nextafter(number, np.float32(-np.inf))), float(number)), (1.0, 0.0))
+    return None
+
+
+# Entries of the table that Cycles makes of a color ramp.
+RAMP_ENTRIES = 256
+
+
+def _curved_ramp(source: Source) -> Curved | None:
+    value, ramp = input_value(source, 0), source.node.color_ramp
+    if value is None:
+        return None
+    places = np.arange(RAMP_ENTRIES, dtype=np.float32) / np.float32(RAMP_ENTRIES - 1)
+    colors = np.array([ramp.evaluate(float(place)) for place in places])
+    numbers = colors[:, 3] if source.socket.name == "Alpha" else colors[:, :3] @ LUMA
+    steps = np.diff(numbers)
+    if not ((steps >= 0.0).all() or (steps <= 0.0).all()):
+        return None
+    if ramp.interpolation == "CONSTANT":
+        # Cycles takes the entry below.
+        below = np.nextafter(places[1:], np.float32(0.0))
+        places = np.append(places[0], np.stack([below, places[1:]], axis=1))
+        numbers = np.append(numbers[0], np.stack([numbers[:-1], numbers[1:]], axis=1))
+    return Curved(value, tuple(places.tolist()), tuple(numbers.tolist()))
+
+
 def _own_value(source: Source) -> Value:
     return constant(source.node.outputs[0].default_value)
 

@@ -332,6 +332,39 @@ def stack(made):
     return made.mix(made.value(0.5), clear(made, 0.5), made.mix(made.value(0.25), made.leaf(0.5), clear(made)))
 
 
+def cut_alpha(made, operation="GREATER_THAN", **settings):
+    """The alpha of an image, above or below a threshold."""
+    node = made.tree.nodes.new("ShaderNodeMath")
+    node.operation, node.inputs[1].default_value = operation, 0.4
+    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
+    return node.outputs[0]
+
+
+def cut_image(made, **settings):
+    inside = made.shader("BsdfPrincipled")
+    made.tree.links.new(cut_alpha(made, **settings), inside.node.inputs["Alpha"])
+    return inside
+
+
+def mixed_by_cut(made, **settings):
+    node = made.tree.nodes.new("ShaderNodeMath")
+    node.operation, node.inputs[0].default_value = "SUBTRACT", 1.0
+    made.tree.links.new(cut_alpha(made, "LESS_THAN", **settings), node.inputs[1])
+    return made.mix(node.outputs[0], clear(made, 0.9), made.mix(made.value(0.5), made.leaf(0.5), clear(made)))
+
+
+def ramped(made, steps="CONSTANT", **settings):
+    inside, node = made.shader("BsdfPrincipled"), made.tree.nodes.new("ShaderNodeValToRGB")
+    node.color_ramp.interpolation = steps
+    node.color_ramp.elements[0].position, node.color_ramp.elements[1].position = 0.2, 0.7
+    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
+    made.tree.links.new(node.outputs["Color"], inside.node.inputs["Alpha"])
+    return inside
+
+
+CUT = {"above a threshold": cut_image, "below a threshold": mixed_by_cut, "ramp of steps": ramped,
+       "linear ramp": lambda made, **settings: ramped(made, "LINEAR", **settings)}  # fmt: skip
+
 # What a pane's share is, if it is the same everywhere.
 MATERIALS = {
     "constant": (lambda made: made.mix(made.value(0.3), made.leaf(0.5), clear(made)), 0.3),
@@ -346,6 +379,8 @@ MATERIALS = {
     "mapped image": (mapped_image, None),
     "mixed by a color": (mixed_by_image, None),
     "mixed by a clipped color": (lambda made: mixed_by_image(made, extension="CLIP"), None),
+    "clipped and cut": (lambda made: cut_image(made, extension="CLIP"), None),
+    **{name: (make, None) for name, make in CUT.items()},
 }
 
 
@@ -375,6 +410,16 @@ def test_an_image_is_interpolated_as_in_cycles(tmp_path):
     found, _ = seen_by_rays(scene_parts.collected_occluders()[0])
     # The light is 2 mm wide, and alpha changes by at most 1 from one pixel of the image, of 0.5 m, to the next.
     assert np.abs(found - expected).max() < 0.02
+
+
+@pytest.mark.parametrize("name", CUT)
+def test_images_are_cut_after_interpolation_as_in_cycles(tmp_path, name):
+    """The light is 2 mm wide, so that the edge of a shadow is in few pixels; a cut pixel of the image is 0.5 m wide."""
+    start()
+    pane(shown(lambda made: CUT[name](made, interpolation="Linear")))
+    expected = seen_by_cycles(tmp_path)
+    found, _ = seen_by_rays(scene_parts.collected_occluders()[0])
+    assert (np.abs(found - expected) > 0.02).mean() < 0.01 and np.ptp(expected) > 0.3
 
 
 def test_transparent_shadows_may_be_off(tmp_path):

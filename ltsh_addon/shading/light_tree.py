@@ -14,7 +14,7 @@ place of points, doi:10.1145/1073204.1073318.)
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -359,78 +359,109 @@ def _heights(ranges, offset, axis, cone):
     return _products(offset, axis), slack
 
 
+@dataclass(frozen=True)
+class _Between:
+    """How nodes lie from tiles, by pairs (K,); lengths in m."""
+
+    offset: np.ndarray  # (K, 3) from center to center
+    half: np.ndarray  # (K, 3) half the box of the tile
+    reach: np.ndarray  # of the node
+    radius: np.ndarray  # of the tile
+    distance: np.ndarray  # of the centers
+    nearest: np.ndarray  # from the box to the center of the node
+    parallax: np.ndarray  # rad: by how much directions differ between points of the tile and of the node
+
+    @classmethod
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Between:
+        """That of the numbers (K,) of tiles and nodes."""
+        offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
+        half, reach, radius = tiles.half[tile], tree.reach[node], tiles.radius[tile]
+        gap = np.maximum(np.abs(offset) - half, 0.0)
+        distance, nearest = (np.maximum(_lengths(vectors), LEAST) for vectors in (offset, gap))
+        extent = radius + reach
+        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.float32(np.pi))
+        return cls(offset, half, reach, radius, distance, nearest, parallax)
+
+    def away(self, axes, cones):
+        """The least angles (K,) in rad between the directions to nodes and cones of directions, negative within."""
+        return _angles(self.offset, self.distance, axes) - cones - self.parallax
+
+    @property
+    def ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As of `_heights`."""
+        return self.reach, self.half, self.distance + (self.radius + self.reach)
+
+
+@dataclass
 class _Pairs:
     """Pairs (K,) of a tile and a node: how much light that is at most, and how much of it may be wrong."""
 
-    def __init__(self, tree: LightTree, tiles: Tiles, tile, node):
-        self.tile, self.node, self.are_leaves = tile, node, tree.number[node] >= 0
-        offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
-        gap = np.maximum(np.abs(offset) - tiles.half[tile], 0.0)
-        reach = tree.reach[node]
-        distance, nearest = (np.maximum(_lengths(vectors), LEAST) for vectors in (offset, gap))
-        size = reach / nearest
-        # By how much directions differ between points of the tile and of the node.
-        radius = tiles.radius[tile]
-        extent = radius + reach
-        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.float32(np.pi))
-        angle, cone = _angles(-offset, distance, tree.axis[node]), tree.cone[node]
-        shining = np.cos(np.clip(angle - cone - parallax, 0.0, 0.5 * np.pi))
-        power = tree.power[node]
-        self.light = power * shining / np.maximum(nearest, reach) ** 2
+    tile: np.ndarray
+    node: np.ndarray
+    are_leaves: np.ndarray
+    is_dark: np.ndarray
+    are_crossed: np.ndarray  # a horizon goes through the node
+    is_smooth: np.ndarray  # light may be interpolated between samples
+    are_in_tail: np.ndarray  # of all lobes
+    is_wrong: np.ndarray  # no points may stand for the node
+    size: np.ndarray  # of the node, by the length over which the integrand changes
+    change: np.ndarray  # of the integrand over the tile
+    light: np.ndarray  # that any sample gets at most
+    mean: np.ndarray  # about that of all samples: of a large tile beside its distance few get the most
+    crossed: np.ndarray  # light that is wrong where horizons and planes are crossed
+
+    @classmethod
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Pairs:
+        """Those of the numbers (K,) of tiles and nodes."""
+        between = _Between.of(tree, tiles, tile, node)
+        size, seen = between.reach / between.nearest, between.radius / between.nearest
         # What is crossed is near the horizon or the plane of the light: the share of it in the light.
         rim = np.minimum(2.0 * size, 1.0)
-        swing = tree.swing[node] / power
-        ranges = reach, tiles.half[tile], distance + extent
-        height, slack = _heights(ranges, -offset, tree.axis[node], cone)
-        plane = np.where(height < slack, np.minimum(SWUNG * swing + CROSSED * rim, 1.0), 0.0)
-        crossed = np.minimum(plane / np.maximum(shining, LEAST), 1.0)
-        self.is_dark = height < -slack
-        self.are_crossed = np.zeros(len(node), bool)
+        light, plane, crossed, is_dark = _shining(tree, node, between, rim)
+        are_crossed = np.zeros(len(node), bool)
         for number, (axes, cones) in enumerate(tiles.horizons):
             turn = cones[tile]
-            angle = _angles(offset, distance, axes[tile])
-            steepest = np.clip(angle - cones[tile] - parallax, 0.0, 0.5 * np.pi)
-            height, slack = _heights(ranges, offset, axes[tile], cones[tile])
-            self.is_dark |= height < -slack
+            height, slack = _heights(between.ranges, between.offset, axes[tile], turn)
+            is_dark |= height < -slack
             is_crossed = height < slack
-            self.are_crossed |= is_crossed
+            are_crossed |= is_crossed
             if tiles.mirrored is None and number == len(tiles.horizons) - 1:
-                self.light *= np.cos(steepest)
-                is_crossed = is_crossed * np.minimum(rim / np.maximum(np.cos(steepest), LEAST), 1.0)
+                steepest = np.cos(np.clip(between.away(axes[tile], turn), 0.0, 0.5 * np.pi))
+                light *= steepest
+                is_crossed = is_crossed * np.minimum(rim / np.maximum(steepest, LEAST), 1.0)
             crossed += CROSSED * is_crossed
         # A light alone is dark behind its plane; where many are turned differently, they are so one after another.
-        self.is_smooth = ~self.are_crossed & ((plane == 0.0) | tree.is_turned[node])
-        seen = radius / nearest
-        self.are_in_tail = np.zeros(len(node), bool)
-        self.is_wrong = np.zeros(len(node), bool)
+        is_smooth = ~are_crossed & ((plane == 0.0) | tree.is_turned[node])
+        are_in_tail, is_wrong = np.zeros((2, len(node)), bool)
         if tiles.mirrored is not None:
             axes, cones = tiles.mirrored
-            turn = cones[tile]
-            away = np.maximum(_angles(offset, distance, axes[tile]) - cones[tile] - parallax, 0.0)
-            width = tiles.width[tile]
+            turn, width = cones[tile], tiles.width[tile]
+            away = np.maximum(between.away(axes[tile], turn), 0.0)
             # As `TailLimits` has it, for each of the lights.
-            self.are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * nearest > NEAR_RADII * np.sqrt(
-                tree.diagonal[node]
-            )
+            near = NEAR_RADII * np.sqrt(tree.diagonal[node])
+            are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * between.nearest > near
             if tiles.only_tails:
-                self.are_in_tail &= away > SHARP_TAIL
-                self.is_wrong = ~self.are_in_tail
-            self.light *= (width**2 / (width**2 + away**2)) ** 2
+                are_in_tail &= away > SHARP_TAIL
+                is_wrong = ~are_in_tail
+            light *= (width**2 / (width**2 + away**2)) ** 2
             length = np.minimum(width + away, 1.0)
             size, seen, turn = size / length, seen / length, turn / length
-        self.size = size
-        self.change = np.minimum(seen + turn, 1.0)
-        self.are_points = size < POINT
-        self.light[self.is_dark] = 0.0
-        # Of a tile that is large beside its distance few samples get so much; this is about the mean.
-        self.mean = self.light / (1.0 + (radius / np.maximum(nearest, reach)) ** 2)
-        self.crossed = self.light * crossed
-        self.error = self.light * FOURTH_ORDER * np.minimum(size, 1.0) ** 4 + self.crossed
+        light[is_dark] = 0.0
+        mean = light / (1.0 + (between.radius / np.maximum(between.nearest, between.reach)) ** 2)
+        change, are_leaves = np.minimum(seen + turn, 1.0), tree.number[node] >= 0
+        are = are_leaves, is_dark, are_crossed, is_smooth, are_in_tail, is_wrong
+        return cls(tile, node, *are, size, change, light, mean, light * crossed)
+
+    @property
+    def are_points(self) -> np.ndarray:
+        """Mask (K,) of the nodes that are one point."""
+        return self.size < POINT
 
     def are_fine(self, most) -> np.ndarray:
         """Mask (K,) of those whose error is at most so much (K,)."""
         small = (self.size < SMALL) & (self.crossed <= most)
-        return (small | (self.size < LARGEST) & (self.error <= most)) & ~self.is_wrong
+        error = self.light * FOURTH_ORDER * np.minimum(self.size, 1.0) ** 4 + self.crossed
+        return (small | (self.size < LARGEST) & (error <= most)) & ~self.is_wrong
 
     def are_near(self, most) -> np.ndarray:
         """Mask (K,) of the leaves that are no points, where their error may be so much (K,)."""
@@ -446,25 +477,31 @@ class _Pairs:
 
     def take(self, index) -> _Pairs:
         """Those at the index (Q,)."""
-        return self._of({name: values[index] for name, values in vars(self).items()})
+        return _Pairs(*(getattr(self, own.name)[index] for own in fields(self)))
 
     @classmethod
     def joined(cls, parts) -> _Pairs:
         """All pairs of the `parts`."""
-        return cls._of({name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+        return cls(*(np.concatenate([getattr(part, own.name) for part in parts]) for own in fields(cls)))
 
-    @classmethod
-    def _of(cls, values) -> _Pairs:
-        found = object.__new__(cls)
-        vars(found).update(values)
-        return found
+
+def _shining(tree: LightTree, node, between: _Between, rim):
+    """Of pairs (K,): the light at most; the share of all light that may be wrong where a sample may be in the plane of
+    a light, and the share of this light; whether the nodes face away."""
+    angle, cone = _angles(-between.offset, between.distance, tree.axis[node]), tree.cone[node]
+    shining = np.cos(np.clip(angle - cone - between.parallax, 0.0, 0.5 * np.pi))
+    power = tree.power[node]
+    light = power * shining / np.maximum(between.nearest, between.reach) ** 2
+    height, slack = _heights(between.ranges, -between.offset, tree.axis[node], cone)
+    plane = np.where(height < slack, np.minimum(SWUNG * (tree.swing[node] / power) + CROSSED * rim, 1.0), 0.0)
+    return light, plane, np.minimum(plane / np.maximum(shining, LEAST), 1.0), height < -slack
 
 
 def _refined(tree, tiles, is_fine) -> _Pairs:
     """The coarsest `_Pairs` of all tiles of which is_fine(pairs) holds, or which are leaves; none that is dark."""
     fine, tile, node = [], np.arange(len(tiles.columns)), np.zeros(len(tiles.columns), int)
     while len(node) or not fine:
-        pairs = _Pairs(tree, tiles, tile, node)
+        pairs = _Pairs.of(tree, tiles, tile, node)
         done = pairs.are_leaves | is_fine(pairs)
         fine.append(pairs.take(done & ~pairs.is_dark))
         open_ones = ~(done | pairs.is_dark)
@@ -509,7 +546,7 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
             finer.append((chosen[part], light[number]))
     if finer:
         columns, light = zip(*finer, strict=True)
-        pairs = _Pairs(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
+        pairs = _Pairs.of(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
         pairs = pairs.take(~pairs.is_dark)
         light = light + np.bincount(pairs.tile, pairs.mean, len(finer))
         near = pairs.are_near(FINER_LEAF_ERROR * light[pairs.tile])

@@ -255,67 +255,15 @@ class _Lighting:
 
     def add(self, lobes: Lobes) -> None:
         """Add the light that `lobes` reflect."""
-        samples, index, colors = self.samples, lobes.index, lobes.colors
-        position = np.ascontiguousarray(samples.position[index].T)
-        extent = np.abs(position).sum(axis=0)
+        index, colors = lobes.index, lobes.colors
+        position = np.ascontiguousarray(self.samples.position[index].T)
         groups = {group for _, group, _ in self.lights}
         sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for group in groups}
         self._add_skies(lobes, sums)
         left = self._add_far(lobes, position, sums)
         for number in sorted([*self.lights.alone, *left]):
-            (light, group, corners), columns = self.lights[number], left.get(number)
-            needs_float64 = self.needs_float64[number]
-            allowed = light.receives(samples.receiver, index)
-            if float64.has_patches(light):
-                continue
-            if light.is_focused or light.cone is not None:
-                near = may_reach(light, position)
-                allowed = near if allowed is None else allowed & near
-            if lobes.only_tails:
-                chosen = _both(allowed, columns)
-                needs_float64.append(index if chosen is None else index[chosen])
-                continue
-            rest = columns
-            if not light.is_profiled:
-                rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
-            elif light_cone.ConeRegions.suit(light):
-                rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
-            if rest is not None and len(rest) == 0:
-                continue
-            if light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners):
-                chosen = _both(allowed, rest)
-                needs_float64.append(index if chosen is None else index[chosen])
-                continue
-            for part, outline, effort in _batches(light, corners, position, lobes.width, rest):
-                origins = light.origins(position[:, part])
-                offset = (light.center[:, None] - origins).astype(np.float32)
-                seen, factor = light, 1.0
-                if light.is_facing:
-                    seen, factor = self._seen(light, index[part], position[:, part])
-                    factor = factor * seen.gain
-                    offset, facing = seen.offset, np.ones(offset.shape[1], bool)
-                else:
-                    toward = dot(offset, light.direction.astype(np.float32))
-                    facing = toward < -off_plane(light.center, 0.0 if light.is_distant else extent[part])
-                if allowed is not None:
-                    facing &= allowed[part]
-                axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
-                if light.is_profiled:
-                    integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(colors))
-                    axes = integrate.rows
-                polygons = local_corners(seen, outline, offset, axes, self.scratch)
-                found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(colors), integrate)
-                if lobes.limits is not None:
-                    own = SeenLight.of_disk(seen) if light.is_facing else SeenLight.of(light, offset, toward)
-                    lobes.limits.apply(found, part, own, self.scratch)
-                if light.is_facing:
-                    found *= factor
-                if redo.any():
-                    found[:, redo] = 0.0
-                    needs_float64.append(index[part][redo])
-                total = sums[group]
-                for channel in range(3):
-                    total[:, channel, part] += found * np.float32(light.radiance[channel])
+            if not float64.has_patches(self.lights[number][0]):
+                self._add_light(lobes, number, position, left.get(number), sums)
         signed = (colors < 0.0).any()
         for group, total in sums.items():
             reflected = (colors * total).sum(axis=0)
@@ -323,6 +271,63 @@ class _Lighting:
                 # Terms that cancel in the Fresnel factor may leave a rest below zero.
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[group, index] += reflected.T
+
+    def _add_light(self, lobes, number, position, columns, sums) -> None:
+        """Add one light to the sums (F, 3, Q) by group; `columns` (Q',) are those for which that is left to do."""
+        (light, group, corners), index = self.lights[number], lobes.index
+        allowed = light.receives(self.samples.receiver, index)
+        if light.is_focused or light.cone is not None:
+            near = may_reach(light, position)
+            allowed = near if allowed is None else allowed & near
+        rest = columns
+        if not lobes.only_tails:
+            if not light.is_profiled:
+                rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
+            elif light_cone.ConeRegions.suit(light):
+                rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
+            if rest is not None and len(rest) == 0:
+                return
+        is_hard = light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners)
+        if lobes.only_tails or is_hard:
+            chosen = _both(allowed, rest)
+            self.needs_float64[number].append(index if chosen is None else index[chosen])
+            return
+        for batch in _batches(light, corners, position, lobes.width, rest):
+            redo = self._add_polygons(lobes, light, position, batch, allowed, sums[group])
+            if redo.any():
+                self.needs_float64[number].append(index[batch[0]][redo])
+
+    def _add_polygons(self, lobes, light, position, batch, allowed, total) -> np.ndarray:
+        """Add the light, seen as polygons, to total (F, 3, Q) for a batch of `_batches`; mask of the columns for which
+        that takes double precision, and which get nothing."""
+        part, outline, effort = batch
+        offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
+        seen, factor = light, 1.0
+        if light.is_facing:
+            seen, factor = self._seen(light, lobes.index[part], position[:, part])
+            factor = factor * seen.gain
+            offset, facing = seen.offset, np.ones(offset.shape[1], bool)
+        else:
+            extent = np.abs(position[:, part]).sum(axis=0)
+            toward = dot(offset, light.direction.astype(np.float32))
+            facing = toward < -off_plane(light.center, 0.0 if light.is_distant else extent)
+        if allowed is not None:
+            facing &= allowed[part]
+        axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
+        if light.is_profiled:
+            integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(lobes.colors))
+            axes = integrate.rows
+        polygons = local_corners(seen, outline, offset, axes, self.scratch)
+        found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(lobes.colors), integrate)
+        if lobes.limits is not None:
+            own = SeenLight.of_disk(seen) if light.is_facing else SeenLight.of(light, offset, toward)
+            lobes.limits.apply(found, part, own, self.scratch)
+        if light.is_facing:
+            found *= factor
+        found[:, redo] = 0.0
+        for channel in range(3):
+            total[:, channel, part] += found * np.float32(light.radiance[channel])
+        return redo
 
     def _add_skies(self, lobes, sums) -> None:
         """Add the light of skies to the sums (F, 3, Q) by group."""

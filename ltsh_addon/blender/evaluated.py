@@ -16,6 +16,50 @@ def read_values(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndar
     return values.reshape(shape)
 
 
+# Before, Cycles did not take corner normals where only faces are sharp.
+_CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
+
+
+def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (C, 3) at the corners, which stand at the vertices `vertex` (C,), and the mask (F,) of the faces whose
+    triangles are flat: there Cycles interpolates nothing.
+
+    Faces count as flat as far as Cycles says so, which is not always how Blender's solid view shows them: with normals
+    at all corners none are, and edges that are all sharp make none.
+    """
+    faces = len(mesh.polygons)
+    sharp = _marks(mesh, "sharp_face", faces)
+    by_vertex = not mesh.has_custom_normals and not sharp.all() and _edges_do_not_count(mesh, sharp)
+    if by_vertex:
+        normal = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32).take(vertex, axis=0)
+    else:
+        normal = read_values(mesh.corner_normals, "vector", (len(vertex), 3), np.float32)
+    flat = sharp if by_vertex or mesh.normals_domain == "FACE" else np.zeros(faces, bool)
+    return normal, flat
+
+
+def _edges_do_not_count(mesh, sharp_faces: np.ndarray) -> bool:
+    """True where Cycles takes normals of vertices, with sharp faces apart."""
+    edges = _marks(mesh, "sharp_edge", len(mesh.edges))
+    return bool(edges.all() if edges.any() else not _CORNERS_OF_SHARP_FACES or not sharp_faces.any())
+
+
+def _marks(mesh, name: str, count: int) -> np.ndarray:
+    attribute = mesh.attributes.get(name)
+    return np.zeros(count, bool) if attribute is None else read_values(attribute.data, "value", (count,), bool)
+
+
+def normals_at_corners(mesh) -> np.ndarray:
+    """Normals (C, 3) of Cycles at all corners of `mesh`, those of its faces where they are flat."""
+    count = len(mesh.loops)
+    vertex = read_values(mesh.loops, "vertex_index", (count,), np.int32)
+    normal, flat = interpolated_normals(mesh, vertex)
+    if flat.any():
+        is_flat = np.repeat(flat, read_values(mesh.polygons, "loop_total", (len(flat),), np.int32))
+        normal[is_flat] = read_values(mesh.corner_normals, "vector", (count, 3), np.float32)[is_flat]
+    return normal
+
+
 SURFACE_TYPES = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CURVES", "POINTCLOUD")
 
 

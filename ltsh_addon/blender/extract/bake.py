@@ -16,7 +16,7 @@ from ...cycles.uv import tiles_of
 from ...files import save_array
 from ...scene import FARTHEST, SceneError, error_line, light_records, listed
 from .. import render_settings
-from ..evaluated import read_values, rendered_surfaces, with_render_depsgraph
+from ..evaluated import normals_at_corners, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
 from ..materials.aovs import (
@@ -139,7 +139,7 @@ def _read(ob, mesh, matrix, uv_name):
         raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or choose another UV map")
     loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
     positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-    normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)
+    normals = normals_at_corners(mesh)
     maps = {other.name: _uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
     uv = maps[layer.name]
     linear = matrix[:3, :3]

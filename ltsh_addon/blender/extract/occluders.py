@@ -15,7 +15,7 @@ import numpy as np
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
-from ..evaluated import SURFACE_TYPES, is_rendered, owner_of, read_values
+from ..evaluated import SURFACE_TYPES, is_rendered, normals_at_corners, owner_of, read_values
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
 from ..materials.values import Curved, Value, combined, constant, curved_at, is_gray, is_srgb, product, value_at
@@ -394,7 +394,7 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
         if mesh.normals_domain == "POINT":
             normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
         elif mesh.normals_domain == "CORNER":
-            normals = read_values(mesh.corner_normals, "vector", (len(mesh.loops), 3), np.float32)[loops]
+            normals = normals_at_corners(mesh)[loops]
 
         def uv_of(name):
             layers = mesh.uv_layers

@@ -72,12 +72,12 @@ def test_faces_without_area_on_the_texture_leave_the_others_as_they_are(odd):
 
 
 def cut_cube():
-    """A cube, left on the UV map, out of which a red sphere, right on it, is cut."""
+    """A flat cube, left on the UV map, out of which a smooth red sphere, right on it, is cut."""
     ob = scene_parts.add_mesh("Cut", *box())
     ob.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32([0, 0, 0.25, 0, 0.25, 1, 0, 1] * 6))
     ob.data.materials.append(principled("Gray", Roughness=0.6)[0])
     red = principled("Red", Base_Color=(0.8, 0.1, 0.1, 1.0), Roughness=0.6)[0]
-    cutter = scene_parts.add_sphere(red, radius=0.6, smooth=False, location=(0.0, 0.0, 0.5), segments=16)
+    cutter = scene_parts.add_sphere(red, radius=0.6, location=(0.0, 0.0, 0.5), segments=16)
     cutter.hide_render = True
     uv = np.empty(2 * len(cutter.data.loops), np.float32)
     cutter.data.uv_layers.active.uv.foreach_get("vector", uv)

@@ -7,6 +7,7 @@ import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import COLUMNS, SIZE, away_from_edges, normal_map, sampled_pictures, times_too_far, viewport_picture
 
+from ltsh_addon.blender import evaluated
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.viewport import meshes
 
@@ -49,7 +50,7 @@ def normals_at(mesh, points):
     vertex = np.array([loop.vertex_index for loop in mesh.loops])
     triangles = np.array([triangle.loops[:] for triangle in mesh.loop_triangles])
     place = np.array([mesh.vertices[index].co[:] for index in vertex], np.float32)
-    normal, flat = meshes.interpolated_normals(mesh, vertex)
+    normal, flat = evaluated.interpolated_normals(mesh, vertex)
     own, its_normal = meshes.own_normals(mesh, flat, triangles, place, normal)
     corner_normals = normal[triangles].astype(np.float64)
     corner_normals[own] = its_normal[:, None]

@@ -150,6 +150,12 @@ class _Collector:
                 meshes, places = _balls(ob, clear[0], self._note)
             else:
                 meshes = _split(ob, clear, self._image)
+                share = _doubled(meshes)
+                if share > 0.0:
+                    text = (
+                        f"{100.0 * share:.2g} % of its faces where others are: Cycles is black there, here all are lit"
+                    )
+                    self._note(text, ob)
                 if any(material is not None and _is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, the surface blocks where it is without", ob)
             self._parts[key] = self._number(meshes), places
@@ -418,6 +424,27 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
         return found
     finally:
         ob.to_mesh_clear()
+
+
+def _doubled(meshes: list[OccluderMesh]) -> float:
+    """The share of the triangles that are where others are, and face the same way."""
+    parts = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
+    if not parts:
+        return 0.0
+    corners = np.concatenate(parts)
+    # Sums of single precision are exact in double, whichever corner comes first.
+    x, y, z = corners.sum(axis=1).T
+    key = x + math.pi * y + math.e * z
+    order = np.argsort(key)
+    one, other = order[:-1], order[1:]
+    same = key[one] == key[other]
+    first, second = (np.sort(corners[index[same]].view("f8,f8,f8"), axis=1) for index in (one, other))
+    sides = (corners[index[same], 1:] - corners[index[same], :1] for index in (one, other))
+    own, its = (np.cross(side[:, 0], side[:, 1]) for side in sides)
+    doubled = (first == second).all(axis=(1, 2)) & ((own * its).sum(axis=1) > 0.0)
+    touched = np.zeros(len(corners), bool)
+    touched[one[same][doubled]] = touched[other[same][doubled]] = True
+    return float(touched.mean()) if len(touched) else 0.0
 
 
 def _part(vertices, triangles, normals, here, transparency) -> OccluderMesh:

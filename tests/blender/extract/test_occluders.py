@@ -463,6 +463,7 @@ NAMED = {
     "hidden from reflections": "light that surfaces choose counts as glossy",
     "in the same place": "in the same place as 'Pane'",
     "instance in the same place": "in the same place as 'Pane'",
+    "doubled": "67 % of its faces where others are",
 }
 
 
@@ -493,6 +494,11 @@ def test_what_is_not_as_in_cycles_is_named(name):
         twin = ob.copy()
         twin.data = ob.data if name.startswith("instance") else ob.data.copy()
         scene_parts.link(twin, ob.location)
+    elif name == "doubled":
+        # Two squares are one; of the triangles above one is the back of the other.
+        square, up = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(-1, -1, 0.1), (1, -1, 0.1), (0, 1, 0.1)]
+        faces = [(0, 1, 2), (2, 3, 0), (6, 4, 5), (6, 7, 4), (10, 9, 8), (8, 9, 10)]
+        hidden(scene_parts.add_mesh("Pane", 2 * square + up, faces, location=(0.3, 0.2, 1.0)))
     else:
         made = Build("Pane")
         made.show(made.leaf(0.5))

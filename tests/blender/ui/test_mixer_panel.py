@@ -1,5 +1,7 @@
 """The light mixer in Blender: what it shows, what it writes to the lights of the scene, lights that have moved."""
 
+import threading
+import time
 from dataclasses import replace
 
 import bpy
@@ -249,7 +251,23 @@ class MovedLights(Events, stand_in(mixer.LTSH_OT_update_moved_lights)):
     """The operator of the button."""
 
 
-def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded):
+@pytest.fixture
+def go_on(monkeypatch):
+    """An event for which moved lights wait after each picture, until something else is asked of them."""
+    event, pictures_of = threading.Event(), results.MovedLights.pictures
+
+    def waiting(self, light, row=None):
+        pictures, turn = pictures_of(self, light, row), self._turn
+        for found in pictures:
+            yield found
+            while not event.is_set() and self._turn == turn:
+                time.sleep(0.01)
+
+    monkeypatch.setattr(results.MovedLights, "pictures", waiting)
+    return event
+
+
+def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded, go_on):
     scene, fill = shaded
     scene.ltsh.mode = "MIX"
     before = shown()
@@ -267,11 +285,13 @@ def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded):
     bpy.context.view_layer.update()
     hand.until(lambda: mixer._updating["update"] is not update)
     assert not np.array_equal(draft, before) and hand.outcome == {"RUNNING_MODAL"}
+    go_on.set()
     hand.until(lambda: False)
     assert hand.outcome == {"FINISHED"} and hand.reports == [] and hand.context.timers == []
     found = shown()
     assert mixer.moved_rows(bpy.context, [row for row, _ in results.mixer_pairs(scene)]) == {}
     # Esc: as it was.
+    go_on.clear()
     fill.location.x = 0.6
     bpy.context.view_layer.update()
     hand = MovedLights().start()
@@ -282,7 +302,8 @@ def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded):
         hand = MovedLights().start()
         end()
         hand.until(lambda: False)
-        assert np.array_equal(shown(), found) and mixer._updating["update"] is None and hand.context.timers == []
+        assert np.array_equal(shown(), found) and mixer._updating["update"] is None
+        assert hand.reports == [] and hand.context.timers == []
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
 
 

@@ -56,7 +56,7 @@ def arc_polynomial(factor: str, degree: int, longest: float = 1.0) -> np.ndarray
 def arc_factors(one_plus_cosine: np.ndarray):
     """(phi, psi, q) of edges of length theta: theta / sin(theta), (phi - 1) / (1 - cos theta), 1 / (1 + cos theta).
 
-    Relative error below 1e-6 (float32; phi 4e-7) and 2e-14 (float64); finite at theta = 0; theta is kept off pi, where
+    Relative error below 1e-6 (float32; phi 4e-7) and 4e-14 (float64); finite at theta = 0; theta is kept off pi, where
     the edge has no direction.
     """
     dtype = one_plus_cosine.dtype

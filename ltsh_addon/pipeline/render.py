@@ -55,6 +55,9 @@ MOST_NOISE, AROUND = 0.06, 4
 # nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge, where that is more
 # than a share of the light; the mean of so many pixels around each.
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
+# Where our points have so much of the variance of both pictures, Cycles keeps its own; of the squared slope from pixel
+# to pixel the variance in a pixel, twice what it is.
+FEW_POINTS, SLOPE = (0.5, 0.75), 1.0 / 6.0
 # Points that a pixel with an edge gets at least. Of all samples so many more for such pixels, and less where these
 # would take more than a share of what is left of a budget. Where more than a share of the pixels has edges they are the
 # detail of surfaces, and the samples of Cycles that the time buys are worth more.
@@ -440,6 +443,26 @@ def _certain(shadows: lighting.Shadows, name: str) -> np.ndarray:
     return _around(np.clip(2.0 - noise / MOST_NOISE, 0.0, 1.0))
 
 
+def _beside_points(film, radiance: np.ndarray, direct: np.ndarray) -> np.ndarray:
+    """The weight (H, W) of our `radiance` (P,) beside Cycles' own (H, W): 0 where its samples tell more.
+
+    Highlights thinner than a pixel need many. The variance of ours is that of the points of a pixel, by their number,
+    but for a slope, of which even few points find the mean; that of both is how much the pictures differ.
+    """
+    whole, hits = film.image(radiance), film.unspread()
+    if film.first is not None:
+        radiance, hits = np.bincount(np.cumsum(film.first) - 1, radiance), hits.take(film.first)
+    mean = hits.image(radiance)
+    slope = sum(np.square(one) for one in np.gradient(mean)) if min(mean.shape) > 1 else 0.0
+    variance = np.maximum(hits.image(np.square(radiance)) - np.square(mean) - SLOPE * slope, 0.0)
+    variance /= max(film.sub_samples - 1, 1)
+    variance = _around(np.where(film.has_more(), 0.0, variance))
+    both = _around(np.square(direct.astype(np.float64) - whole))
+    share = np.divide(variance, both, out=np.zeros_like(both), where=both > 0.0)
+    least, most = FEW_POINTS
+    return _around(((most - share) / (most - least)).clip(0.0, 1.0))
+
+
 def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
     """Means (H, W) over squares of 2 `around` + 1 pixels."""
     side = 2 * around + 1
@@ -473,7 +496,10 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
             if is_denoised and not comparison.extraction.has_lens:
                 certain = _certain(comparison.shadows, name)
             image = comparison.images[next(iter(comparison.results)), name]
-            if is_denoised and not comparison.extraction.has_lens and name == "diffuse":
+            if is_denoised and not comparison.extraction.has_lens and name == "specular":
+                radiance = comparison.extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
+                certain = certain * _beside_points(comparison.film, radiance, (light * color).mean(axis=-1))
+            elif is_denoised and not comparison.extraction.has_lens:
                 of_cycles = _share_of(certain, light.astype(np.float64) * color)
                 weight = _beside(certain[..., None] * image, of_cycles)
                 weight = np.where(comparison.film.has_more(), 1.0, weight)

@@ -21,7 +21,7 @@ from ltsh_addon.pipeline.lighting import KeptPicture
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, relight
-from ltsh_addon.scene import PASSES, AreaLight
+from ltsh_addon.scene import PASSES, AreaLight, Film
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -221,10 +221,10 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
         seen, own = layers[kind + color] > 0.0, layers[f"ltsh4.{name}"]
         assert seen.mean() > 0.1
         found = layers[kind + direct] * layers[kind + color]
-        # Of edges of diffuse light a part is Cycles' own.
+        # Of edges of diffuse light, and of highlights of which two points tell too little, a part is Cycles' own.
         assert (found - own)[seen].min() > -1e-5
         if name == "specular":
-            np.testing.assert_allclose(found[seen], own[seen], rtol=1e-5, atol=1e-6)
+            assert np.isclose(found[seen], own[seen], rtol=1e-5, atol=1e-6).mean() > 0.7
     assert (out / "render.png").stat().st_size > 500
     assert main([*words, "--resume"]) == 0
 
@@ -566,3 +566,22 @@ def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
     path = parts.save(tmp_path / "dark.blend")
     report = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=2, denoise="off")).report
     assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])
+
+
+def test_few_points_leave_to_cycles_what_its_samples_tell_better():
+    """Highlights thinner than a pixel, and a slope, by four points of each pixel beside samples of known variance."""
+    size, points = 48, 4
+    random = np.random.default_rng(5)
+    film = Film(size, size, np.repeat(np.arange(size * size), points), points)
+    noise = random.normal(size=(size, size))
+    thin, variance = 10.0 * (random.random(len(film.pixel)) < 0.1), 100.0 * 0.1 * 0.9
+    weight = {
+        samples: render._beside_points(film, thin, 1.0 + np.sqrt(variance / samples) * noise).mean()
+        for samples in (1, 4, 64)
+    }
+    # By chance the points of 81 pixels differ less than they should.
+    assert weight[1] > 0.95 and weight[64] < 0.1 and weight[1] > weight[4] > weight[64]
+    # Each point at the middle of a quarter of its pixel: their mean is the mean of the slope.
+    corner = np.tile([0.25, 0.75, 0.25, 0.75], size * size)
+    slope = film.pixel % size + corner
+    assert render._beside_points(film, slope, film.image(slope) + 0.05 * noise).min() > 0.95

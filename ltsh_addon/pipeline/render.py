@@ -43,9 +43,10 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 # A pass of Cycles, followed by the name of a light group.
 OF_GROUP = "Combined_"
 REST = "rest"
-# Points of a pixel where nothing is said, at most those of a budget, and processor seconds that denoising and writing
-# take for a million pixels, and those of each further denoising.
-SUB_SAMPLES, MOST_SUB_SAMPLES, LAST_SECONDS, MORE_SECONDS = 9, 17, 12.0, 4.0
+# Points of a pixel where nothing is said; of a budget those of the first look, and at most.
+SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 2, 17
+# Processor seconds that denoising and writing take at least, for a million pixels, and those of each further denoising.
+START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.5, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
 # Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
@@ -64,9 +65,16 @@ FEW_POINTS, SLOPE = (0.5, 0.75), 1.0 / 6.0
 FEWEST_POINTS, MOST_FINER, FINER_SHARE, MOST_EDGES = 8, 1.0, 0.3, 0.3
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
-# What direct light will take is told from squares of so many pixels on a side that have such shares of its samples. The
-# time grows with the samples to a power from 0.5 to 1, seldom to more than 0.85. Of what is left it may take so much.
-SQUARE, PROBES, POWERS, DIRECT_SHARE = 8, (0.01, 0.04), (0.5, 0.85, 1.0), 0.6
+# What direct light will take is told from squares of so many pixels on a side that have a share of its samples: with
+# these the time grows to a power, from the first squares at least 0.5, from the second 0.49 to 0.84 in six scenes of
+# two sizes. Of what is left it may take so much.
+SQUARE, PROBES, DIRECT_SHARE = 8, ((0.01, 0.5), (0.04, 0.7)), 0.45
+# Where the two points of a pixel differ from their mean by more than so much of the light of the picture, both as root
+# mean squares, its highlights are thinner than pixels, and time tells more as samples of Cycles. In five scenes at most
+# 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
+THIN = 0.35
+# Of what is left of a budget: so much may a second look at the scene take, for more points.
+AGAIN_SHARE = 0.15
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -182,7 +190,7 @@ def _left(options: RenderOptions, extraction, clock: _ProcessorClock) -> float |
         return None
     million = extraction.film.width * extraction.film.height / 1e6
     reserve = (LAST_SECONDS + MORE_SECONDS * (_denoisings(extraction) - 1)) * million
-    return max(options.budget - clock.seconds() - reserve, 0.0)
+    return max(options.budget - clock.seconds() - START_SECONDS - reserve, 0.0)
 
 
 def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock) -> list[str]:
@@ -238,12 +246,11 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
 
     tables = picture.load_tables(options.techniques)
     width, height = options.resolution or (None, None)
-    most = SUB_SAMPLES if options.budget is None else MOST_SUB_SAMPLES
-    own = child_job(
-        *(PictureOptions, options), passes=PASSES, sub_samples=options.sub_samples or most, shadows="on",
-        cycles_samples=2,
-    )  # fmt: skip
-    size = {"width": width, "height": height, "seconds": options.budget}
+    most = options.sub_samples or (SUB_SAMPLES if options.budget is None else MOST_SUB_SAMPLES)
+    # Depth of field takes all points or none.
+    first = most if options.budget is None or most > MOST_SUB_SAMPLES else min(FIRST_SUB_SAMPLES, most)
+    own = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
+    size = {"width": width, "height": height, "seconds": options.budget, "sub_samples": first}
     size |= {"cycles_samples": 0, "for_finished": True, "edge_points": EDGE_POINTS}
     job = child_job(client.ExtractOptions, own, **where, **size)
     extraction = client.extract(job, progress=progress)
@@ -252,11 +259,16 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
         return picture.Comparison(own, extraction, {}, None)
     with lighting.ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
         how = _How(options, own, tables, tracer)
-        extraction = how.affordable(extraction, _left(options, extraction, clock))
+        looked = clock.seconds() - (extraction.processor_seconds - extraction.direct_seconds)
+        number, reason = how.affordable(extraction, _left(options, extraction, clock), looked)
         clock.end("choice")
-        if extraction.kept.everything:
-            return picture.Comparison(own, extraction, {}, None)
-        extraction = client.ended(extraction)
+        if reason:
+            kept = replace(extraction.kept, everything=(*extraction.kept.everything, reason))
+            return picture.Comparison(own, replace(extraction, kept=kept), {}, None)
+        if number > extraction.film.sub_samples:
+            extraction = client.extract(replace(job, sub_samples=number, seconds=None), progress=progress)
+            clock.end("extraction", extraction.processor_seconds)
+        extraction = client.ended(client.with_points(extraction, number))
         clock.end("extraction")
         shadows = how.shadows(extraction, progress)
         clock.end("shadows")
@@ -288,42 +300,35 @@ class _How:
         rays = lighting.rays_of_samples(_rays(self.options, replace(extraction, samples=samples, film=film)), film)
         return self.tracer.trace(samples, ShadowSampling(PASSES, rays, film), progress=progress).take(place)
 
-    def affordable(self, extraction, seconds: float | None):
-        """With the points of a pixel, each but once, that processor `seconds` allow; None: with all of them."""
+    def affordable(self, look, seconds: float | None, looked: float) -> tuple[int, str]:
+        """The points of a pixel that processor `seconds` allow (None: any), after a `look` at the first of them for
+        which it took `looked`; or why Cycles does better with that time."""
         from ..blender.process import client
 
+        points, most = look.film.sub_samples, self.own.sub_samples
+        whole = client.with_points(look, points)
+        if seconds is None or len(whole.samples) == 0:
+            return points, ""
         # Cycles will look at the scene about as long as was done here.
-        allowed = None if seconds is None else DIRECT_SHARE * (seconds - extraction.direct_seconds)
-        if allowed is not None and allowed <= 0.0:
-            return self._left_to_cycles(extraction)
-        points, whole = extraction.film.sub_samples, client.with_points(extraction, extraction.film.sub_samples)
-        if allowed is None or len(whole.samples) == 0:
-            return whole
-        number, took = self._probe(whole, PROBES[0])
-        least, usual, largest = POWERS
-        if took * (len(whole.samples) / number) ** usual <= allowed:
-            return whole
-        one, power = np.count_nonzero(extraction.point == 0), least
-        if took * (one / number) ** power <= allowed:
-            first, (number, took) = (number, took), self._probe(whole, PROBES[1])
-            power = np.log(took / first[1]) / np.log(max(number / first[0], 1.1))
-            power = float(np.clip(power, least, largest))
-        most = number * (allowed / took) ** (1.0 / power)
-        if len(whole.samples) <= most:
-            return whole
-        if most < one or extraction.has_lens:
-            return self._left_to_cycles(extraction)
+        allowed, reason = DIRECT_SHARE * (seconds - look.direct_seconds), client.too_small(self.options.budget)
+        if allowed <= 0.0:
+            return 0, reason
+        one = np.count_nonzero(look.point == 0)
         # Each point that a pixel gets beside its first makes about as many samples.
-        return client.with_points(extraction, 1 + int((points - 1) * (most - one) / (len(whole.samples) - one)))
+        counts = np.arange(1, max(points, most) + 1) if not look.has_lens else np.array([points])
+        samples = one + (counts - 1) * (len(whole.samples) - one) / max(points - 1, 1)
+        again = np.where(counts > points, 0.5 * looked * (1.0 + counts / points), 0.0)
+        counts, samples, again = (each[again <= AGAIN_SHARE * seconds] for each in (counts, samples, again))
+        for share, power in PROBES:
+            number, took, thin = self._probe(whole, share)
+            fits = counts[again + took * (samples / number) ** power <= allowed]
+            if len(fits) == 0:
+                return 0, reason
+        return (0, client.TOO_THIN) if thin > THIN else (int(fits[-1]), "")
 
-    def _left_to_cycles(self, extraction):
-        from ..blender.process import client
-
-        everything = (*extraction.kept.everything, client.too_small(self.options.budget))
-        return replace(extraction, kept=replace(extraction.kept, everything=everything))
-
-    def _probe(self, extraction, share: float) -> tuple[int, float]:
-        """How many samples of a few squares of the picture there are, and the processor seconds that they take."""
+    def _probe(self, extraction, share: float) -> tuple[int, float, float]:
+        """Of a few squares of the picture: how many samples there are, the processor seconds that they take, and by how
+        much of their light specular light differs from point to point of a pixel."""
         from ..blender.process import client
 
         film, start = extraction.film, time.process_time()
@@ -332,11 +337,16 @@ class _How:
         chosen = np.random.default_rng(round(1.0 / share)).permutation(film.width * film.height)
         count = np.cumsum(np.bincount(square, minlength=len(chosen))[chosen])
         there = np.isin(square, chosen[: 1 + np.searchsorted(count, share * len(square))])
-        part = replace(extraction, samples=extraction.samples.take(there), film=film.take(there))
-        part = client.ended(part)
+        part = client.ended(replace(extraction, samples=extraction.samples.take(there), film=film.take(there)))
         shadows = self.shadows(part)
-        picture.evaluated(self.tables, part, shadows, self.own, None)
-        return int(np.count_nonzero(there)), time.process_time() - start
+        results = picture.evaluated(self.tables, part, shadows, self.own, None)
+        images = picture.Comparison(self.own, part, results, shadows).images
+        (technique, result), *_ = results.items()
+        variance, _ = _of_points(part.film, _seen(part, result, "specular"))
+        variance = variance[~part.kept.by_pass["specular"]].sum()
+        light = np.square(sum(images[technique, name].mean(axis=-1) for name in PASSES)).sum()
+        thin = float(np.sqrt(variance / light)) if light > 0.0 else 0.0
+        return int(np.count_nonzero(there)), time.process_time() - start, thin
 
     def with_fine_edges(self, comparison: picture.Comparison, more: float, progress) -> picture.Comparison:
         """The same with more points of the pixels that edges of diffuse light run through: those of shadows, and of
@@ -449,18 +459,28 @@ def _beside_points(film, radiance: np.ndarray, direct: np.ndarray) -> np.ndarray
     Highlights thinner than a pixel need many. The variance of ours is that of the points of a pixel, by their number,
     but for a slope, of which even few points find the mean; that of both is how much the pictures differ.
     """
-    whole, hits = film.image(radiance), film.unspread()
-    if film.first is not None:
-        radiance, hits = np.bincount(np.cumsum(film.first) - 1, radiance), hits.take(film.first)
-    mean = hits.image(radiance)
+    whole, (variance, mean) = film.image(radiance), _of_points(film, radiance)
     slope = sum(np.square(one) for one in np.gradient(mean)) if min(mean.shape) > 1 else 0.0
-    variance = np.maximum(hits.image(np.square(radiance)) - np.square(mean) - SLOPE * slope, 0.0)
-    variance /= max(film.sub_samples - 1, 1)
+    variance = np.maximum(variance - SLOPE * slope, 0.0) / max(film.sub_samples - 1, 1)
     variance = _around(np.where(film.has_more(), 0.0, variance))
     both = _around(np.square(direct.astype(np.float64) - whole))
     share = np.divide(variance, both, out=np.zeros_like(both), where=both > 0.0)
     least, most = FEW_POINTS
     return _around(((most - share) / (most - least)).clip(0.0, 1.0))
+
+
+def _of_points(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variance and mean (H, W) of the `radiance` (P,) of the points of each pixel."""
+    hits = film.unspread()
+    if film.first is not None:
+        radiance, hits = np.bincount(np.cumsum(film.first) - 1, radiance), hits.take(film.first)
+    mean = hits.image(radiance)
+    return np.maximum(hits.image(np.square(radiance)) - np.square(mean), 0.0), mean
+
+
+def _seen(extraction, result, name: str) -> np.ndarray:
+    """The light (P,) of a pass, of all lights and colors, that the samples show."""
+    return extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
 
 
 def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
@@ -497,7 +517,7 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
                 certain = _certain(comparison.shadows, name)
             image = comparison.images[next(iter(comparison.results)), name]
             if is_denoised and not comparison.extraction.has_lens and name == "specular":
-                radiance = comparison.extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
+                radiance = _seen(comparison.extraction, result, name)
                 certain = certain * _beside_points(comparison.film, radiance, (light * color).mean(axis=-1))
             elif is_denoised and not comparison.extraction.has_lens:
                 of_cycles = _share_of(certain, light.astype(np.float64) * color)

@@ -74,16 +74,19 @@ def render_pixel_samples(
 
 # Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# Processor seconds that direct light takes: in all, and for a point of a pixel; the latter grows by so much with each
-# light, up to so many. Of a budget, shares that points may take, and all of direct light.
-START_SECONDS, POINT_SECONDS, LIGHT_SHARE = 1.2, 6e-6, 0.125
+# Processor seconds that direct light takes: in all, in looks at the scene (ours, and those that Cycles takes for the
+# first points, for more, and for its picture), and for a point of a pixel, which grows by so much with each light, up
+# to so many. Of a budget, shares that points may take, and all of direct light.
+START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.2, 5, 6e-6, 0.125
 POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.8, 100
 
 
-def affordable_points(seconds: float, pixels: int, lights: int) -> int:
-    """How many points of each pixel a budget allows; 0: it leaves too little for Cycles."""
+def affordable_points(budget: float, pixels: int, lights: int, looked: float = 0.0) -> int:
+    """How many points of each pixel processor seconds allow, of which each look at the scene takes as many as it has
+    taken already; 0: they leave too little for Cycles."""
     each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
-    return max(int(POINTS_SHARE * seconds / each), 1) if DIRECT_SHARE * seconds > START_SECONDS + each else 0
+    left, looks = budget - LOOKS * looked, LOOKS * looked
+    return max(int(POINTS_SHARE * left / each), 1) if DIRECT_SHARE * left > START_SECONDS + looks + each else 0
 
 
 # Passes of Cycles with the parts of the picture that are not reflected light.
@@ -279,8 +282,8 @@ def extract(job: dict, folder: Path, progress) -> dict:
             scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
         )
         if budget is not None and not has_lens:
-            left = budget - (time.process_time() - opened)
-            count = min(affordable_points(left, pixels, len(inventory.lights)), count)
+            looked = time.process_time() - opened
+            count = min(affordable_points(budget, pixels, len(inventory.lights), looked), count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")

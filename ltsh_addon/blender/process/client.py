@@ -72,6 +72,8 @@ def too_small(budget: float) -> str:
     return f"the budget is too small for it, {budget:g} s"
 
 
+TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
+
 # Materials, or other reasons, that an error names.
 REASONS = 5
 # Smoother surfaces show the patches of a world.

@@ -16,8 +16,8 @@ from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import PictureOptions, RenderOptions, render, shade_scene
-from ltsh_addon.pipeline.lighting import KeptPicture
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, picture, render, shade_scene
+from ltsh_addon.pipeline.lighting import KeptPicture, ShadowTracer
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, relight
@@ -424,6 +424,9 @@ def test_budgets_buy_points_by_what_they_cost():
     assert points[0] == 0 and 1 <= points[1] < points[2] and points[3] == pytest.approx(4 * points[2], abs=4)
     # Thousands of lights are clustered.
     assert pixels_module.affordable_points(64.0, pixels, 100) == pixels_module.affordable_points(64.0, pixels, 9999)
+    # Of large scenes each look takes long.
+    looked = [pixels_module.affordable_points(8.0, pixels, 4, seconds) for seconds in (0.0, 0.2, 0.8)]
+    assert looked[0] >= looked[1] > looked[2] == 0
 
 
 def test_a_budget_excludes_samples(tmp_path, capsys):
@@ -452,42 +455,70 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("each", "power", "points"),
+    ("each", "power", "looked", "points"),
     [
-        (1e-5, 1.0, 5),  # seconds of a sample: all of them
-        (1.6e-3, 1.0, range(2, 5)),
-        (0.028, 0.6, range(2, 5)),
-        (0.01, 1.0, 0),
-        (1.0, 0.5, 0),
+        (1e-5, 1.0, 0.1, 5),  # seconds of a sample: all of them
+        (1e-5, 1.0, 9.0, 2),  # no time for a second look
+        (1e-5, 1.0, 0.3, range(3, 5)),
+        (0.009, 0.7, 0.1, range(1, 5)),
+        (0.03, 1.0, 0.1, 0),
+        (1.0, 0.5, 0.1, 0),
     ],
 )
 def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_for(
-    tmp_path, monkeypatch, each, power, points
+    tmp_path, monkeypatch, each, power, looked, points
 ):
     floor_and_ball(gray(), 1)
-    options = client.ExtractOptions(parts.save(tmp_path / "room.blend"), sub_samples=5, for_finished=True, shadows="on")
-    extraction = client.extract(options)
-    looks = []
+    options = client.ExtractOptions(parts.save(tmp_path / "room.blend"), sub_samples=2, for_finished=True, shadows="on")
+    look, thin = client.extract(options), 0.1
 
     def seconds_of(self, part, share):
-        looks.append(share)
         count = max(round(share * len(part.samples)), 1)
-        return count, each * count**power
+        return count, each * count**power, thin
 
     monkeypatch.setattr(render._How, "_probe", seconds_of)
-    monkeypatch.setattr(render, "POWERS", (0.5, 1.0, 1.0))
-    how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), None, {}, None)
-    seconds = 3.0 + extraction.direct_seconds
-    found = how.affordable(extraction, seconds)
-    if points == 0:
-        assert any("too small" in line for line in found.kept.everything)
+    most = PictureOptions(options.scene, output=tmp_path, sub_samples=5)
+    how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), most, {}, None)
+    seconds = 3.0 + look.direct_seconds
+    number, reason = how.affordable(look, seconds, looked)
+    assert number in (points if isinstance(points, range) else [points])
+    assert bool(reason) == (number == 0)
+    if number == 0:
+        assert "too small" in reason
         return
-    assert not found.kept.everything
-    assert each * len(found.samples) ** power <= render.DIRECT_SHARE * 3.0
-    assert found.film.sub_samples in (points if isinstance(points, range) else [points])
-    # The cheap one is looked at once.
-    assert len(looks) == (1 if points == 5 else 2)
-    assert how.affordable(extraction, 0.0).kept.everything and how.affordable(extraction, None).film.sub_samples == 5
+    samples = len(client.with_points(client.extract(replace(options, sub_samples=number)), number).samples)
+    # Each further point makes no more samples than the second one.
+    assert each * samples**power <= render.DIRECT_SHARE * 3.0
+    assert how.affordable(look, 0.0, looked)[0] == 0 and how.affordable(look, None, looked) == (2, "")
+    # However much time there is, Cycles does better with it.
+    thin = 2.0
+    assert how.affordable(look, seconds, looked) == (0, client.TOO_THIN)
+
+
+def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp_path):
+    """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel."""
+    thin = {}
+    for name, height in (("smooth", 0.0), ("crumpled", 0.01)):
+        parts.empty_scene(SIZE, SIZE)
+        side = np.linspace(-2.0, 2.0, 100)
+        x, y = (grid.ravel() for grid in np.meshgrid(side, side))
+        z = height * np.random.default_rng(2).random(len(x))
+        corner = (np.arange(99)[:, None] * 100 + np.arange(99)).ravel()
+        mesh = bpy.data.meshes.new(name)
+        mesh.from_pydata(np.stack([x, y, z], axis=1), [], corner[:, None] + np.array([0, 1, 101, 100]))
+        mesh.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
+        bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+        parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
+        parts.add_area_light(location=(0.5, 0.0, 3.0), size=0.2)
+        path = parts.save(tmp_path / f"{name}.blend")
+        job = client.ExtractOptions(path, sub_samples=2, for_finished=True, shadows="on")
+        found = client.extract(job)
+        own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
+        options = RenderOptions(path, output=tmp_path, budget=9.0)
+        with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
+            how = render._How(options, own, picture.load_tables(options.techniques), tracer)
+            _, _, thin[name] = how._probe(client.with_points(found, 2), 1.0)
+    assert thin["smooth"] < 0.5 * render.THIN and thin["crumpled"] > 1.5 * render.THIN
 
 
 def test_the_files_of_a_budget_share_no_noise(tmp_path):

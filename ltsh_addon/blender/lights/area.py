@@ -54,13 +54,13 @@ class LightInventory:
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m; add it for positions in the file
-    unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
-    world: Any = None  # that lights the scene
+    unshaded: list[str] = field(default_factory=list)  # reasons why materials are not shaded, see `inject_aovs`
+    world: Any = None  # the world that lights the scene
     behind: Any = None  # the world that is seen behind the surfaces
-    occluders: Any = None  # visibility.Occluders, where shadows are wanted
-    made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
+    occluders: Any = None  # visibility.Occluders, if shadows are wanted
+    made_opaque: list[tuple] = field(default_factory=list)  # see `inject_aovs`
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
-    kept: KeptByCycles = field(default_factory=KeptByCycles)  # by Cycles, in finished pictures
+    kept: KeptByCycles = field(default_factory=KeptByCycles)  # what finished pictures leave to Cycles
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -71,7 +71,7 @@ class LightInventory:
         return frozenset(name for mesh in self.meshes for name in mesh.emitting_materials)
 
     def warn(self, message: str) -> None:
-        """Note `message` once."""
+        """Add `message` to the warnings, once."""
         if message not in self._noted:
             self._noted.add(message)
             self.warnings.append(message)
@@ -365,7 +365,7 @@ def _instance_key(instance) -> tuple:
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
-    """Warn of what Cycles renders for this light and the techniques do not."""
+    """Warn of a negative power and of a sheared transform."""
     light, name = ob.data, ob.original.name
     if light.energy < 0.0:
         inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")

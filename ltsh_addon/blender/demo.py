@@ -201,7 +201,7 @@ def _set_up_view() -> None:
 
 
 def build(path: Path) -> None:
-    """Write the example scene to `path`; what Blender has open is replaced by it."""
+    """Save the example scene as `path`; it replaces the file that is open in Blender."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     _materials()
     for part in everything():

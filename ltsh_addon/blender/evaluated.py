@@ -1,4 +1,4 @@
-"""What the evaluated scene holds: surfaces, instances, and what emitters light."""
+"""What the evaluated scene holds: surfaces, instances and the traits of emitters."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 
 
 def read_values(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
-    """An array of `shape` of the property `name` of all items of one of Blender's collections."""
+    """The property `name` of all items of one of Blender's collections, as an array of `shape`."""
     values = np.empty(int(np.prod(shape)), dtype)
     collection.foreach_get(name, values)
     return values.reshape(shape)
 
 
-# Before, Cycles did not take corner normals where only faces are sharp.
+# Before 5.0 Cycles did not use corner normals in meshes whose only sharp elements are faces.
 _CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
 
 
 def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (C, 3) at the corners, which stand at the vertices `vertex` (C,), and the mask (F,) of the faces whose
-    triangles are flat: there Cycles interpolates nothing.
+    """Normals (C, 3) at the corners, whose vertices are `vertex` (C,), and the mask (F,) of flat faces, on which Cycles
+    interpolates no normals.
 
-    Faces count as flat as far as Cycles says so, which is not always how Blender's solid view shows them: with normals
-    at all corners none are, and edges that are all sharp make none.
+    Faces are flat as in Cycles, which may differ from Blender's solid view: no face is flat if the normals belong to
+    corners, and edges that are all sharp make no face flat.
     """
     faces = len(mesh.polygons)
     sharp = _marks(mesh, "sharp_face", faces)
@@ -39,7 +39,7 @@ def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _edges_do_not_count(mesh, sharp_faces: np.ndarray) -> bool:
-    """True where Cycles takes normals of vertices, with sharp faces apart."""
+    """True if Cycles takes the normals of vertices, except on sharp faces."""
     edges = _marks(mesh, "sharp_edge", len(mesh.edges))
     return bool(edges.all() if edges.any() else not _CORNERS_OF_SHARP_FACES or not sharp_faces.any())
 
@@ -50,7 +50,7 @@ def _marks(mesh, name: str, count: int) -> np.ndarray:
 
 
 def normals_at_corners(mesh) -> np.ndarray:
-    """Normals (C, 3) of Cycles at all corners of `mesh`, those of its faces where they are flat."""
+    """Cycles' normals (C, 3) at all corners of `mesh`; corners of a flat face have the normal of the face."""
     count = len(mesh.loops)
     vertex = read_values(mesh.loops, "vertex_index", (count,), np.int32)
     normal, flat = interpolated_normals(mesh, vertex)
@@ -100,7 +100,7 @@ def with_render_depsgraph(scene, visit: Callable):
 
 @dataclass(frozen=True)
 class EmitterTraits:
-    """What an object gives its light besides power: its light group and the lobes it lights."""
+    """The light group of an emitting object and the lobes that it lights."""
 
     group: str
     diffuse: bool
@@ -108,8 +108,10 @@ class EmitterTraits:
 
     @classmethod
     def of(cls, instance) -> EmitterTraits:
-        """The traits of a depsgraph instance. As in Cycles, the outermost instancer may switch lobes off, and its group
-        counts where the object itself has none."""
+        """The traits of a depsgraph instance.
+
+        As in Cycles, the outermost instancer may switch lobes off, and its group is used if the object has none.
+        """
         ob = instance.object
         group, diffuse, glossy = ob.original.lightgroup, ob.visible_diffuse, ob.visible_glossy
         if instance.is_instance and instance.parent is not None:
@@ -128,9 +130,9 @@ class MaterialSlot:
 
 @dataclass(frozen=True)
 class RenderedSurface:
-    """An original object with a surface and what stood in its slots when evaluated.
+    """An original object with a surface, and the materials of its slots when it was evaluated.
 
-    The evaluated object itself may be gone: Blender makes those of instances for one step of the iteration.
+    It keeps no evaluated object: Blender makes those of instances for one step of the iteration only.
     """
 
     original: object
@@ -138,14 +140,14 @@ class RenderedSurface:
 
     @classmethod
     def of(cls, ob) -> RenderedSurface:
-        """That of an evaluated object."""
+        """The surface of the evaluated object `ob`."""
         materials = [slot.material for slot in ob.material_slots]
         slots = (MaterialSlot(None if material is None else material.original) for material in materials)
         return cls(ob.original, tuple(slots))
 
 
 def surface_instancer(instance) -> RenderedSurface | None:
-    """The outermost instancer of a depsgraph instance where that has a surface itself."""
+    """The outermost instancer of a depsgraph instance if it has a surface itself, else None."""
     if instance.is_instance and instance.parent is not None and instance.parent.type in SURFACE_TYPES:
         return RenderedSurface.of(instance.parent)
     return None
@@ -156,7 +158,7 @@ def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
     found = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
-        # Hair grows on emitters that are not shown themselves, and has their materials.
+        # Hair has the materials of its emitter, which may itself be hidden.
         if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
             key = (ob.original.name_full, ob.data.name_full if ob.data else "")
             if key not in found:
@@ -165,22 +167,22 @@ def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
 
 
 def is_surface(instance) -> bool:
-    """True for what has surfaces that are shown."""
+    """True for an instance that has a surface and is shown."""
     return instance.object.type in SURFACE_TYPES and instance.show_self
 
 
 def is_rendered(ob) -> bool:
-    """False for curves and texts themselves: renders see the mesh they make, which comes as an instance of its own."""
+    """False for curves and texts: a render shows the mesh made from them, which is a separate instance."""
     return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
 
 
 def owner_of(instance):
-    """The object that brings the instance into the scene: itself, or what instances it."""
+    """The object that brings an instance into the scene: its instancer, or itself if it has none."""
     return instance.parent if instance.is_instance and instance.parent else instance.object
 
 
 def is_seen_by_cameras(instance, view_layer) -> bool:
-    """False where the artist hides it from camera rays, or has it contribute indirectly alone."""
+    """False if the instance is hidden from camera rays, or contributes only indirectly in `view_layer`."""
     owner = owner_of(instance)
     if not (instance.object.visible_camera and owner.visible_camera):
         return False
@@ -193,7 +195,7 @@ def data_pointer(ob) -> int:
 
 
 def mesh_key(instance) -> tuple:
-    """Key of an evaluated mesh: its object, original data and instancer, then the address of the evaluated data.
+    """A key of an evaluated mesh: its object, original data, instancer, and the address of the evaluated data.
 
     Blender may use the address of freed data again, but then one of the first three differs.
     """
@@ -207,7 +209,7 @@ def mesh_key(instance) -> tuple:
 
 
 def visibility(depsgraph, space):
-    """A test of depsgraph instances: are they seen in `space`? Only its local view makes a difference."""
+    """A function that is True for depsgraph instances shown in `space`; only its local view hides any."""
     if space is None or space.local_view is None:
         return lambda instance: True
 

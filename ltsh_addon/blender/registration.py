@@ -1,4 +1,4 @@
-"""What LTSH adds to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
+"""Adds LTSH to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import bpy
 
 from ..cli.progress import reserve_stdout
 
-# Modules of this package with register() and unregister(), in the order in which they need each other.
+# PARTS: modules of this package with register() and unregister(); each needs only those before it.
 PARTS = (
     "ui.settings",
     "engine.settings",
@@ -24,12 +24,12 @@ PARTS = (
     "ui.mixer",
 )
 
-# Takes back what is registered, last first; one that fails does not keep the others from it.
+# Unregisters everything, last first, even if one part fails.
 _registered = ExitStack()
 
 
 def register(command_line: Callable[..., int]) -> None:
-    """Add everything; `command_line` is `cli.main`. `unregister` removes it."""
+    """Register the command and all parts; `command_line` is `cli.main`."""
 
     def run(arguments: list[str]) -> int:
         if "--json" in arguments:
@@ -43,12 +43,12 @@ def register(command_line: Callable[..., int]) -> None:
             part.register()
             added.callback(part.unregister)
         _registered.push(added.pop_all())
-    # Blender 4.5 hangs at exit when an engine is still registered.
+    # Blender 4.5 hangs at exit if an engine is still registered.
     atexit.register(unregister)
 
 
 def unregister() -> None:
-    """Remove what `register` added."""
+    """Undo `register`."""
     from .ui import preflight
 
     atexit.unregister(unregister)

@@ -1,4 +1,4 @@
-"""How samples and references are rendered: camera, size, pixel filter, view layer, and neutral settings."""
+"""Settings with which samples and references are rendered: camera, size, pixel filter, view layer, neutral values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def cycles_setting(owner, name: str):
 
 
 def working_space() -> dict:
-    """Name of the working space ("" where Blender does not tell, before 5.0) and its matrix to linear Rec.709."""
+    """The working space: "name" ("" before 5.0, which does not tell), and "to_rec709", the matrix to linear Rec.709."""
     columns = [mathutils.Color(axis).from_scene_linear_to_rec709_linear() for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
     name = bpy.data.colorspace.working_space if bpy.app.version >= (5, 0, 0) else ""
     return {"name": name, "to_rec709": [[column[row] for column in columns] for row in range(3)]}
@@ -44,7 +44,7 @@ CAMERA_KINDS = {"PANO": "panoramic", "CUSTOM": "custom (Open Shading Language)"}
 
 
 def go_to_frame(scene, frame: int | None) -> None:
-    """Evaluate the animation at `frame`, or at the file's own; a camera bound to a marker becomes the scene's."""
+    """Evaluate the animation at `frame`, or at the file's own frame; also activates a camera bound to a marker."""
     if frame is None:
         scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
     else:
@@ -52,7 +52,7 @@ def go_to_frame(scene, frame: int | None) -> None:
 
 
 def choose_camera(scene, name: str | None):
-    """The camera object to render from: by `name`, or the scene's at its current frame."""
+    """Make the camera object `name` that of the scene and return it; None: the scene's own. Raises SceneError."""
     if name is None:
         camera = scene.camera
         if camera is None:
@@ -72,7 +72,7 @@ def choose_camera(scene, name: str | None):
             f"camera {camera.name!r} is {kind}, expected a perspective or orthographic one; "
             "change its type, or name another camera"
         )
-    # A render switches to the camera of the last marker, whatever the scene says.
+    # A render would switch to the camera of the last marker.
     for marker in scene.timeline_markers:
         marker.camera = None
     scene.camera = camera
@@ -80,21 +80,21 @@ def choose_camera(scene, name: str | None):
 
 
 def hold_still(scene, camera) -> None:
-    """Keep scene and lens at their values of this frame: a render evaluates them again, and would undo what is set."""
+    """Remove the animation of scene and lens: a render evaluates it again, which would undo our settings."""
     for owner in (scene, camera.data):
         if owner.animation_data is not None:
             owner.animation_data_clear()
 
 
 def picture_size(scene) -> tuple[int, int]:
-    """Width and height of the whole picture in pixels, without regard to a border."""
+    """Width and height of the whole picture in pixels, whether or not there is a border."""
     render = scene.render
     share = render.resolution_percentage
     return render.resolution_x * share // 100, render.resolution_y * share // 100
 
 
 def set_resolution(scene, width: int | None, height: int | None) -> tuple[int, int]:
-    """Set and return the size of the whole picture in pixels; a missing side keeps the file's aspect."""
+    """Set and return the size (width, height) of the whole picture in pixels; None keeps the aspect of the file."""
     own_width, own_height = picture_size(scene)
     if own_width < 1 or own_height < 1:
         raise SceneError(
@@ -118,9 +118,9 @@ def set_resolution(scene, width: int | None, height: int | None) -> tuple[int, i
 
 
 def render_border(scene) -> Border | None:
-    """The part of the picture that is rendered, None for all of it.
+    """The part of the picture that is rendered; None for all of it.
 
-    Raises SceneError for a border of less than a pixel, which Blender does not render.
+    Raises SceneError for a border smaller than a pixel, which Blender does not render.
     """
     render, (width, height) = scene.render, picture_size(scene)
     if not render.use_border:
@@ -149,7 +149,7 @@ def render_border(scene) -> Border | None:
 
 @contextmanager
 def shifted_pixels(scene, offset: np.ndarray):
-    """Meanwhile the rays of `scene` go through the points `offset` (2,) pixels from the pixels' centers."""
+    """Within this context camera rays are shifted by `offset` (2,), in pixels to the right and up."""
     render, lens = scene.render, scene.camera.data
     size = picture_size(scene)
     width, height = size[0] * render.pixel_aspect_x, size[1] * render.pixel_aspect_y
@@ -164,20 +164,22 @@ def shifted_pixels(scene, offset: np.ndarray):
         lens.shift_x, lens.shift_y = before
 
 
-# In pixels. The interface ends at 0.01, which is too wide: reference rays then cross edges that the central sample
-# does not (measured: 1 % of the pixels of a detailed picture, 6 % relative L2). What
-# remains: 1 in 1000 rays per axis strays by up to half a pixel, by the first cell of Cycles' filter table.
+# CENTER_FILTER_WIDTH: in pixels, of a filter that puts all rays in the center of a pixel. The least width in Blender's
+# interface, 0.01, is too wide: some reference rays then cross edges that the central sample does not (measured: 1 % of
+# the pixels of a detailed picture, 6 % relative L2). Even so, 1 in 1000 rays per axis strays by up to half a pixel,
+# because of the first cell of Cycles' filter table.
 CENTER_FILTER_WIDTH = 1e-6
+# QUANTILE_STEPS: steps in which a filter is integrated.
 QUANTILE_STEPS = 8192
 
 
 def filter_density(kind: str, width: float, distance: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weight of the filter `distance` pixels from the center along one axis, not normalized, and its half extent.
+    """The weight of the filter at a `distance` in pixels along one axis, not normalized, and its half extent in pixels.
 
     `kind` and `width` (pixels) are `pixel_filter_type` and `filter_width` of the scene; filters are separable. BOX is
-    one pixel whatever the width. GAUSSIAN is exp(-8 (x / width)^2), cut at 1.5 widths. BLACKMAN_HARRIS is the window of
-    Harris 1978 ("On the use of windows for harmonic analysis with the discrete Fourier transform"), four terms,
-    two widths from end to end. Measured on an edge: Cycles 4.5.15 and 5.2.3 agree to 1e-3 of its height.
+    always one pixel wide. GAUSSIAN is exp(-8 (x / width)^2), cut at 1.5 widths. BLACKMAN_HARRIS is the window of Harris
+    1978 ("On the use of windows for harmonic analysis with the discrete Fourier transform") with four terms, two widths
+    from end to end. Measured on an edge, Cycles 4.5.15 and 5.2.3 agree to 1e-3 of the height of the edge.
     """
     distance = np.asarray(distance, dtype=np.float64)
     if kind == "BOX":
@@ -194,7 +196,7 @@ def filter_density(kind: str, width: float, distance: np.ndarray) -> tuple[np.nd
 
 
 def filter_quantiles(kind: str, width: float, shares: np.ndarray) -> np.ndarray:
-    """Distances from the pixel's center, in pixels, below which the filter has the `shares` of its weight."""
+    """Signed distances from the pixel's center, in pixels, below which the filter has these `shares` of its weight."""
     half = filter_density(kind, width, np.zeros(1))[1]
     distance = np.linspace(-half, half, QUANTILE_STEPS + 1)
     weight = filter_density(kind, width, distance)[0]
@@ -203,9 +205,10 @@ def filter_quantiles(kind: str, width: float, shares: np.ndarray) -> np.ndarray:
 
 
 def filter_points(kind: str, width: float, count: int) -> np.ndarray:
-    """Offsets (count, 2) from the pixel's center, right and up, in pixels, distributed as the filter; 0 for one.
+    """Offsets (count, 2) from the pixel's center, right and up, in pixels, distributed as the filter.
 
-    The R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences"), warped along each axis.
+    They are the R2 sequence (Roberts 2018, "The Unreasonable Effectiveness of Quasirandom Sequences"), warped along
+    each axis. A single point is the center.
     """
     if count == 1:
         return np.zeros((1, 2))
@@ -213,14 +216,17 @@ def filter_points(kind: str, width: float, count: int) -> np.ndarray:
     return filter_quantiles(kind, width, (np.arange(count)[:, None] * steps + 0.5) % 1.0)
 
 
-# Farther than so many pixels around its own no sample is shared.
+# MOST_AROUND: how many pixels away from its own a sample may count.
 MOST_AROUND = 2
 
 
 def shared_points(kind: str, width: float, count: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points (count, 2) of a pixel as of `filter_points`, but evenly, and their weights (count, D, D) by the filter in
-    the pixels around, rows from top to bottom: so each pixel has those of its neighbors too, 2.25 times as many
-    effective ones with Cycles' default. None, and `balanced_points`, for boxes and for very wide filters."""
+    """Evenly distributed points (count, 2) of a pixel, and their weights (count, D, D) in the pixels around it.
+
+    Points are as those of `filter_points`, weights are values of the filter, with rows from top to bottom. Each pixel
+    also uses the points of its neighbors, 2.25 times as many effective ones with Cycles' default filter. Box and very
+    wide filters share no points: `balanced_points` and None.
+    """
     around = int(np.ceil(filter_density(kind, width, np.zeros(1))[1] - 0.5))
     if not 0 < around <= MOST_AROUND:
         return balanced_points(kind, width, count), None
@@ -231,15 +237,20 @@ def shared_points(kind: str, width: float, count: int) -> tuple[np.ndarray, np.n
 
 
 def balanced_points(kind: str, width: float, count: int) -> np.ndarray:
-    """As `filter_points`, first the center, then pairs that face each other: an odd number of them has its mean in the
-    center. Without, the mean of 16 points is 0.16 pixels from there, which moves the picture against one by Cycles."""
+    """As `filter_points`, but first the center and then pairs of opposite points.
+
+    An odd number of points has its mean in the center. The mean of 16 points of `filter_points` is 0.16 pixels off,
+    which would shift the picture against that of Cycles.
+    """
     half = filter_points(kind, width, 1 + count // 2)[1:] if count > 1 else np.zeros((0, 2))
     return np.concatenate([np.zeros((1, 2)), np.stack([half, -half], axis=1).reshape(-1, 2)])[:count]
 
 
 def camera_rays(scene, matrix) -> list | None:
-    """Where the rays of a picture start, and where they go, (2, 3, 3): at its top left corner, and what one pixel to
-    the right and one down add; `matrix` is that of the camera. None for panoramas."""
+    """Starts and directions (2, 3, 3) of the rays of a picture, for a camera at `matrix`; None for panoramas.
+
+    Each has three rows (3,): its value at the top left corner, and what one pixel to the right and one down add to it.
+    """
     lens, (width, height) = scene.camera.data, picture_size(scene)
     if lens.type not in {"PERSP", "ORTHO"}:
         return None
@@ -255,24 +266,24 @@ def camera_rays(scene, matrix) -> list | None:
 
 
 def sub_pixel_offsets(scene, count: int, points=filter_points):
-    """What `points` returns for the scene's own filter. To be called outside `pinned_pixel_filter`, which replaces
-    it."""
+    """What `points` returns for `count` points of the scene's filter. Call it outside `pinned_pixel_filter`, which
+    replaces that filter."""
     return points(cycles_setting(scene, "pixel_filter_type"), cycles_setting(scene, "filter_width"), count)
 
 
 def filter_name(scene) -> str:
-    """The scene's filter for a report: its kind, and its width in pixels where it has one."""
+    """The scene's filter for a report: its kind, and its width in pixels if it has one."""
     kind = cycles_setting(scene, "pixel_filter_type")
     return kind if kind == "BOX" else f"{kind} {cycles_setting(scene, 'filter_width'):g} px"
 
 
 @contextmanager
 def pinned_pixel_filter(scene):
-    """Meanwhile all camera rays of a pixel go through its center; sub-samples come from shifting the camera."""
+    """Within this context all camera rays of a pixel go through its center; `shifted_pixels` gives sub-samples."""
     cycles = scene.cycles
     before = cycles.pixel_filter_type, cycles.filter_width
     cycles.pixel_filter_type = "GAUSSIAN"
-    # Written past the property's limits, into what stores it.
+    # The stored property is written directly because of the limits of the public one.
     stored = cycles.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else cycles
     stored["filter_width"] = CENTER_FILTER_WIDTH
     try:
@@ -285,8 +296,10 @@ VIEW_LAYER = "ltsh"
 
 
 def only_view_layer(scene, warnings: list[str], name: str | None = None, done: str = "shaded"):
-    """The only view layer that is rendered from now on: the one called `name`, or the first in use. A warning says
-    what is not `done` with the others."""
+    """Make a view layer the only one that is rendered and return it: the one called `name`, or the first in use.
+
+    A warning says that only this one is `done`. Raises SceneError if there is no such layer.
+    """
     if name is not None and name not in scene.view_layers:
         layers = listed(repr(layer.name) for layer in scene.view_layers)
         raise SceneError(f"view layer {name!r} is not in scene {scene.name!r}; view layers there: {layers}")
@@ -301,10 +314,10 @@ def only_view_layer(scene, warnings: list[str], name: str | None = None, done: s
 
 
 def choose_view_layer(scene, warnings: list[str], name: str | None = None):
-    """As `only_view_layer`, with no passes of its own and the name VIEW_LAYER."""
+    """As `only_view_layer`; the layer also gets the name VIEW_LAYER and loses its AOVs and light groups."""
     layer = only_view_layer(scene, warnings, name)
     layer.name = VIEW_LAYER
-    # Nobody reads these passes, and their names could be those of passes that are read.
+    # Nothing reads these passes, and their names could clash with those of passes that are read.
     for extra in (layer.aovs, layer.lightgroups):
         for item in list(extra):
             extra.remove(item)
@@ -312,10 +325,10 @@ def choose_view_layer(scene, warnings: list[str], name: str | None = None):
 
 
 def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
-    """Switch off all that stands between one camera ray per sample and the passes, with a warning where it shows.
+    """Switch off all effects that would alter the passes of single camera rays; warns if the picture changes.
 
-    What is left on purpose: the border, holdouts, material overrides and excluded or indirect-only collections, which
-    samples and reference both show as any render does.
+    Kept on purpose are the border, holdouts, material overrides, and excluded or indirect-only collections: samples and
+    reference both show them as any render does.
     """
     render, cycles = scene.render, scene.cycles
     lens = f"depth of field of camera {camera.name!r}"
@@ -333,24 +346,24 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     render.engine = "CYCLES"
     render.threads_mode, render.threads = "FIXED", cores()
     render.use_compositing = render.use_sequencer = False
-    # Alpha 0 then means a holdout and nothing else; the passes are the same.
+    # With an opaque film only holdouts have alpha 0; the passes do not change.
     render.film_transparent = False
     render.use_freestyle = render.use_persistent_data = False
     render.use_file_extension = render.use_overwrite = True
     cycles.device = "CPU"
-    # AOVs need the other shading system, and without scripts both show the same.
+    # AOVs need the shading system without scripts; files without scripts look the same in both.
     cycles.shading_system = cycles.shading_system and bool(script_nodes())
-    # The exposure is multiplied into what is read from the file, free of the property's limits.
+    # The exposure is applied after reading the rendered files, free of the property's limits.
     cycles.film_exposure = 1.0
     cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
     cycles.use_animated_seed = cycles.use_fast_gi = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
-    # What is wholly transparent is seen through, however much of it there is, and leaves no trace in the passes.
+    # Rays pass through any number of wholly transparent surfaces, which leave no trace in the passes.
     cycles.transparent_max_bounces, view_layer.pass_alpha_threshold = 1024, 0.5
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.light_sampling_threshold = 0.0
-    # How likely a light is chosen matters between two horizons: as `cycles.light_tree` tells.
+    # The probability with which Cycles chooses a light matters between two horizons; see `cycles.light_tree`.
     cycles.use_light_tree = True
     cycles.caustics_reflective = True
     view_layer.samples = 0
@@ -368,7 +381,7 @@ def script_nodes() -> list:
 
 @contextmanager
 def without_scripts(scene):
-    """Meanwhile Cycles renders without Open Shading Language, as if nothing were linked to the nodes that run it."""
+    """Within this context Cycles renders without Open Shading Language, as if the nodes that run it were not linked."""
     before, nodes = scene.cycles.shading_system, script_nodes()
     scene.cycles.shading_system = False
     for node in nodes:
@@ -383,7 +396,7 @@ def without_scripts(scene):
 
 @contextmanager
 def without_lights(scene):
-    """Meanwhile no light object shines: what Cycles would spend on their light is a third of a render of one sample."""
+    """Within this context no light object is rendered; their light would take a third of the time of one sample."""
     lights = [ob for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render]
     for ob in lights:
         ob.hide_render = True
@@ -395,7 +408,7 @@ def without_lights(scene):
 
 
 def steps_after_rendering(scene) -> list[str]:
-    """Warnings about what Blender would do to the rendered picture and is switched off."""
+    """Warnings about steps after rendering that the scene asks for and that are switched off."""
     render, found = scene.render, []
     if render.use_freestyle:
         found.append("Freestyle")
@@ -415,7 +428,7 @@ GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")
 
 
 def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
-    """Take the objects `names` and all volumes out of every collection; children keep their parents."""
+    """Remove the objects `names` and all volumes from every collection; children keep their parents."""
     for ob in bpy.data.objects:
         if ob.type == "VOLUME" and ob.name_full in {other.name_full for other in scene.objects}:
             warnings.append(f"volume {ob.name!r} is not shaded; left out of the Cycles reference as well")
@@ -430,7 +443,7 @@ def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:
 
 
 def prepare_surfaces(warnings: list[str]) -> None:
-    """Object settings that change how a surface itself is shaded."""
+    """Switch off object settings that change how a surface is shaded, with warnings."""
     for ob in bpy.data.objects:
         if ob.type not in SURFACE_TYPES:
             continue
@@ -443,14 +456,14 @@ def prepare_surfaces(warnings: list[str]) -> None:
 
 
 def enable_passes(view_layer, names: tuple[str, ...]) -> None:
-    """Switch on the passes `use_pass_<name>`, all others off."""
+    """Switch on the passes `use_pass_<name>` and switch off all others."""
     for attribute in dir(view_layer):
         if attribute.startswith("use_pass_"):
             setattr(view_layer, attribute, attribute[len("use_pass_") :] in names)
 
 
 def render_exr(scene, path: Path, codec: str = "ZIP") -> None:
-    """Render `scene` into the multi-layer float EXR `path`. Raises SceneError, and OSError where the disk is full."""
+    """Render `scene` into the multi-layer float EXR `path`. Raises SceneError, and OSError if the disk is full."""
     settings = scene.render.image_settings
     if bpy.app.version >= (5, 0, 0):
         settings.media_type = "MULTI_LAYER_IMAGE"
@@ -466,7 +479,7 @@ def render_exr(scene, path: Path, codec: str = "ZIP") -> None:
 
 
 def pass_names() -> dict[str, str]:
-    """Names of the passes in the EXR, which changed with 5.0."""
+    """Our key of a pass -> its name in an EXR by this Blender; the names changed with 5.0."""
     names = ("Glossy Direct", "Glossy Color", "Diffuse Direct", "Diffuse Color", "Emission", "Environment",
              "Object Index", "Material Index")  # fmt: skip
     if bpy.app.version < (5, 0, 0):
@@ -477,12 +490,12 @@ def pass_names() -> dict[str, str]:
 
 
 def save_png(scene, pixels: np.ndarray, path: Path) -> None:
-    """Save `pixels` (H, W, 4), row 0 on top, as Blender shows them: through the view transform of the scene."""
+    """Save `pixels` (H, W, 4), row 0 on top, as a PNG through the view transform of the scene."""
     height, width = pixels.shape[:2]
     image = bpy.data.images.new("LTSH picture", width, height, alpha=True, float_buffer=True)
     if bpy.app.version >= (5, 0, 0):
         image.colorspace_settings.name = bpy.data.colorspace.working_space
-    # Blender takes color for multiplied by alpha, as it is.
+    # The colors are already multiplied by alpha.
     image.alpha_mode = "PREMUL"
     image.pixels.foreach_set(np.ascontiguousarray(pixels[::-1], np.float32).ravel())
     settings = scene.render.image_settings

@@ -1,4 +1,4 @@
-"""Saving copies of the open file: whole or not at all, or at once for a second Blender."""
+"""Copies of the open file: compressed and checked for completeness, or quickly for a second Blender."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import bpy
 
 from ..scene import SceneError, error_line
 
-# What a compressed .blend ends with (Zstandard seekable format 0.1.1, facebook/zstd, contrib/seekable_format).
+# The last bytes of a compressed .blend (Zstandard seekable format 0.1.1, facebook/zstd, contrib/seekable_format).
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 
 _state = {"keeps engine": False}
@@ -19,7 +19,7 @@ _state = {"keeps engine": False}
 def save_working_copy(path: Path, *, keep_engine: bool = False) -> None:
     """Save the open file, unsaved changes included, as `path` for a second Blender. Raises RuntimeError.
 
-    Files are saved with the artist's engine, also during a preview; `keep_engine` leaves the one that is in use.
+    Even during a preview a file is saved with the artist's engine; `keep_engine` saves the engine in use.
     """
     with _without_thumbnail():
         _state["keeps engine"] = keep_engine
@@ -30,13 +30,13 @@ def save_working_copy(path: Path, *, keep_engine: bool = False) -> None:
 
 
 def keeps_engine() -> bool:
-    """True while a copy is saved with the engine that is in use."""
+    """True while a copy is being saved with the engine in use."""
     return _state["keeps engine"]
 
 
 @contextlib.contextmanager
 def _without_thumbnail():
-    """Meanwhile saving draws no thumbnail: that is a render of its own, many times as long as the writing."""
+    """Within this context saving draws no thumbnail, whose render takes many times as long as the writing."""
     preferences = bpy.context.preferences
     before, unsaved = preferences.filepaths.file_preview_type, preferences.is_dirty
     try:
@@ -47,8 +47,10 @@ def _without_thumbnail():
 
 
 def save_copy(path: Path, **options) -> None:
-    """Save a compressed copy of the open file as `path`; `options` are those of `bpy.ops.wm.save_as_mainfile`. Raises
-    SceneError, which names the folder, where it cannot be saved whole."""
+    """Save a compressed copy of the open file as `path`; `options` are those of `bpy.ops.wm.save_as_mainfile`.
+
+    Raises SceneError, which names the folder, if it cannot be saved completely.
+    """
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=True, **options)
     except RuntimeError as error:
@@ -59,7 +61,7 @@ def save_copy(path: Path, **options) -> None:
 
 
 def check_whole(path: Path) -> None:
-    """Raise SceneError where the end of the compressed .blend is missing."""
+    """Raise SceneError if the end of the compressed .blend `path` is missing."""
     with path.open("rb") as file:
         file.seek(-min(len(SEEK_TABLE_END), path.stat().st_size), os.SEEK_END)
         if file.read() != SEEK_TABLE_END:

@@ -1,4 +1,4 @@
-"""Baked textures put to use: materials that show them, in the open file or in a new .blend (a task of the child)."""
+"""Materials that show baked textures, in the open file or in a new .blend (a task of the child)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from ..saving import save_copy
 from .pixels import open_scene
 
 GROUP_PREFIX = "LTSH Bake"
-# What a material that shows a texture remembers: the one it stands for (0: none), and how its slot held that.
+# Custom properties of a material that shows a texture. FORMER: the material that it replaces (0: none). FORMER_LINK:
+# the link setting that the slot had.
 FORMER, FORMER_LINK = "ltsh_former_material", "ltsh_former_link"
 
 
 def apply_bake(job: dict, progress) -> dict:
-    """Do the `job` (see `client.apply_bake`): open the scene, give every baked object copies of its materials that
-    show the texture, save the file `job["path"]`; the manifest."""
+    """Do the `job` (see `client.apply_bake`): let the baked objects of the scene show their textures, and save it.
+
+    The file is saved as `job["path"]`. Returns the manifest.
+    """
     warnings = []
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings)
@@ -40,12 +43,12 @@ def show_texture(ob, entry: dict) -> None:
 
 
 def shows_texture(ob) -> bool:
-    """True where a material of `ob` is one of `show_texture`."""
+    """True if a material of `ob` was made by `show_texture`."""
     return any(slot.material is not None and FORMER_LINK in slot.material for slot in ob.material_slots)
 
 
 def restore_materials(ob) -> bool:
-    """Give `ob` the materials back that it had before `show_texture`; False where it shows no texture."""
+    """Give `ob` back the materials that it had before `show_texture`; False if it shows no texture."""
     found = False
     for slot in ob.material_slots:
         shown = slot.material
@@ -71,11 +74,11 @@ def _image(entry):
             image.tiles.new(tile_number=file["tile"])
         image.filepath = first["path"].replace(f".{first['tile']}.", ".<UDIM>.")
     try:
-        # From the file that is open: saving elsewhere adapts all such paths.
+        # The path is relative to the open file; saving elsewhere adapts such paths.
         image.filepath = bpy.path.relpath(image.filepath)
     except ValueError:
         pass  # on another drive
-    # The name of the scene's linear space differs between color configurations.
+    # The linear space of the scene has different names in different color configurations.
     for space in ("Linear Rec.709", "scene_linear"):
         try:
             image.colorspace_settings.name = space
@@ -86,7 +89,7 @@ def _image(entry):
 
 
 def _group(name: str, image, uv_name: str):
-    """A node group that gives the texture as a color and as emission."""
+    """A node group that outputs the texture as a color and as emission."""
     group = bpy.data.node_groups.new(f"{GROUP_PREFIX} {name}", "ShaderNodeTree")
     group.interface.new_socket("Emission", in_out="OUTPUT", socket_type="NodeSocketShader")
     group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
@@ -103,12 +106,12 @@ def _group(name: str, image, uv_name: str):
 
 
 def _show(ob, group) -> None:
-    """Give `ob` copies of its materials whose surface is the group's emission; what was there stays beside it."""
+    """Give `ob` copies of its materials that emit the output of `group`; their other nodes stay, unlinked."""
     if len(ob.material_slots) == 0:
         ob.data.materials.append(None)
     for slot in ob.material_slots:
         shown = slot.material
-        # The mesh may have other users, which go on showing their materials.
+        # Link the material to the object: other users of the mesh keep theirs.
         link = slot.link
         slot.link = "OBJECT"
         name = shown.name if shown is not None else ob.name

@@ -1,4 +1,4 @@
-"""Texels of objects: their surfaces, lights and Cycles' own bake, and what a job asks before (runs in the child)."""
+"""Bakes of objects: the surfaces of their texels, the lights, and Cycles' own bake (runs in the child)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from .origin import middle_of, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 UV_LAYER = "ltsh_texels"
-# Texels that Cycles' bake spreads its samples over, from side to side: a whole one since Blender 5.2.
+# SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
 
@@ -47,7 +47,7 @@ class ObjectError(Exception):
 
 @dataclass(frozen=True)
 class Block:
-    """Rows of a tile: first row (from below), number of rows, and the size of the whole tile."""
+    """A block of rows of a UDIM tile: its first row, counted from below, its rows, and the size of the whole tile."""
 
     tile: int
     first_row: int
@@ -60,7 +60,7 @@ class Block:
         return f"{self.tile}_{self.first_row}"
 
     def placed(self, uv: np.ndarray) -> np.ndarray:
-        """uv (N, 2) so that the block fills the unit square."""
+        """`uv` (N, 2), moved and scaled so that the block fills the unit square."""
         column, row = (self.tile - 1001) % 10, (self.tile - 1001) // 10
         v = (uv[:, 1] - row) * (self.height / self.rows) - self.first_row / self.rows
         return np.stack([uv[:, 0] - column, v], axis=-1)
@@ -87,7 +87,7 @@ def chosen_objects(scene, view_layer, wanted) -> list:
 
 
 def check_object(ob) -> None:
-    """Raise ObjectError for what can be told without evaluating the object."""
+    """Raise ObjectError if the object cannot be baked, as far as that is known without evaluating it."""
     if ob.type != "MESH":
         raise ObjectError(f"object {ob.name!r} is a {ob.type}, expected a mesh: convert it to one")
     if ob.library is not None or ob.data.library is not None:
@@ -98,7 +98,7 @@ def check_object(ob) -> None:
 
 
 def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
-    """UDIM tiles of a mesh object; none where they cannot be told without evaluating it."""
+    """The UDIM tiles of a mesh object; [] if they are unknown without evaluating it."""
     if ob.type != "MESH" or ob.modifiers or len(ob.data.loops) == 0:
         return []
     layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
@@ -115,8 +115,10 @@ def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
 def read_mesh(
     ob, depsgraph, uv_name: str | None, origin=(0.0, 0.0, 0.0)
 ) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
-    """The object `ob` as `depsgraph` evaluates it around `origin` (3,), the name of its UV map, and all of its UV maps
-    (T, 3, 2) by name, "" for the one that renders. Raises ObjectError."""
+    """The evaluated mesh of `ob`, the name of the UV map to bake, and all UV maps (T, 3, 2) by name.
+
+    "" names the UV map that renders. `origin` (3,) in m is added to the positions. Raises ObjectError.
+    """
     evaluated = ob.evaluated_get(depsgraph)
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
@@ -189,13 +191,13 @@ class ObjectBake:
         if layer is None:
             raise ObjectError(f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one")
         ob.data.uv_layers.active_index = active
-        # Blender appends a number to a name in use.
+        # Blender appends a number if the name is in use.
         self.layer_name, self.images = layer.name, {}
         for plan in plans:
             plan.prepare(self.layer_name)
 
     def close(self) -> None:
-        """Take the UV map and the images out again."""
+        """Remove the UV map, the nodes and the images."""
         self.ob.data.uv_layers.remove(self.ob.data.uv_layers[self.layer_name])
         for plan in self.plans:
             plan.remove()
@@ -203,8 +205,11 @@ class ObjectBake:
             bpy.data.images.remove(image)
 
     def maps(self, block: Block, point: int, points: int) -> np.ndarray:
-        """(N, rows, W, 3) float32, row 0 below: map n of every material at once, at one of the `points` of each texel
-        that Cycles samples, 0 its center; last the others' places (u, v, 0), where the block is the unit square."""
+        """Maps (N, rows, W, 3) float32, row 0 at the bottom, at the given one of the `points` of each texel.
+
+        Cycles samples these points; point 0 is the center of the texel. Map n shows map n of every material at once.
+        For the other points one more map follows: their places (u, v, 0), where the block is the unit square.
+        """
         found, cycles = [], self.scene.cycles
         # With a fixed seed the bytes do not depend on what was baked before.
         cycles.seed, cycles.samples, cycles.use_sample_subset = 0, points, True
@@ -221,7 +226,7 @@ class ObjectBake:
         return np.array(found)
 
     def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
-        """(2, rows, W, 3): Cycles' direct light, colors included, as two halves with their own seeds."""
+        """Cycles' direct light (2, rows, W, 3), colors included: two halves with different seeds."""
         for plan in self.plans:
             plan.show(None)
         halves = []
@@ -264,7 +269,7 @@ class ObjectBake:
 
 
 def view_of(wanted, camera, bent: bool) -> BakeView:
-    """The view `wanted`: "camera", "above" or a position (3,)."""
+    """The view for `wanted`: "camera", "above" or a position (3,)."""
     if wanted == "above":
         return BakeView("above")
     if wanted == "camera":
@@ -276,34 +281,34 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
     return BakeView("point", tuple(wanted), bent)
 
 
-# Keys of a job that may differ while the same file stays open.
+# Keys of a job that may change while the same file stays open.
 _OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images", "temporary")
 
 
 @dataclass(frozen=True)
 class ReadMesh:
-    """Mesh and UV maps of an object, in files."""
+    """The mesh and the UV maps of an object, saved in files."""
 
-    mesh: Path  # as TexelMesh.load reads it
+    mesh: Path  # for `TexelMesh.load`
     uv_name: str
     uv_names: tuple[str, ...]  # "" for the one that renders
-    uv_maps: Path  # .npz, (T, 3, 2) by the number of the name
+    uv_maps: Path  # .npz of arrays (T, 3, 2), named by the position in `uv_names`
 
     def uv_map(self, name: str) -> np.ndarray:
-        """(T, 3, 2)."""
+        """The UV map `name` (T, 3, 2)."""
         with np.load(self.uv_maps) as data:
             return data[str(self.uv_names.index(name))]
 
 
 @dataclass
 class BakeScene:
-    """The open file; `meshes` or `problems` have each of the objects that were named when it was opened."""
+    """The open file. Each object that was named when it was opened is in either `meshes` or `problems`."""
 
     scene: object
     camera: str
     view: BakeView
     lights: list
-    origin: np.ndarray  # (3,) m in the file, of the occluders
+    origin: np.ndarray  # (3,) m, the place in the file of the occluders' origin
     warnings: list[str]
     names: list[str]
     meshes: dict[str, ReadMesh]
@@ -312,7 +317,7 @@ class BakeScene:
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
-        """The maps that the material slots of an object need, and warnings about its materials."""
+        """The plan of each material slot of an object, and warnings about its materials."""
         uv_names, made, warnings = set(self.meshes[ob.name].uv_names), {}, []
         for slot in ob.material_slots:
             material = slot.material
@@ -328,7 +333,7 @@ _kept: dict[str, tuple] = {}
 
 
 def opened_scene(job: dict, progress) -> BakeScene:
-    """The file of `job` (see `client.BakeJob`), opened unless it is already, as it stands on the disk."""
+    """The opened file of `job` (see `client.BakeJob`); one that is open is used again if nothing has changed."""
     status = Path(job["scene"]).stat()
     key = {name: value for name, value in job.items() if name not in _OF_ONE_JOB}
     key = repr(sorted(key.items())), status.st_mtime_ns, status.st_size, pixels.files_opened()
@@ -405,7 +410,7 @@ def _open(job: dict) -> BakeScene:
 
 
 def _camera(scene, job):
-    """The camera of the view, or one that only stands where a render needs one."""
+    """The camera of the view, or a new one, which a render needs in any case."""
     if job["view"] == "camera":
         return render_settings.choose_camera(scene, job["camera"])
     camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
@@ -423,8 +428,10 @@ def _look_from(scene, camera, wanted) -> None:
 
 
 def _apply_modifiers(scene, objects, uv_name: str | None) -> None:
-    """Give objects the mesh that their modifiers make, where these bring in places on the UV map or materials of other
-    meshes (booleans, arrays with caps, geometry nodes): Cycles' bake takes both from the object's own mesh."""
+    """Replace the meshes of objects by evaluated ones where modifiers change the UV map or the materials.
+
+    Booleans, arrays with caps and geometry nodes can do so; Cycles' bake reads both from the object's own mesh.
+    """
     probed = {}
     for ob in objects:
         if ob.type == "MESH" and ob.library is None and ob.data.library is None and len(ob.modifiers):
@@ -452,7 +459,7 @@ def _apply_modifiers(scene, objects, uv_name: str | None) -> None:
 
 
 def _probe(mesh, layer) -> str:
-    """The name of a new UV map of `mesh`: `layer`, moved as `Block.placed` moves it."""
+    """The name of a new UV map of `mesh`, a copy of `layer` moved as `Block.placed` does; "" if there is no room."""
     name, active = layer.name, mesh.uv_layers.active_index
     probe = mesh.uv_layers.new(name=UV_LAYER, do_init=False)
     if probe is None:
@@ -467,7 +474,7 @@ def _probed(uv: np.ndarray) -> np.ndarray:
 
 
 def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
-    """Whether the UV map that stands in the object's own mesh is the one it is rendered with, and so the materials."""
+    """True if the object's own mesh has the UV map and the materials with which it is rendered."""
     evaluated = ob.evaluated_get(depsgraph)
     if [slot.material and slot.material.original for slot in evaluated.material_slots] != [
         slot.material for slot in ob.material_slots
@@ -486,7 +493,7 @@ def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
 
 
 def _evaluated_copy(ob, depsgraph):
-    """A mesh of its own of what the modifiers of an object make, generated coordinates as before."""
+    """A new mesh with the result of the modifiers of `ob`; its generated coordinates are unchanged."""
     evaluated = ob.evaluated_get(depsgraph)
     mesh = bpy.data.meshes.new_from_object(evaluated, preserve_all_data_layers=True, depsgraph=depsgraph)
     mesh.use_auto_texspace = False
@@ -495,11 +502,11 @@ def _evaluated_copy(ob, depsgraph):
 
 
 def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
-    """Lights, meshes of objects by name, what is wrong with the others by name, and surfaces without material."""
+    """The lights, meshes by object name, problems of the other objects by name, and objects without material."""
 
     def visit(depsgraph):
         meshes, problems = {}, {}
-        # Asked for here, where the depsgraph is that of a render.
+        # Only the depsgraph of a render knows what is rendered.
         rendered = {surface.original.name_full: surface for surface in rendered_surfaces(depsgraph)}
         for number, ob in enumerate(objects):
             try:
@@ -527,7 +534,7 @@ def _saved(mesh, uv_name, uv_maps, folder, number) -> ReadMesh:
 
 
 def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
-    """Lobes of the materials of objects, by full name of the material."""
+    """The lobes of the materials of `objects`, by full name of the material."""
     found = {}
     for material in (slot.material for ob in objects for slot in ob.material_slots):
         if material.name_full not in found:
@@ -537,7 +544,7 @@ def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
 
 
 def extract_bake(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.extract_bake`), write .npz and .npy into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.extract_bake`) and write .npz and .npy files into `folder`; returns the manifest."""
     started = time.monotonic()
     opened = opened_scene(job, progress)
     names = opened.names if isinstance(job["objects"], str) else job["objects"]
@@ -570,7 +577,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
 
 
 def _object(opened, name, images, job, folder, progress) -> dict:
-    """Write what belongs to one object into `folder`; its record."""
+    """Write the files of one object into `folder`; returns its record."""
     ob, read = bpy.context.view_layer.objects[name], opened.meshes[name]
     plans, warnings = opened.plans(ob, images)
     folder.mkdir(parents=True, exist_ok=True)
@@ -590,7 +597,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
 
 
 def _bake(opened, ob, plans, job, folder, progress) -> None:
-    """Write the maps and Cycles' bake of the tiles of an object that are wanted and not finished."""
+    """Write the maps and Cycles' bake of an object, for the wanted tiles that are not finished."""
     read, points = opened.meshes[ob.name], job["sub_samples"] if any(plan.count for plan in plans) else 0
     bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
     try:
@@ -622,7 +629,7 @@ def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, i
 
 
 def scene_facts(job: dict, progress) -> dict:
-    """Do the `job` (see `client.scene_facts`): what there is to bake in which frame; the manifest."""
+    """Do the `job` (see `client.scene_facts`): returns a manifest of what there is to bake in each frame."""
     progress("open scene", 0.0)
     pixels.open_scene(Path(job["scene"]), [], job["scripts"])
     scene, facts, tiles = bpy.context.scene, [], {}

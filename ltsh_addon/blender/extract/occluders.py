@@ -1,7 +1,7 @@
 """What blocks light in an evaluated scene (runs in the child).
 
-As in Cycles: what shadow rays see, whoever sees it besides, and however bright it is. Holdouts block. Hair becomes
-tubes and points become balls of flat faces, of the same mean width.
+As in Cycles, every object that is visible to shadow rays blocks them, holdouts and glowing objects included. Hair
+becomes tubes and points become balls, both with flat faces and with the mean width of round ones.
 """
 
 from __future__ import annotations
@@ -21,26 +21,27 @@ from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of,
 from ..materials.values import Curved, Value, combined, constant, curved_at, is_gray, is_srgb, product, value_at
 from ..render_settings import cycles_setting
 
-# Stands for the place of occluders that are not points.
+# AS_IT_IS: the places of occluders that are not points.
 AS_IT_IS = np.eye(4)[None]
-# Names of a kind in a warning.
+# NAMED: how many names of a kind a warning lists.
 NAMED = 3
-# Bits of a mask from those for rays that lights choose to those for rays that surfaces choose, where they differ.
+# A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
+# SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
 SURFACE_SHIFT = 16
-# Beyond, hair and points are left out: hair would take some 0.7 GiB.
+# MOST_PIECES: hair or points with more pieces block nothing; such hair would take some 0.7 GiB.
 MOST_PIECES = 1_000_000
 TUBE_SIDES = 3
-# How far a ball of radius 1 is from its flat faces and their corners, at most.
+# BALL_THICKNESS: the largest distance of a ball of radius 1 from the flat faces that stand for it.
 BALL_THICKNESS = 0.08
-# Radius of points without one, in m, as in Cycles.
+# POINT_RADIUS: in m, as in Cycles, of points without a radius.
 POINT_RADIUS = 0.01
 
 
 def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occluders:
-    """What blocks shadow rays in a render of `depsgraph`, but for objects of full names `left_out`.
+    """What blocks shadow rays in a render of `depsgraph`, without the objects with full names in `left_out`.
 
-    `override` is what replaces all materials; `warn(text)` takes what is not as in Cycles. Call it before materials are
-    changed.
+    The material `override` replaces all others. `warn(text)` is called for differences from Cycles. Call this before
+    materials are changed.
     """
     return _Collector(depsgraph, override, left_out).collect(warn)
 
@@ -51,19 +52,19 @@ class _Collector:
         objects = {
             instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
         }
-        # Where some rays meet other things, each half of a mask is for those of one kind.
+        # If some object blocks only one kind of ray, each kind has its own half of a mask.
         self._shift = SURFACE_SHIFT if any(map(_is_met_by_some, depsgraph.object_instances)) else 0
         self._most_sets = (SURFACE_SHIFT if self._shift else MOST_BLOCKER_SETS + 1) - 1
         self._blockers = Blockers(list(objects.values()), self._most_sets)
         self._meshes: list[OccluderMesh] = []
-        # Of evaluated data the numbers of its meshes, and of points their places (N, 4, 4) in the object.
+        # Key of evaluated data -> numbers of its meshes, and the places (N, 4, 4) of its points in the object.
         self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
         self._instances: list[tuple] = []  # (mesh, matrices (N, 3, 4), mask, terminator)
-        # By size and place of meshes the first of them, and the name of its object.
+        # (size, place) of a mesh -> number of the first such mesh, and the name of its object.
         self._there: dict[tuple, tuple[int, str]] = {}
         self._materials: dict[str, _Clear | None] = {}
         self._images: dict[tuple, np.ndarray] = {}
-        # Names of the objects that do not block as in Cycles, by kind.
+        # Difference from Cycles -> names of the objects that it concerns.
         self._notes: dict[str, dict[str, None]] = {}
 
     def collect(self, warn) -> Occluders:
@@ -116,13 +117,13 @@ class _Collector:
             mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
         self._instances += [(number, (matrix @ places)[:, :3], mask, terminator) for number in numbers]
-        # Metaballs are told twice.
+        # The depsgraph lists metaballs twice.
         if places is AS_IT_IS and instance.object.type != "META":
             for number in numbers:
                 self._look_for_twins(number, matrix, instance.object)
 
     def _look_for_twins(self, number, matrix, ob):
-        """Note a mesh of an object that is where another one is."""
+        """Add a note if an equal mesh is already in the same place."""
         mesh, own = self._meshes[number], (number, ob.original.name)
         first = self._there.setdefault((len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), own)
         if first is not own and _is_same(mesh, self._meshes[first[0]]):
@@ -162,7 +163,7 @@ class _Collector:
         self._place(instance, matrix, *self._parts[key])
 
     def _number(self, meshes) -> list[int]:
-        """Numbers of the `meshes`, which are kept."""
+        """Keep those `meshes` that have triangles; returns their numbers."""
         first = len(self._meshes)
         self._meshes += [mesh for mesh in meshes if len(mesh.triangles)]
         return list(range(first, len(self._meshes)))
@@ -174,7 +175,7 @@ class _Collector:
         )
 
     def _clear_of(self, material) -> _Clear | None:
-        """What a material lets through; None where it blocks."""
+        """The light that a material lets through; None if it blocks all."""
         if material is None:
             return None
         if material.name_full not in self._materials:
@@ -187,7 +188,7 @@ class _Collector:
             return None
         output = surface.node
         if live_link(surface) is None:
-            # Volumes are not shaded, which is said elsewhere.
+            # A material with only a volume lets light through; another warning tells that volumes are not shaded.
             return None if live_link(output.inputs["Volume"]) is None else _Clear(constant(1.0))
         value, curve = _share_at(surface), None
         if isinstance(value, Curved):
@@ -208,7 +209,7 @@ class _Collector:
         return _Clear(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
 
     def _image(self, value: Value) -> np.ndarray | None:
-        """What `value` is for the pixels (H, W) of its image."""
+        """`value` at the pixels (H, W) of its image; None if only Cycles knows the colors."""
         use = value.image
         key = (use.image.session_uid, value.matrix[0].tobytes(), value.offset[0].tobytes())
         if key not in self._images:
@@ -237,12 +238,12 @@ class _Collector:
             slot = min(settings.material, len(ob.material_slots)) - 1
             material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
             meshes = [_tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
-            # Particles are in world space.
+            # The places of particles are in world space.
             self._place(instance, np.eye(4), self._number(meshes))
 
 
 def _meets(instance) -> tuple[bool, bool]:
-    """Do rays that lights choose meet the instance, and do those that surfaces choose, glossy ones?"""
+    """Whether the instance blocks rays toward points on lights, and glossy rays in directions that surfaces choose."""
     ob, owner = instance.object, owner_of(instance)
     return tuple(getattr(ob, name) and getattr(owner, name) for name in ("visible_shadow", "visible_glossy"))
 
@@ -258,18 +259,21 @@ def _is_same(mesh, other):
     )
 
 
-# What materials let through:
+# Transparency of materials:
 
 
 @dataclass(frozen=True)
 class _Clear:
-    """Share of light that a material lets through."""
+    """The share of light that a material lets through."""
 
     value: Value
-    curve: tuple | None = None  # as of `Transparency`
+    curve: tuple | None = None  # see `Transparency.curve`
 
     def transparency(self, uv_of, image_of) -> Transparency:
-        """For triangles; `uv_of(name)` are their corners on a UV map, `image_of(value)` the shares of an image."""
+        """The `Transparency` of triangles.
+
+        `uv_of(name)` returns their corners on a UV map, and `image_of(value)` the shares at the pixels of an image.
+        """
         if self.value.is_constant:
             return Transparency(float(self.value.offset[0]))
         use = self.value.image
@@ -286,7 +290,7 @@ class _Clear:
 
 
 def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
-    """Share of light that the shader at the input `socket` lets through, as shadow rays see it; None: unknown."""
+    """The share of light that the shader at the input `socket` lets through for shadow rays; None: unknown."""
     source = source_of(socket, groups)
     if source is None or source.node is None:
         return constant(0.0)
@@ -307,7 +311,7 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
         return None
     if _is_constant(factor):
         share = float(np.clip(factor.offset[0], 0.0, 1.0))
-        # What is not there need not be known.
+        # The other shader does not contribute and may be unknown.
         if share in (0.0, 1.0):
             return parts[int(share)]
         return _sum(*parts, 1.0 - share, share)
@@ -325,7 +329,7 @@ def _is_constant(value: Value | Curved | None) -> bool:
 
 
 def _sum(first, second, first_share: float, second_share: float) -> Value | Curved | None:
-    """As `combined`; None unless what is not curved is constant beside what is."""
+    """As `combined`, also for one `Curved` and one constant; None for other pairs with a `Curved`."""
     pairs = (first, first_share, second, second_share), (second, second_share, first, first_share)
     for one, share, other, other_share in pairs:
         if isinstance(one, Curved):
@@ -334,7 +338,7 @@ def _sum(first, second, first_share: float, second_share: float) -> Value | Curv
 
 
 def _factor_at(socket, groups) -> Value | Curved | None:
-    """The factor of a Mix Shader node; shadow rays are of one kind alone."""
+    """The factor of a Mix Shader node for shadow rays, which are of no other type; None: unknown."""
     source = source_of(socket, groups)
     if source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeLightPath":
         name = source.socket.name
@@ -355,7 +359,7 @@ def _values_of_image(value: Value) -> np.ndarray | None:
     if image.alpha_mode == "NONE":
         pixels[..., 3] = 1.0
     if colors_count and image.alpha_mode != "CHANNEL_PACKED" and (pixels[..., 3] != 1.0).any():
-        return None  # Cycles multiplies colors by alpha, unless both are used
+        return None  # Cycles multiplies colors by alpha unless the material uses both
     if colors_count and srgb:
         colors = pixels[..., :3]
         pixels[..., :3] = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
@@ -370,7 +374,7 @@ def _is_displaced(material) -> bool:
 
 
 def _shape_key(ob) -> tuple:
-    """What tells the evaluated data of objects apart while a depsgraph stays as it is."""
+    """A key of the evaluated data of an object, valid while the depsgraph does not change."""
     data = ob.data
     is_mesh = isinstance(data, bpy.types.Mesh)
     original = data.original.session_uid if data.original is not None else 0
@@ -382,7 +386,7 @@ def _shape_key(ob) -> tuple:
 
 
 def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
-    """The faces of `ob` that block, and those of each slot that let light through."""
+    """Meshes of `ob`: one of all faces that block, and one per slot of those that let light through."""
     mesh = ob.to_mesh()
     if mesh is None:
         return []
@@ -427,12 +431,12 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
 
 
 def _doubled(meshes: list[OccluderMesh]) -> float:
-    """The share of the triangles that are where others are, and face the same way."""
+    """The share of the triangles that coincide with others and face the same way."""
     parts = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
     if not parts:
         return 0.0
     corners = np.concatenate(parts)
-    # Sums of single precision are exact in double, whichever corner comes first.
+    # A sum of single precision numbers is exact in double precision, so the order of the corners does not matter.
     x, y, z = corners.sum(axis=1).T
     key = x + math.pi * y + math.e * z
     order = np.argsort(key)
@@ -457,7 +461,7 @@ def _part(vertices, triangles, normals, here, transparency) -> OccluderMesh:
 
 
 def _tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
-    """Hair curves through their points."""
+    """Tubes along hair curves."""
     curves = ob.data
     points = len(curves.points)
     if points > MOST_PIECES:
@@ -475,7 +479,7 @@ def _tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
 
 
 def _tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
-    """Hair of a particle system, in world space."""
+    """Tubes along the hair of a particle system, in world space."""
     settings = system.settings
     along = np.linspace(0.0, 1.0, steps)
     root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
@@ -493,7 +497,7 @@ def _tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
 
 
 def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
-    """Of hair and points, which have no UV maps."""
+    """The transparency of hair or points, whose images are not read because they have no UV maps."""
     if clear is None:
         return None
     if clear.value.is_constant:
@@ -504,11 +508,11 @@ def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
 
 
 def _tubes(places, radii, first, transparency) -> OccluderMesh:
-    """Tubes around the curves that begin at the points `first`, of the mean width of round ones."""
+    """Tubes around curves through `places` that begin at the points `first`, with the mean width of round tubes."""
     points, sides = len(places), TUBE_SIDES
     starts = np.ones(points, bool)
     starts[first] = False
-    ends = np.flatnonzero(starts)  # of the pieces, each begins at the point before
+    ends = np.flatnonzero(starts)  # end points of the pieces; each piece begins at the point before
     along = np.zeros((points, 3))
     along[ends] += places[ends] - places[ends - 1]
     along[ends - 1] += places[ends] - places[ends - 1]
@@ -517,7 +521,7 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
     x = np.cross(along, axis)
     x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
     y = np.cross(along, x)
-    # A convex outline is as wide, in the mean over all directions, as its length over pi.
+    # The mean width of a convex outline over all directions is its length over pi.
     out = radii.astype(np.float64) * math.pi / (sides * math.sin(math.pi / sides))
     angle = 2.0 * math.pi * np.arange(sides) / sides
     ring = np.cos(angle)[:, None] * x[:, None] + np.sin(angle)[:, None] * y[:, None]
@@ -525,13 +529,13 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
     one, two = np.arange(sides), (np.arange(sides) + 1) % sides
     low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
     triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
-    # What is shaded is a ribbon through the middle, or a round tube; it bends where these pieces are straight.
+    # The shaded surface is a ribbon through the middle or a round tube, and bends where these pieces are straight.
     thickness = np.repeat(1.3 * np.maximum(out[ends], out[ends - 1]), 2 * sides)
     return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency, thickness=thickness)
 
 
 def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
-    """A ball, and the places (N, 4, 4) that it has in a point cloud."""
+    """A list of one ball, and its places (N, 4, 4) in a point cloud."""
     cloud = ob.data
     count = len(cloud.points)
     if count > MOST_PIECES:
@@ -554,7 +558,7 @@ def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
 
 @cache
 def _ball():
-    """A ball of 80 triangles, whose mean shadow is that of a round one of radius 1: vertices, triangles."""
+    """Vertices and triangles of a ball of 80 triangles with the same mean shadow as a sphere of radius 1."""
     golden = (1.0 + math.sqrt(5.0)) / 2.0
     corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     corners = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
@@ -578,6 +582,6 @@ def _ball():
     vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
     triangles = np.array(triangles)
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
-    # The mean shadow of a convex body is a quarter of its surface.
+    # The mean shadow of a convex body is a quarter of its surface area.
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     return vertices * math.sqrt(4.0 * math.pi / area), triangles

@@ -1,7 +1,7 @@
-"""A scene that lies far from the origin is moved to it (in the child).
+"""Moves a scene that is far from the origin to it (in the child).
 
-Blender and Cycles hold positions in single precision: 100 km away they are 8 mm apart. Everything that is rendered is
-moved by the same vector, and moved back where one object does not follow.
+Blender and Cycles store positions in single precision: 100 km away they are 8 mm apart. All that is rendered is moved
+by the same vector; if one object does not follow, everything is moved back.
 """
 
 from __future__ import annotations
@@ -13,16 +13,19 @@ from ...scene import listed
 from ..evaluated import SURFACE_TYPES, with_render_depsgraph
 from ..materials.graph import tree_in_use
 
-# In m from the origin; nearer, positions are at most 0.12 mm apart.
+# FAR: in m from the origin; up to there positions are at most 0.12 mm apart.
 FAR = 2000.0
-# In m: how far from its place a moved object may be, besides the rounding of where it was.
+# TOLERANCE: how far in m a moved object may be from its expected place, in addition to rounding.
 TOLERANCE = 1e-3
+# NAMED: how many objects a warning names.
 NAMED = 3
 
 
 def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
-    """Move `scene` so that the light nearest to `eye` (3,) is near the origin, if it is far and that does not take the
-    eye farther away, else the eye; where the origin was moved to (3,), in m."""
+    """Move `scene` so that `new_origin` comes to the origin; returns that place (3,) in m, or 0 if nothing moved.
+
+    `eye` (3,) is the position of the camera. Nothing moves if no object is farther away than FAR.
+    """
     nowhere = np.zeros(3)
     if not any(np.abs(_corners(ob)).max() > FAR for ob in scene.objects):
         return nowhere
@@ -49,8 +52,11 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
 
 
 def new_origin(lights: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Whole m (3,) from the origin to the one of `lights` (N, 3) that is nearest to `eye` (3,), or to the eye where
-    that is nearer to the origin than to the light; 0 where the light is not far from the origin, or the eye."""
+    """The place (3,), in whole m, that should become the origin; 0 if it is not far from the origin.
+
+    It is the one of `lights` (N, 3) nearest to `eye` (3,). It is the eye instead if that light is far from the origin
+    and the eye is nearer to the origin than to the light.
+    """
     nearest = lights[np.argmin(np.linalg.norm(lights - eye, axis=1))]
     if np.abs(nearest).max() > FAR and np.linalg.norm(nearest - eye) > np.linalg.norm(eye):
         nearest = eye
@@ -59,7 +65,7 @@ def new_origin(lights: np.ndarray, eye: np.ndarray) -> np.ndarray:
 
 
 def _corners(ob) -> np.ndarray:
-    """Corners (N, 3) of the box around an object, or its place."""
+    """Corners (N, 3) of the box around an object with a surface; the position (1, 3) of any other object."""
     matrix = np.array(ob.matrix_world, dtype=np.float64)
     corners = np.array(ob.bound_box, dtype=np.float64) if ob.type in SURFACE_TYPES else np.zeros((1, 3))
     with np.errstate(invalid="ignore"):  # an object may be nowhere
@@ -67,12 +73,12 @@ def _corners(ob) -> np.ndarray:
 
 
 def middle_of(ob) -> np.ndarray:
-    """Middle (3,) of the box around an object."""
+    """The middle (3,) of the box around an object."""
     return _corners(ob).mean(axis=0)
 
 
 def _places(depsgraph) -> list[tuple]:
-    """((name, type), matrix (4, 4)) of all that is rendered, and of the camera, in an order that stays."""
+    """((name, type), matrix (4, 4)) of the camera and of all that is rendered except suns, in a fixed order."""
     found = []
     for instance in depsgraph.object_instances:
         ob = instance.object
@@ -85,7 +91,7 @@ def _places(depsgraph) -> list[tuple]:
 
 
 def _moved(scene, origin: np.ndarray, places) -> list[str]:
-    """Move the scene by -origin. Where something does not follow all is put back, and its names are returned."""
+    """Move the scene by -origin. If objects do not follow, undo everything and return their names, else []."""
     roots = [ob for ob in scene.objects if ob.parent is None]
     collections = {collection for ob in scene.objects for collection in ob.users_collection}
     before = {ob: tuple(ob.delta_location) for ob in roots}
@@ -93,12 +99,12 @@ def _moved(scene, origin: np.ndarray, places) -> list[str]:
     for ob in roots:
         ob.delta_location = np.array(ob.delta_location) - origin
     for collection in collections - {scene.collection}:
-        # Instances of objects that are moved themselves.
+        # Otherwise instances of the collection would move twice: with its objects and with the instancer.
         collection.instance_offset = np.array(collection.instance_offset) - origin
     lost = _lost(places, with_render_depsgraph(scene, _places), origin)
     carried = [ob for ob in roots if ob.name in lost]
     if carried:
-        # Constraints may move them along with what has moved.
+        # Their constraints may follow objects that have moved: try without moving them.
         for ob in carried:
             ob.delta_location = before[ob]
         lost = _lost(places, with_render_depsgraph(scene, _places), origin)
@@ -114,12 +120,12 @@ def _moved(scene, origin: np.ndarray, places) -> list[str]:
 
 
 def _lost(before, after, origin) -> list[str]:
-    """Names of the objects that have not moved by -origin."""
+    """Names of the objects that did not move by -origin."""
     if [key for key, _ in before] != [key for key, _ in after]:
         return [name for name, _ in dict.fromkeys(key for key, _ in before)]
     lost = {}
     for ((name, _), old), (_, new) in zip(before, after, strict=True):
-        # Half the last digit of a coordinate, for each that was added up.
+        # Half a last digit of the coordinate for each term of its sum.
         rounding = 4.0 * np.spacing(np.abs(old[:3, 3]).max().astype(np.float32))
         same_axes = np.allclose(old[:3, :3], new[:3, :3], rtol=1e-5, atol=1e-5 * np.abs(old[:3, :3]).max())
         if not same_axes or np.abs(old[:3, 3] - origin - new[:3, 3]).max() > TOLERANCE + rounding:
@@ -128,7 +134,7 @@ def _lost(before, after, origin) -> list[str]:
 
 
 def _keep_texture_space(origin: np.ndarray) -> None:
-    """Let materials and lights see the positions that were."""
+    """Make the Position outputs of materials and lights give the positions before the move."""
     trees = [tree_in_use(block) for block in (*bpy.data.materials, *bpy.data.lights)]
     for tree in [*filter(None, trees), *(group for group in bpy.data.node_groups if group.type == "SHADER")]:
         for node in list(tree.nodes):

@@ -1,4 +1,4 @@
-"""Samples, lights and the Cycles reference of a picture (runs in the child)."""
+"""The samples, the lights and the Cycles reference of a picture (runs in the child)."""
 
 from __future__ import annotations
 
@@ -41,29 +41,31 @@ from ..render_settings import (
 from .occluders import collect_occluders
 from .origin import move_to_origin
 
-# So many samples, whose files take about 1 GB, are worth no compression that takes long.
+# FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
 FAST_PIXELS = 10_000_000
 
 
 def render_pixel_samples(
     scene, view_layer, folder: Path, offsets: np.ndarray, progress, extra_passes: tuple[str, ...] = ()
 ) -> list[str]:
-    """Names of the files in `folder`, one for each of the `offsets` (N, 2) from the pixel centers; with depth of field
-    each has other points of the lens."""
+    """Render one sample per pixel for each of the `offsets` (N, 2) from the pixel centers, in pixels.
+
+    Returns the names of the files in `folder`, one per offset. With depth of field each file has other lens points.
+    """
     declare_aovs(view_layer)
     enable_passes(view_layer, ("combined", "diffuse_color", "normal", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
     files, sub_samples, cycles = [], len(offsets), scene.cycles
     if scene.camera.data.dof.use_dof:
         cycles.samples, cycles.use_sample_subset, cycles.sample_subset_length = sub_samples, True, 1
-    # Faster to write than ZIP, 2.4 times larger on the example scene.
+    # RLE is faster to write than ZIP; its files are 2.4 times larger on the example scene.
     codec = "RLE" if sub_samples * scene.render.resolution_x * scene.render.resolution_y <= FAST_PIXELS else "ZIP"
     with pinned_pixel_filter(scene), without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
-            cycles.sample_offset = index  # of a subset
-            # Only the camera differs: the others need no second look at the scene, and show the same bits.
+            cycles.sample_offset = index  # used only with a sample subset
+            # Only the camera changes from file to file: Cycles keeps the scene, and the result is the same bit by bit.
             scene.render.use_persistent_data = index < sub_samples - 1
             with shifted_pixels(scene, offset):
                 render_exr(scene, folder / files[-1], codec)
@@ -72,37 +74,42 @@ def render_pixel_samples(
     return files
 
 
-# Points of a pixel from which on finished pictures have depth of field by them: with fewer Cycles has less noise.
+# FINISHED_LENS: fewest points per pixel for depth of field in a finished picture; with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# Processor seconds that direct light takes: in all, in looks at the scene (ours, and those that Cycles takes for the
-# first points, for more, and for its picture), and for a point of a pixel, which grows by so much with each light, up
-# to so many. Of a budget, shares that points may take, and all of direct light.
+# Processor seconds of direct light. START_SECONDS: always. LOOKS: how many looks at the scene there are, by us and by
+# Cycles (for the first points, for more points, and for its picture). POINT_SECONDS: for a point of a pixel, which
+# grows by LIGHT_SHARE with each light, up to MOST_LIGHTS.
+# Shares of a budget. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
 START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.2, 5, 6e-6, 0.125
 POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.8, 100
 
 
 def affordable_points(budget: float, pixels: int, lights: int, looked: float = 0.0) -> int:
-    """How many points of each pixel processor seconds allow, of which each look at the scene takes as many as it has
-    taken already; 0: they leave too little for Cycles."""
+    """How many points of each pixel a `budget` of processor seconds allows; 0: too little would be left for Cycles.
+
+    Each look at the scene is expected to take as long as the first, `looked` seconds.
+    """
     each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
     left, looks = budget - LOOKS * looked, LOOKS * looked
     return max(int(POINTS_SHARE * left / each), 1) if DIRECT_SHARE * left > START_SECONDS + looks + each else 0
 
 
-# Passes of Cycles with the parts of the picture that are not reflected light.
+# REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
 REST_PASSES = ("emit", "environment")
-# File with what stands in the way of light.
+# OCCLUDERS: the file with the occluders.
 OCCLUDERS = "occluders.npz"
 SEEDS = {"A": 1, "B": 7919}
+# Chunks of one half of the reference. FIRST_CHUNK: samples of the first. CHUNK_SECONDS: the time that each of the
+# others should take. MAX_CHUNKS: how many others there are at most.
 FIRST_CHUNK = 16
 CHUNK_SECONDS = 4.0
 MAX_CHUNKS = 8
 
 
 def remove_occlusion(scene) -> None:
-    """Make every surface, instances included, invisible to all rays but the camera's.
+    """Make every surface, instances included, invisible to all rays but those of the camera.
 
-    Objects that shine must stay visible to the rays that they light: these go through them instead.
+    Objects that shine must stay visible to the rays that find their light: rays pass through them instead.
     """
     for ob in bpy.data.objects:
         if ob.type not in SURFACE_TYPES:
@@ -114,16 +121,16 @@ def remove_occlusion(scene) -> None:
 
 
 def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_samples: int, progress) -> list[list]:
-    """For each half the list of [file name in `folder`, samples in it]; a half has cycles_samples / 2 samples.
+    """Render the reference in two halves of cycles_samples / 2 samples each.
 
-    The camera rays are those of `render_pixel_samples`, so that edges agree: with several sub-samples each gets its
-    share of the samples, at least one. A half is rendered in chunks of one sample sequence, because Cycles reports
-    progress only about once a minute.
+    Returns for each half a list of [file name in `folder`, samples in it]. The camera rays are those of
+    `render_pixel_samples`, so that edges agree: each sub-sample gets an equal share of the samples, at least one. A
+    half is rendered in chunks of one sample sequence because Cycles reports progress only about once a minute.
     """
     enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
     samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
-    # One look at the scene, and one picture of a procedural sky, is enough for all files.
+    # Cycles keeps the scene, and its picture of a procedural sky, for all files.
     scene.render.use_persistent_data = True
     with pinned_pixel_filter(scene):
         files = [_render_half(scene, folder, half, offsets, share, progress) for half in SEEDS]
@@ -132,7 +139,10 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
 
 
 def _render_half(scene, folder: Path, half: str, offsets, share: int, progress) -> list[list]:
-    """One file per sub-sample, each with the next `share` samples of one sequence; that of a single one in chunks."""
+    """Render one half: for each sub-sample a file with the next `share` samples of one sequence.
+
+    A single sub-sample is rendered in chunks.
+    """
     cycles = scene.cycles
     files, done, samples = [], 0, share * len(offsets)
     chunk = share if len(offsets) > 1 else min(FIRST_CHUNK, share)
@@ -172,15 +182,15 @@ _files_opened = 0
 
 
 def files_opened() -> int:
-    """How many times `open_scene` was called; what was read from a file is valid until the next time."""
+    """How many times `open_scene` was called; data of a file is valid until the next call."""
     return _files_opened
 
 
-NAMED = 5  # of a kind, in an error
+NAMED = 5  # how many things of a kind an error names
 
 
 def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
-    """Open the .blend `path` in memory; scripts in it run only if asked for."""
+    """Open the .blend `path` in Blender; its `scripts` run only if True. Raises SceneError."""
     global _files_opened
     _files_opened += 1
     try:
@@ -198,7 +208,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
 
 
 def _reason(error: RuntimeError, path: Path) -> str:
-    """What Blender says is wrong with a file, without the file's name."""
+    """Blender's reason for an error about a file, without the name of the file."""
     text = error_line(error).removeprefix("Error: ")
     for named in (f'Loading "{path}" failed: ', f"Failed to read blend file '{path}': ", f' in file "{path}"'):
         text = text.replace(named, "")
@@ -208,8 +218,10 @@ def _reason(error: RuntimeError, path: Path) -> str:
 def prepare_scene(
     scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False, for_finished: bool = False
 ) -> LightInventory:
-    """Take the inventory, leave out what cannot be shaded and inject the sample outputs; the lights found, of which a
-    finished picture may have none."""
+    """Prepare the open scene for sample renders: returns its lights, leaves out what cannot be shaded, injects AOVs.
+
+    Raises SceneError if no light can be shaded, except `for_finished`.
+    """
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -242,7 +254,7 @@ def prepare_scene(
 
 
 def add_world(inventory: LightInventory, scene, world) -> None:
-    """Add to `inventory` what its lights emit, and the light of `world`, which was that of `scene`."""
+    """Complete `inventory` with the emission of its lights and the light of `world`, the former world of `scene`."""
     of_world = world_lights(scene, world, inventory.warn)
     inventory.lights = seen_lights(scene, inventory) + of_world
     inventory.world = world if of_world else None
@@ -251,7 +263,7 @@ def add_world(inventory: LightInventory, scene, world) -> None:
 
 
 def no_light(scene, reasons: list[str]) -> SceneError:
-    """The error of a scene in which no light can be shaded, with the first `reasons`."""
+    """The error for a scene in which no light can be shaded; it names the first of the `reasons`."""
     found = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
     text = f"found lights {listed(found, NAMED)}" if found else "found no lights at all"
     if reasons:
@@ -260,7 +272,7 @@ def no_light(scene, reasons: list[str]) -> SceneError:
 
 
 def extract(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.extract`), write EXRs into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.extract`) and write its files into `folder`; returns the manifest."""
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])
@@ -270,13 +282,13 @@ def extract(job: dict, folder: Path, progress) -> dict:
     camera = render_settings.choose_camera(scene, job["camera"])
     view_layer = render_settings.choose_view_layer(scene, warnings, job["view_layer"])
     picture, for_finished = _picture(scene, job), job["for_finished"]
-    # By the points of the pixels; those of the reference are others.
+    # The points of a pixel give the depth of field. With a reference there is none: its lens points would differ.
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
     has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
     budget, pixels = job["seconds"], picture["width"] * picture["height"]
     inventory, count = LightInventory(), 0
-    if budget is None or affordable_points(budget, pixels, 1):  # else nothing is looked at in vain
+    if budget is None or affordable_points(budget, pixels, 1):  # otherwise a look at the scene would be wasted
         with_occluders, count = job["shadows"] == "on", job["sub_samples"]
         inventory = prepare_scene(
             scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
@@ -298,13 +310,13 @@ def extract(job: dict, folder: Path, progress) -> dict:
     lens.use_dof = has_lens
     offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
-        # Where all is left to Cycles nothing is to be shaded.
+        # If all direct light is left to Cycles, no samples are needed.
         count = 0 if inventory.kept.everything else count
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
     finer = _finer(scene, job["edge_points"]) if for_finished and has_shadows and count and not has_lens else None
     with world_behind(scene, inventory.behind if job["rest"] and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if job["rest"] else ()), *job["indices"])
-        # Lights in sight are part of the rest.
+        # Lights that the camera sees are part of the rest.
         with nullcontext() if job["rest"] else without_lights(scene):
             samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
@@ -314,7 +326,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         _prepare_reference(scene, inventory)
         reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
     seconds["cycles"] = time.monotonic() - started
-    # The picture may be shown next, as the file says.
+    # A later task may save this picture as a PNG with the file's own settings.
     scene.render.film_transparent = picture["film_transparent"]
     return {
         "blender_version": bpy.app.version_string,
@@ -340,7 +352,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
 
 
 def _prepare_reference(scene, inventory: LightInventory) -> None:
-    """Let Cycles light the scene as the techniques do."""
+    """Make Cycles light the scene as the techniques do, with or without shadows."""
     if inventory.occluders is None:
         remove_occlusion(scene)
     else:
@@ -349,7 +361,7 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
 
 
 def _finer(scene, count: int) -> dict | None:
-    """What more points of a pixel take (see `gbuffer.FinerPoints`), None for a camera whose rays are not known."""
+    """The record of `gbuffer.FinerPoints` for `count` points per pixel; None if the camera's rays are not known."""
 
     def visit(depsgraph):
         return camera_rays(scene, scene.camera.evaluated_get(depsgraph).matrix_world)
@@ -367,7 +379,7 @@ def _finer(scene, count: int) -> dict | None:
 
 
 def scene_named(name: str | None):
-    """The scene `name` of the open file; None: the one it was saved with."""
+    """The scene `name` of the open file; None: the scene that was active when it was saved. Raises SceneError."""
     if name is None:
         return bpy.context.scene
     if name not in bpy.data.scenes:
@@ -377,7 +389,7 @@ def scene_named(name: str | None):
 
 
 def _picture(scene, job: dict) -> dict:
-    """Set the size; what the manifest says about the picture."""
+    """Set the size of the picture; returns its entries of the manifest."""
     width, height = render_settings.set_resolution(scene, job["width"], job["height"])
     border = render_settings.render_border(scene)
     cropped = border is not None and border.cropped

@@ -1,10 +1,13 @@
 """Lights of an evaluated scene as `AreaLight` (runs in the child).
 
-As Cycles 4.5 and 5.2 have them, measured to 2e-5. With the strength S = color * temperature color * energy *
-2^exposure, area lights have the radiance L = S / pi [/ area if normalize], one-sided along the local -Z axis; size and
-shape follow the first two columns of the world matrix. The radius of points and spots is not scaled with the object;
-the cone of a spot is. Balls and disks: L = S / (4 pi^2 r^2), S / pi without Normalize; a sun of half the angle h:
-S / (pi sin^2 h), or S.
+They are as in Cycles 4.5 and 5.2, measured to 2e-5. The strength is S = color * temperature color * energy *
+2^exposure. The radiance L follows from it:
+
+- Area lights: L = S / (pi area), or S / pi without Normalize. They emit along the local -Z axis only. The first two
+  columns of the world matrix scale their size and shape.
+- Points and spots of radius r, balls or disks: L = S / (4 pi^2 r^2), or S / pi without Normalize. The object does not
+  scale the radius, but it does scale the cone of a spot.
+- Suns of half angle h: L = S / (pi sin^2 h), or S without Normalize.
 """
 
 from __future__ import annotations
@@ -26,37 +29,38 @@ from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
 from .textures import UnseenLight, look_at_area_lights
 
-# Two axes further from a right angle than this (cosine) are called sheared.
+# SHEAR_COSINE: a transform is sheared if the cosine between two of its axes is larger.
 SHEAR_COSINE = 1e-4
-# Full angle in degrees of the narrowest beam; below, it is a line of light.
+# LEAST_SPREAD: full angle in degrees of the narrowest beam that is shaded.
 LEAST_SPREAD = 0.1
-# In m and rad: what has no size is that large. Only its solid angle times its radiance matters.
+# Size of lights that have none; only their solid angle times their radiance matters. LEAST_RADIUS: in m.
+# LEAST_ANGLE: half angle of a sun in rad.
 LEAST_RADIUS, LEAST_ANGLE = 1e-6, 2e-5
-# Suns fill at most this half angle in rad: as far as a plane in front of the eye reaches.
+# WIDEST_SUN: largest half angle of a sun in rad. Its disk is in a plane in front of the eye and cannot fill pi / 2.
 WIDEST_SUN = 1.5698
-# Of a cone without blend.
+# SHARPEST: `SpotCone.sharpness` of a cone without blend.
 SHARPEST = 1e9
 
 
 @dataclass
 class LightInventory:
-    """Lights that can be shaded, what cannot, and the names of the objects to leave out of the reference."""
+    """The lights of a scene that can be shaded, and warnings about those that cannot."""
 
     lights: list[AreaLight] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    left_out: set[str] = field(default_factory=set)
+    left_out: set[str] = field(default_factory=set)  # full names of the objects to leave out of the reference
     unseen: dict[int, UnseenLight] = field(default_factory=dict)  # by position in `lights`
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m in the file, of all positions here
-    unshaded: list[str] = field(default_factory=list)  # why materials are not shaded, as `inject_aovs` numbers them
-    world: Any = None  # that lights the scene
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m; add it for positions in the file
+    unshaded: list[str] = field(default_factory=list)  # reasons why materials are not shaded, see `inject_aovs`
+    world: Any = None  # the world that lights the scene
     behind: Any = None  # the world that is seen behind the surfaces
-    occluders: Any = None  # visibility.Occluders, where shadows are wanted
-    made_opaque: list[tuple] = field(default_factory=list)  # as `inject_aovs` leaves it
+    occluders: Any = None  # visibility.Occluders, if shadows are wanted
+    made_opaque: list[tuple] = field(default_factory=list)  # see `inject_aovs`
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
-    kept: KeptByCycles = field(default_factory=KeptByCycles)  # by Cycles, in finished pictures
+    kept: KeptByCycles = field(default_factory=KeptByCycles)  # what finished pictures leave to Cycles
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -67,20 +71,20 @@ class LightInventory:
         return frozenset(name for mesh in self.meshes for name in mesh.emitting_materials)
 
     def warn(self, message: str) -> None:
-        """Note `message` once."""
+        """Add `message` to the warnings, once."""
         if message not in self._noted:
             self._noted.add(message)
             self.warnings.append(message)
 
 
 def collect_lights(depsgraph, override=None) -> LightInventory:
-    """All lights that a render of `depsgraph` sees, instances included; `override` is what replaces all materials.
+    """All lights in a render of `depsgraph`, instances included; the material `override` replaces all others.
 
-    What `unseen` and `meshes` of the inventory emit is not known before `seen_lights` has looked at them.
+    What `unseen` and `meshes` of the inventory emit is known only after `seen_lights` has rendered them.
     """
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
     inventory = LightInventory(receivers=receivers)
-    placed, hit = [], []  # hit: by rays that leave surfaces at random
+    placed, hit = [], []  # hit: lights that random rays from surfaces can hit
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type != "LIGHT" or not instance.show_self:
@@ -105,7 +109,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             if light.affects_diffuse != light.affects_specular:
                 inventory.warn(half_hidden(light))
             _note_instancer(instance, inventory)
-    # One unusable instance takes all instances of the object along: the reference can only drop the object.
+    # If one instance is unusable, all instances of the object are left out: the reference can only drop the object.
     for name, light, unseen in placed:
         if name not in inventory.left_out:
             if unseen is not None:
@@ -124,19 +128,21 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
     return inventory
 
 
-# Pairs of overlapping lights that are named.
+# NAMED_PAIRS: how many pairs of overlapping lights a warning names.
 NAMED_PAIRS = 3
-# No more are looked for.
+# MOST_PAIRS: the search ends after this many pairs.
 MOST_PAIRS = 1000
-# Points along each side of a light that are tried for an overlap.
+# TRIED: points along each side of a light that are tested for an overlap.
 TRIED = 16
-# Lights that are compared with all others at once.
+# CHUNK: how many lights are compared with all others at once.
 CHUNK = 256
 
 
 def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLight, float]]:
-    """Lights that lie in one plane, as far as single precision tells, shine to the same side on the same objects and
-    overlap, and the share of the smaller one that lies in the other; at most MOST_PAIRS."""
+    """Pairs of overlapping lights, each with the share of the smaller light that lies in the other; at most MOST_PAIRS.
+
+    Both lights lie in one plane, up to single precision, shine to the same side and light a common object.
+    """
     if len(lights) < 2:
         return []
     axis = np.ptp([light.center for light in lights], axis=0).argmax()
@@ -149,7 +155,7 @@ def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLigh
     found = []
     for start in range(0, len(lights), CHUNK):
         part = slice(start, start + CHUNK)
-        # Those before have been compared with these.
+        # Lights before `start` have already been compared with these.
         end = np.searchsorted(center[:, axis], center[part, axis].max() + reach[part].max() + reach.max(), "right")
         other = slice(start, end)
         offset = center[None, other] - center[part, None]
@@ -169,12 +175,12 @@ def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLigh
 
 
 def _never_meet(first: AreaLight, second: AreaLight) -> bool:
-    """True for lights that light no object both."""
+    """True if no object receives light from both."""
     return None not in (first.receivers, second.receivers) and not set(first.receivers) & set(second.receivers)
 
 
 def _overlap(first: AreaLight, second: AreaLight) -> float:
-    """Share of the smaller of two lights in a plane that lies in the other one."""
+    """The share of the smaller of two lights in one plane that lies in the other."""
     small, large = sorted((first, second), key=lambda light: np.linalg.norm(light.area_vector))
     steps = (np.arange(TRIED) + 0.5) / TRIED * 2.0 - 1.0
     s, t = (values.ravel() for values in np.meshgrid(steps, steps))
@@ -186,7 +192,7 @@ def _overlap(first: AreaLight, second: AreaLight) -> float:
 
 
 def _note_overlaps(lights: list[AreaLight], inventory: LightInventory) -> None:
-    """Warn of lights of which Cycles loses some: of two hits at the same distance it takes one."""
+    """Warn of overlapping lights: Cycles takes one of two hits at the same distance, and so loses light."""
     pairs = overlapping_pairs(lights)
     if not pairs:
         return
@@ -216,9 +222,9 @@ def _note_instancer(instance, inventory: LightInventory) -> None:
 
 
 def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
-    """The lights of `inventory` with what node trees and materials make of them, which Cycles is asked for.
+    """The lights of `inventory`, with the emission of node trees and materials as Cycles renders it.
 
-    Objects that must let light through in the reference get the custom property SIDE_PROPERTY, as do their materials.
+    Objects that must let light through in the reference, and their materials, get the custom property SIDE_PROPERTY.
     """
     for block in (*bpy.data.objects, *bpy.data.materials):
         if SIDE_PROPERTY in block:
@@ -260,7 +266,7 @@ def reason_to_leave_out(ob, matrix: np.ndarray) -> str:
 
 
 def _reason_to_leave_out_point(light, matrix, lengths) -> str:
-    """As `reason_to_leave_out` of a point, spot or sun light."""
+    """As `reason_to_leave_out`, for a point, spot or sun light."""
     if light.type not in ("POINT", "SPOT", "SUN"):
         return f"{light.type} lights are not shaded"
     if light.type != "SUN" and max(np.abs(matrix[:3, 3]).max(), light.shadow_soft_size) > FARTHEST:
@@ -276,7 +282,7 @@ def _sizes(light) -> tuple[float, float]:
 
 
 def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
-    """The evaluated light `ob` at `matrix` (4, 4), without what its node tree makes of it."""
+    """The `AreaLight` of the evaluated light `ob` at `matrix` (4, 4), without regard to its node tree."""
     light = ob.data
     shared = {
         "group": traits.group,
@@ -311,7 +317,10 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
 
 
 def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None) -> UnseenLight | None:
-    """How to look at a light whose node tree is more than one white Emission node, which is the default since 5.0."""
+    """How to render the light `ob` for its node tree; None if it has none, or only one white Emission node.
+
+    That node is the default tree since 5.0.
+    """
     light = ob.data
     if tree_in_use(light) is None:
         return None
@@ -319,7 +328,7 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=Non
     if emission.plain:
         return None
     if light.type == "SUN":
-        # As Cycles has it: there is no distance.
+        # As in Cycles: a sun has no distance.
         emission.falloff = Falloff()
     for problem in what_is_lost(emission, is_light=True):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
@@ -337,7 +346,8 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=Non
         is_placed = light.type == "SUN" or emission.is_placed
         return UnseenLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
     is_ball = not light.use_soft_falloff and light.shadow_soft_size > 0.0
-    # Cycles' UV of spots goes with the direction. Disks that turn to each point shine along their normals.
+    # In Cycles the UV coordinates of a spot depend on the direction. A disk that turns to each point shines along its
+    # normal, so its emission depends on the direction, too.
     by_spot = light.type == "SPOT" and emission.by_uv
     within = bool(emission.directional) or by_spot
     axes = matrix[:3, :3]
@@ -355,7 +365,7 @@ def _instance_key(instance) -> tuple:
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
-    """Warn of what Cycles renders for this light and the techniques do not."""
+    """Warn of a negative power and of a sheared transform."""
     light, name = ob.data, ob.original.name
     if light.energy < 0.0:
         inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")
@@ -371,12 +381,12 @@ def _is_sheared(ob, matrix: np.ndarray) -> bool:
 
 
 def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:
-    """The evaluated point, spot or sun light `ob` at `matrix` (4, 4); `traits` are fields of the AreaLight."""
+    """The `AreaLight` of the evaluated point, spot or sun light `ob` at `matrix` (4, 4); `traits` are fields of it."""
     light, axis = ob.data, -matrix[:3, 2] / max(np.linalg.norm(matrix[:3, 2]), 1e-30)
     if light.type == "SUN":
         return _sun(light, ob.original.name, axis, traits)
     radius = max(light.shadow_soft_size, 0.0)
-    # Without a size it is the intensity that is given.
+    # Without a size the strength is an intensity: divide it by the area of the small disk that stands for the light.
     area = math.pi * max(radius, LEAST_RADIUS) ** 2 if radius <= LEAST_RADIUS else 1.0
     scale = 1.0 / math.pi / area
     if light.normalize:
@@ -396,7 +406,7 @@ def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:
 
 
 def strength(light) -> np.ndarray:
-    """Color times power (3,)."""
+    """The strength S (3,): color times power; see the top of this file."""
     value = np.array(light.color, dtype=np.float64) * light.energy * 2.0**light.exposure
     if light.use_temperature:
         value *= np.array(light.temperature_color, dtype=np.float64)[:3]

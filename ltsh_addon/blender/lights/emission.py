@@ -1,4 +1,4 @@
-"""What lights emit: the node tree behind a light, and a render of it where that is not enough."""
+"""What lights emit: read from the node tree of a light, or from a render of the light where that is not enough."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..materials.graph import Source, is_group, is_socket, shaders_behind, sourc
 from ..materials.values import value_at
 from ..render_settings import enable_passes
 
-# Nodes whose value is the same everywhere, as long as what they are fed is.
+# Nodes whose outputs are constant if their inputs are.
 CONSTANT_NODES = frozenset(
     "ShaderNode" + name
     for name in (
@@ -26,28 +26,30 @@ CONSTANT_NODES = frozenset(
         *("BrightContrast", "Invert", "RGBCurve", "VectorCurve", "FloatCurve", "RGBToBW", "LightFalloff"),
     )
 ) | {"FunctionNodeInputColor", "FunctionNodeInputVector", "FunctionNodeInputInt", "FunctionNodeInputBool"}
-# What values depend on, by node and output; all outputs where none is named. On where the light shines:
+# The next five tables name the outputs of nodes that depend on something; an empty tuple stands for all outputs.
+# DIRECTIONAL: on the direction in which the light leaves.
 DIRECTIONAL = {
     "ShaderNodeLayerWeight": (),
     "ShaderNodeFresnel": (),
-    "ShaderNodeTexIES": (),  # unless something is linked to its vector
+    "ShaderNodeTexIES": (),  # unless its Vector is linked
     "ShaderNodeNewGeometry": ("Incoming",),
     "ShaderNodeTexCoord": ("Reflection",),
 }
-# On the camera of the picture:
+# OF_CAMERA: on the camera of the picture.
 OF_CAMERA = {"ShaderNodeCameraData": (), "ShaderNodeTexCoord": ("Camera", "Window")}
-# On the place in the world, or on the object, not only on the place on the light:
+# PLACED: on the place in the world or on the object, and not only on the place on the light.
 PLACED = {
     **{f"ShaderNode{name}": () for name in ("NewGeometry", "ObjectInfo", "VectorTransform", "Attribute", "Bump")},
     **{f"ShaderNode{name}": () for name in ("CameraData", "Tangent", "NormalMap", "TexEnvironment", "TexSky")},
-    "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),  # and Object, where another one is named
+    "ShaderNodeTexCoord": ("Camera", "Window", "Reflection"),  # and Object, if the node names another object
 }
-# On the place on the light or its normal there; unlinked vectors of textures are such places, too.
+# BY_PLACE: on the place on the light or its normal there. So do textures whose Vector is not linked, except IES.
 BY_PLACE = {
     "ShaderNodeNewGeometry": ("Position", "Normal", "True Normal", "Parametric", "Tangent"),
     "ShaderNodeTexCoord": ("Generated", "Normal", "UV", "Object", "Reflection"),
     **{f"ShaderNode{name}": () for name in ("LayerWeight", "Fresnel", "UVMap", "Tangent", "Bump", "NormalMap")},
 }
+# BY_UV: on the UV coordinates. So do image textures whose Vector is not linked.
 BY_UV = {"ShaderNodeNewGeometry": ("Parametric",), "ShaderNodeTexCoord": ("UV",), "ShaderNodeUVMap": ()}
 LIGHT_PATH, CAMERA_RAY, IES = "ShaderNodeLightPath", "Is Camera Ray", "ShaderNodeTexIES"
 
@@ -57,18 +59,18 @@ NO_FACTOR = (
     "its emission is not a product of one Light Falloff and the rest; shaded as if Light Falloff nodes gave their "
     "Strength at any distance"
 )
-POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # of the distance, by the node's outputs
+POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # output of the Light Falloff node -> power of the distance
 
 
 @dataclass(frozen=True)
 class Falloff:
-    """What the distance multiplies the light by: as `falloff` and `smooth` of an `AreaLight`."""
+    """How the distance scales a light: the fields `falloff` and `smooth` of an `AreaLight`."""
 
     power: int = 0
     smooth: float = 0.0
 
     def times(self, other: Falloff) -> Falloff | None:
-        """The product; None where an `AreaLight` has none such."""
+        """The product of both falloffs; None where an `AreaLight` cannot express it."""
         power = self.power + other.power
         return None if power > 2 or (self.smooth and other.smooth) else Falloff(power, self.smooth + other.smooth)
 
@@ -78,15 +80,15 @@ class Emission:
     """What the nodes of a material or light emit."""
 
     emits: bool = False
-    plain: bool = False  # one Emission node, white, of strength 1
-    varies: bool = False
+    plain: bool = False  # all of it is one white Emission node of strength 1
+    varies: bool = False  # some node may give different values from place to place
     directional: set[str] = field(default_factory=set)  # labels of nodes
     of_camera: set[str] = field(default_factory=set)  # labels of nodes
-    of_path: set[str] = field(default_factory=set)  # outputs of Light Path nodes but for CAMERA_RAY
-    is_placed: bool = False  # it has to be looked at where it stands
-    by_place: bool = False
-    by_uv: bool = False
-    falloff: Falloff | None = Falloff()  # a factor of all of it; None: Light Falloff nodes do something else
+    of_path: set[str] = field(default_factory=set)  # outputs of Light Path nodes, except CAMERA_RAY
+    is_placed: bool = False  # see PLACED: it must be rendered where it stands
+    by_place: bool = False  # see BY_PLACE
+    by_uv: bool = False  # see BY_UV
+    falloff: Falloff | None = Falloff()  # it scales all of the emission; None: no common factor does
 
 
 def emission_of(data) -> Emission:
@@ -110,7 +112,7 @@ def emission_of(data) -> Emission:
 
 
 def _falloff_of(leaf) -> Falloff | None:
-    """The falloff that is a factor of what one shader node emits; None: it is none."""
+    """The falloff that scales the emission of one shader node; None where falloff is not a factor of it."""
     others = [factor.source for term in leaf.terms for factor in term]
     if "Alpha" in leaf.node.inputs:
         others.append(source_of(leaf.node.inputs["Alpha"], leaf.groups))
@@ -121,8 +123,8 @@ def _falloff_of(leaf) -> Falloff | None:
 
 
 def factors_of(source: Source) -> tuple[list[tuple], Falloff] | None:
-    """What the emitting node of `source` multiplies: inputs that do not depend on the distance, each with the groups
-    that it is in, and the falloff; None where the distance is no factor."""
+    """The factors of what the node of `source` emits: input sockets that do not depend on the distance, each as
+    (socket, groups around it), and the falloff. None where falloff is not a factor."""
     both = [_factors(socket, source.groups) for socket in emission_sockets(source.node)]
     return _joined(both)
 
@@ -153,7 +155,10 @@ def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
 
 
 def _multiplied(node, as_number: bool):
-    """The inputs whose product `node` is, None if it is none; `as_number`: a color would be made a number."""
+    """The input sockets whose product `node` gives; None if it gives no product.
+
+    `as_number`: the product goes to a number socket, which would convert a color.
+    """
     kind = node.bl_idname
     if kind == "ShaderNodeMath":
         return node.inputs[:2] if node.operation == "MULTIPLY" and not node.use_clamp else None
@@ -171,7 +176,7 @@ def _multiplied(node, as_number: bool):
 
 
 def _has_falloff(source: Source | None) -> bool:
-    """True where a Light Falloff node is among what `source` is made of."""
+    """True if a Light Falloff node is among the nodes behind `source`."""
     seen, found = set(), [source]
     while found:
         source = found.pop()
@@ -186,7 +191,7 @@ def _has_falloff(source: Source | None) -> bool:
 
 @contextmanager
 def falloff_left_out(blocks):
-    """Meanwhile the Light Falloff nodes of materials and lights give their Strength, at any distance."""
+    """Within this context the Light Falloff nodes of materials and lights give their Strength at any distance."""
     moved, smooths = [], []
     try:
         for tree in trees_of(blocks):
@@ -223,7 +228,7 @@ def trees_of(blocks) -> list:
     return found
 
 
-# What nodes are made of, beside sockets, and what of them has no say in a value.
+# PARTS: types of the settings inside a node, beside its sockets. UNSEEN: properties of nodes that change no value.
 PARTS = (
     *(bpy.types.ImageUser, bpy.types.TexMapping, bpy.types.ColorMapping),
     *(bpy.types.ColorRamp, bpy.types.ColorRampElement),
@@ -236,7 +241,7 @@ UNSEEN = (
 
 
 def nodes_as_text(data) -> str:
-    """The node trees of a material or light: another text wherever they may have another value."""
+    """The node trees of a material or light as text, which differs wherever their values may differ."""
     found = []
     for tree in trees_of([data]):
         for node in tree.nodes:
@@ -278,7 +283,7 @@ def _is_neutral(node) -> bool:
 
 
 def _note_value(source: Source | None, found: Emission, seen: set) -> None:
-    """Note in `found` what a value depends on."""
+    """Note in `found` what the value of `source` depends on."""
     if source is None or source.node is None:
         return
     key = source.node, source.socket.identifier, source.groups
@@ -308,12 +313,15 @@ def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
 
 
 def what_is_lost(emission: Emission, is_light: bool) -> list[str]:
-    """What of the emission of a light, or else a material, is not shaded as Cycles has it, but for its direction."""
+    """Warnings about emission that is not shaded as in Cycles: that of a light (`is_light`) or of a material.
+
+    They leave out a dependence on the direction.
+    """
     found = []
     if emission.of_camera:
         nodes = ", ".join(sorted(emission.of_camera))
         found.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")
-    # Cycles asks lights for what they emit with no kind of ray, and materials with different ones.
+    # Cycles evaluates the nodes of lights without a ray type ("Is ..."), those of materials with several ray types.
     paths = sorted(name for name in emission.of_path if not (is_light and name.startswith("Is ")))
     if paths:
         found.append(
@@ -327,7 +335,7 @@ def what_is_lost(emission: Emission, is_light: bool) -> list[str]:
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What Object Info nodes say of an object, but for its place."""
+    """What Object Info nodes say of an object, except for its location."""
 
     color: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     index: int = 0
@@ -335,14 +343,14 @@ class ObjectFacts:
 
     @classmethod
     def of(cls, ob, instance=None) -> ObjectFacts:
-        """Those of an object, or of an instance of it."""
+        """The facts of an object, or of an instance of it."""
         is_made = instance is not None and instance.is_instance
         random = instance.random_id if is_made else _random_id(ob.name)
         return cls(tuple(ob.color), ob.pass_index, random / 0xFFFFFFFF)
 
 
 def _random_id(name: str) -> int:
-    """The random number of an object by its name, as in Cycles: lookup3 (B. Jenkins 2006) of a sum of its letters."""
+    """Cycles' random number for an object (32 bits): the hash lookup3 (B. Jenkins 2006) of a sum over its name."""
     mask, key = 0xFFFFFFFF, 0
     for letter in np.frombuffer(name.encode(), np.int8).tolist():
         key = (37 * key + letter) & mask
@@ -357,7 +365,8 @@ def _random_id(name: str) -> int:
 
 @contextmanager
 def seen_by_surfaces(blocks, random: float):
-    """Meanwhile no ray is one of a camera for the nodes of materials and lights, and `random` is that of the object."""
+    """Within this context the nodes of materials and lights get 0 for Is Camera Ray and `random` for Object Info's
+    Random."""
     values = {LIGHT_PATH: (CAMERA_RAY, 0.0), "ShaderNodeObjectInfo": ("Random", random)}
     moved = []
     try:
@@ -379,23 +388,27 @@ def seen_by_surfaces(blocks, random: float):
             tree.nodes.remove(own)
 
 
+# PIXELS: along each side of a picture.
 PIXELS = 256
 SAMPLES_PER_PIXEL = 4
-# Pixels may be this much longer than wide (Blender's own limit is 200).
+# PIXEL_ASPECT: the largest ratio of the sides of a pixel (Blender's own limit is 200).
 PIXEL_ASPECT = 100.0
-# Only what is this close to the plane of the rectangle is seen, by its longer side.
+# CLIP: how far from the plane of a rectangle things are seen, as a share of its longer side.
 CLIP = 1e-3
 
 
 class Studio:
-    """A scene with one object and a camera that looks at it; use `open_studio`."""
+    """A scene with one object and a camera that looks at it; `open_studio` makes one."""
 
     def __init__(self, scene, camera, base):
         self.scene, self.camera, self.base = scene, camera, base
 
     @contextmanager
     def show(self, ob, matrix: np.ndarray, facts: ObjectFacts):
-        """Meanwhile `ob`, an object of no other scene, stands at `matrix` (4, 4), which may be sheared."""
+        """Within this context `ob` stands at `matrix` (4, 4), which may be sheared; afterwards `ob` is removed.
+
+        `ob` must not be in another scene.
+        """
         self.scene.collection.objects.link(ob)
         ob.parent, ob.matrix_parent_inverse = self.base, Matrix(matrix.tolist())
         ob.color, ob.pass_index = facts.color, facts.index
@@ -407,10 +420,11 @@ class Studio:
     def look(
         self, center, half_u, half_v, direction, pixels: int = PIXELS, depth: float = CLIP
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Radiance (H, W, 3) that the rectangle center +- half_u +- half_v emits toward `direction`, and where (H, W)
-        anything was seen: up to `depth` times its longer side from its plane.
+        """Radiance (H, W, 3) that the rectangle center +- half_u +- half_v emits toward `direction`, and a mask (H, W)
+        of the pixels where anything was seen.
 
-        Columns run along half_u; row 0 is at +half_v if (half_u, half_v, direction) is right-handed, else at -half_v.
+        Things are seen up to `depth` times the longer side of the rectangle from its plane. Columns run along
+        half_u. Row 0 is at +half_v if (half_u, half_v, direction) is right-handed, else at -half_v.
         """
         width, height = 2.0 * np.linalg.norm(half_u), 2.0 * np.linalg.norm(half_v)
         right = 2.0 * half_u / width
@@ -427,9 +441,11 @@ class Studio:
         return light[..., :3], light[..., 3] > 0.5
 
     def look_around(self, center, axes, angle: float, reach: float, pixels: int) -> np.ndarray:
-        """Radiance (pixels, pixels, 3) that arrives at `center` from up to `angle` rad across around forward, for the
-        `axes` (forward, right); columns run along right, row 0 is at its cross product with forward. What is farther
-        away than `reach` in m is not seen, nor what is a thousand times closer."""
+        """Radiance (pixels, pixels, 3) that arrives at `center` in a square field of view, `angle` rad wide.
+
+        `axes` are (forward, right). Columns run along right; row 0 is at cross(right, forward). Things are seen at
+        distances from `reach` / 1000 to `reach`, in m.
+        """
         forward, right = axes
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = np.stack([right, np.cross(right, forward), -forward], axis=-1), center
@@ -444,7 +460,7 @@ class Studio:
             lens.type = "ORTHO"
 
     def picture(self) -> np.ndarray:
-        """What the camera sees (H, W, 4), row 0 on top."""
+        """The camera's picture (H, W, 4), RGBA, row 0 on top."""
         with tempfile.TemporaryDirectory(prefix="ltsh-", ignore_cleanup_errors=True) as name:
             path = Path(name) / "look.exr"
             self.scene.render.filepath = str(path)
@@ -452,7 +468,7 @@ class Studio:
             return _read_pixels(path)
 
     def _fit_pixels(self, ratio: float, pixels: int) -> None:
-        """Spread about `pixels` x `pixels` over a rectangle of `ratio` width to height."""
+        """Set resolution and pixel aspect for a rectangle of `ratio` width to height, with up to `pixels` squared."""
         render = self.scene.render
         columns = rows = pixels
         if ratio > PIXEL_ASPECT:
@@ -483,7 +499,7 @@ def _read_pixels(path: Path) -> np.ndarray:
 
 @contextmanager
 def open_studio(of_scene):
-    """A `Studio` at the frame of `of_scene`; afterwards all is gone again."""
+    """A `Studio` at the frame of `of_scene`; its data is removed afterwards."""
     scene = bpy.data.scenes.new("Look at an emitter")
     lens = bpy.data.cameras.new("Look at an emitter")
     camera = bpy.data.objects.new("Look at an emitter", lens)

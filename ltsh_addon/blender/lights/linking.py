@@ -1,10 +1,10 @@
-"""Light linking: which objects a light reaches, and which are in its way (runs in the child).
+"""Light linking: which objects a light reaches, and which block it (runs in the child).
 
 Measured in 4.5.15 and 5.2.3: a light with a receiver collection reaches what the collection includes, or everything
-if it includes nothing, except what it excludes. Items that stand in the collection directly and its child collections
-have a state; all that is inside a child has the child's state. Where an object has several, the last child's counts,
-and its own before those. An instance follows its instancer where that is an
-item of any receiver collection, otherwise its own object. Blocker collections work in the same way.
+if it includes nothing, except what it excludes. Each object and each child collection directly in the collection has
+a state: included or excluded. Everything inside a child has the state of the child. If an object has several states,
+its own wins over those of children, and that of the last child over those before. An instance follows its instancer
+if that is in any receiver collection, otherwise its own object. Blocker collections work in the same way.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ def linked_objects(collection) -> LinkedObjects:
 
 
 def receiver_collection(ob):
-    """The collection that tells what the original light or mesh light `ob` reaches, or None: everything."""
+    """The receiver collection of the original light or mesh light `ob`; None: it reaches everything."""
     linking = getattr(ob, "light_linking", None)
     return None if linking is None else linking.receiver_collection
 
 
-# Lights with a bit each for what is in their way; a mask has 32 bits, of which the first is for all other lights.
+# A mask has 32 bits. OTHER_LIGHTS: the first bit, of lights without a blocker collection. MOST_BLOCKER_SETS: how many
+# blocker collections get a bit of their own.
 MOST_BLOCKER_SETS = 31
 OTHER_LIGHTS = 1
 
 
 class Blockers:
-    """Masks of lights and of what blocks them: a light is blocked by what has a bit of its mask."""
+    """Bit masks of lights and of objects: an object blocks a light if their masks have a bit in common."""
 
     def __init__(self, emitters: list, most: int = MOST_BLOCKER_SETS):
         """`emitters` are the original objects that light; at most `most` blocker collections count."""
@@ -80,7 +81,7 @@ class Blockers:
         self._named = frozenset().union(*(linked.included | linked.excluded for linked in self._sets))
 
     def mask_of(self, instance) -> int:
-        """Mask of a depsgraph instance that blocks."""
+        """The mask of a depsgraph instance as a blocker."""
         name = instance.object.original.name_full
         if instance.is_instance and instance.parent is not None and instance.parent.original.name_full in self._named:
             name = instance.parent.original.name_full
@@ -88,13 +89,13 @@ class Blockers:
 
 
 def _has_size(light) -> bool:
-    """False for points and directions, which no ray meets by chance."""
+    """False for lights of zero size, which no random ray hits."""
     size = {"POINT": "shadow_soft_size", "SPOT": "shadow_soft_size", "SUN": "angle"}.get(light.type)
     return size is None or getattr(light, size) > 0.0
 
 
 class Receivers:
-    """Numbers of the sets of objects that the same lights reach; 0 is of all that no receiver collection mentions."""
+    """Numbered sets of objects that the same lights reach; set 0 holds those that no receiver collection names."""
 
     def __init__(self, emitters: list):
         """`emitters` are the original objects that light."""
@@ -120,7 +121,7 @@ class Receivers:
         return None if collection is None else self._reached[collection.name_full]
 
     def mark(self) -> None:
-        """Write the number of its set on every object; forget what may stand there from elsewhere."""
+        """Give every mentioned object its number as RECEIVER_PROPERTY; delete that property of all other objects."""
         for ob in bpy.data.objects:
             if RECEIVER_PROPERTY in ob:
                 del ob[RECEIVER_PROPERTY]

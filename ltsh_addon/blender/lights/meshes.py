@@ -30,27 +30,27 @@ from .linking import Receivers
 
 @dataclass
 class Placement:
-    """One instance of an object that shines: evaluated mesh in world space."""
+    """One instance of an object that shines: its evaluated mesh in world space."""
 
     vertices: np.ndarray  # (N, 3)
     triangles: np.ndarray  # (T, 3) counterclockwise around the side that Cycles calls front
     slots: np.ndarray  # (T,) index of the material slot
     matrix: np.ndarray  # (4, 4)
-    mesh: object = None  # copy of the evaluated mesh, where a texture must be looked at
+    mesh: object = None  # copy of the evaluated mesh, if a texture must be rendered
     facts: ObjectFacts = ObjectFacts()
 
 
 @dataclass
 class MeshLight:
-    """An object whose materials may emit, before anybody has looked at them."""
+    """An object whose materials may emit; how much is not known yet."""
 
     ob: object  # original
-    light: AreaLight  # a stand-in with all that does not depend on the polygon
+    light: AreaLight  # a stand-in with all values that its polygons share
     materials: list  # original material or None per slot
     emission: list[Emission]  # per slot
     placements: list[Placement] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
-    is_dropped: bool = False  # it lights nothing, for it has too many faces
+    is_dropped: bool = False  # it lights nothing because it has too many faces
 
     @property
     def varies(self) -> bool:
@@ -63,15 +63,15 @@ class MeshLight:
         return [material.name_full for material, emission in pairs if emission.emits]
 
     def light_of(self, slot: int) -> AreaLight:
-        """The stand-in for what the material of a `slot` emits."""
+        """The stand-in light with the falloff of the material in `slot`."""
         falloff = self.emission[slot].falloff or Falloff()
         return replace(self.light, falloff=falloff.power, smooth=falloff.smooth)
 
 
 def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies: bool = True) -> list[MeshLight]:
-    """Objects that a render of `depsgraph` sees with materials that may emit; `override` replaces all materials.
+    """Objects in a render of `depsgraph` whose materials may emit; the material `override` replaces all others.
 
-    Without `copies` of their meshes, textures cannot be looked at, and no data is made.
+    `copies`: copy the meshes of objects with textures into new data blocks, which rendering the textures needs.
     """
     found: dict[tuple, MeshLight | None] = {}
     known: dict[str, Emission] = {}
@@ -161,22 +161,25 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     return Placement(world, triangles, slots, matrix, copy)
 
 
-# Custom property of objects that let light through in the reference: those that shine, and instancers of such. It is
-# 1 where only the front of their faces shines, -1 the back, 0 both.
+# SIDE_PROPERTY: custom property of objects that let light through in the reference: objects that shine, and surfaces
+# that instance lights. Its value is 1 if only the front of the faces shines, -1 if only the back does, 0 for both.
 SIDE_PROPERTY = "ltsh_emitting_side"
-# Of an object: what pictures and bakes take, 20,000 in about 13 s of processor time, and what the viewport takes.
+# Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
+# processor time. MOST_SHOWN: in the viewport.
 MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
-# Polygons of one object with a texture that are looked at one by one; beyond, the largest stand for all.
+# MOST_LOOKS: up to this many textured polygons of one object are rendered one by one. Of an object with more, only the
+# STAND_INS largest of each instance are rendered, and all get their mean.
 MOST_LOOKS = 256
 STAND_INS = 32
 # Fields of lights that differ from polygon to polygon.
 _PLACE = ("center", "half_u", "half_v", "direction", "corners")
+# FEW_POLYGONS: up to this many textured polygons are rendered with all PIXELS, more with a quarter along each side.
 FEW_POLYGONS = 16
 
 
 @contextmanager
 def _undisplaced(found: list[MeshLight]):
-    """Meanwhile no material moves the faces out of the camera's sight."""
+    """Within this context no material displaces faces, which could move them out of the camera's sight."""
     methods = {
         material.name_full: (material, material.displacement_method)
         for mesh_light in found
@@ -193,9 +196,9 @@ def _undisplaced(found: list[MeshLight]):
 
 
 def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
-    """The lights that the objects `found` are, seen from the camera at `eye` (3,).
+    """The area lights that stand for the objects `found`; the camera is at `eye` (3,).
 
-    Objects that shine get the custom property SIDE_PROPERTY.
+    A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
     """
     for mesh_light in found:
         _note_what_is_lost(mesh_light, warn)
@@ -229,7 +232,7 @@ def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn
 
 
 def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[AreaLight]:
-    """The lights of the objects `found` without a look at them: `radiance_of(material)` (3,) is known."""
+    """The area lights of the objects `found`, without falloff, for known radiances `radiance_of(material)` (3,)."""
     lights = []
     for mesh_light in found:
         radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
@@ -245,7 +248,7 @@ def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, w
 
 
 def mark_transparent(ob, side: int, materials: list) -> None:
-    """Give the original `ob` SIDE_PROPERTY `side`, and its `materials` one that only tells them apart from others."""
+    """Set SIDE_PROPERTY of the original `ob` to `side`, and of its `materials` to 0, which only marks them."""
     ob[SIDE_PROPERTY] = side
     for material in materials:
         if material is not None:
@@ -264,7 +267,7 @@ def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
 
 
 def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
-    """SIDE_PROPERTY of an object."""
+    """The value of SIDE_PROPERTY for an object."""
     sides = set()
     for placement in mesh_light.placements:
         vertices = placement.vertices
@@ -278,7 +281,7 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
 
 
 def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[FlatPolygon]]]:
-    """Emitting polygons of each placement, labeled by material slot."""
+    """Each placement with its emitting polygons, labeled by material slot."""
     shines = np.array([emission.varies or bool(np.any(value)) for emission, value in _slots(mesh_light, radiance)])
     parts = []
     for placement in mesh_light.placements:
@@ -314,12 +317,13 @@ def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[
 
 
 def polygon_light(stand_in: AreaLight, polygon: FlatPolygon, way: int, radiance: np.ndarray) -> AreaLight:
-    """`stand_in` as the side `way` (1 or -1 times the normal) of `polygon`, half_u along its longest edge."""
+    """`stand_in` with the shape of `polygon`, half_u along its longest edge, emitting along `way` (1 or -1) times its
+    normal."""
     return polygon_lights(stand_in, [polygon], way, radiance)[0]
 
 
 def polygon_lights(stand_in: AreaLight, polygons: list[FlatPolygon], way: int, radiance) -> list[AreaLight]:
-    """As `polygon_light`, of `polygons` with equally many corners."""
+    """As `polygon_light`, for `polygons` with equally many corners."""
     corners = np.array([polygon.corners for polygon in polygons])[:, :: 1 if way > 0 else -1]
     direction = way * np.array([polygon.normal for polygon in polygons])
     edges = np.roll(corners, -1, axis=1) - corners
@@ -340,7 +344,7 @@ def polygon_lights(stand_in: AreaLight, polygons: list[FlatPolygon], way: int, r
 
 
 def _material_radiance(studio: Studio, material, known: dict) -> np.ndarray:
-    """What `material` emits (2, 3) from the front and the back of a face, the same all over it."""
+    """Radiance (2, 3) that `material`, which does not vary, emits from the front and the back of a face."""
     if material.name_full not in known:
         mesh = bpy.data.meshes.new("Look at a material")
         mesh.from_pydata([(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [], [(0, 1, 2, 3)])
@@ -354,7 +358,7 @@ def _material_radiance(studio: Studio, material, known: dict) -> np.ndarray:
 
 @contextmanager
 def _shown(studio: Studio, mesh, matrix: np.ndarray, facts: ObjectFacts):
-    """Meanwhile `mesh` stands at `matrix`, as surfaces see it."""
+    """Within this context `mesh` stands at `matrix` in the studio and looks as it does to surfaces."""
     ob = bpy.data.objects.new("Look at a mesh", mesh)
     # Its light must not fall on itself.
     ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = ob.visible_shadow = False
@@ -402,7 +406,7 @@ def _dressed(mesh_light: MeshLight, placement: Placement):
 
 
 def _look_at_polygon(studio: Studio, light: AreaLight, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (H, W, 3) of the rectangle around `light`, and the pixels (H, W) inside its outline."""
+    """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline."""
     image, seen = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
     rows, columns = seen.shape
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
@@ -454,7 +458,8 @@ MOST_TRANSPARENT_FACES = 1024
 
 
 def let_light_through(scene) -> None:
-    """Make the faces of all objects with SIDE_PROPERTY transparent to all but camera rays, and emit from their side."""
+    """Make the faces of all objects with SIDE_PROPERTY transparent to all but camera rays; they emit from the side that
+    it names."""
     materials = {material.name_full: material for material in bpy.data.materials if SIDE_PROPERTY in material}
     for ob in bpy.data.objects:
         if SIDE_PROPERTY in ob:
@@ -481,7 +486,7 @@ def _let_through(material) -> None:
     one_sided = _mix(tree, _is_dark_side(tree), both.outputs[0], clear)
     is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
     tree.links.new(_mix(tree, is_camera_ray, one_sided, original), output.inputs["Surface"])
-    # What the file says here only changes how well Cycles samples the light.
+    # The setting in the file only affects how well Cycles samples the light.
     material.cycles.emission_sampling = "FRONT_BACK"
 
 
@@ -493,7 +498,7 @@ def _mix(tree, factor, first, second):
 
 
 def _is_dark_side(tree):
-    """A socket that is 1 on the side of a face that SIDE_PROPERTY does not name: side (2 backfacing - 1) > 0."""
+    """A socket that is 1 on the side that does not emit: SIDE_PROPERTY (2 backfacing - 1) > 0."""
     side = tree.nodes.new("ShaderNodeAttribute")
     side.attribute_type, side.attribute_name = "OBJECT", SIDE_PROPERTY
     back = tree.nodes.new("ShaderNodeNewGeometry").outputs["Backfacing"]

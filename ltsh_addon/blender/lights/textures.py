@@ -1,4 +1,4 @@
-"""Lights with textures, as patches."""
+"""Lights with node trees or textures, as patches of constant radiance, patterns of directions, or their mean."""
 
 from __future__ import annotations
 
@@ -14,27 +14,26 @@ from ...scene import AreaLight, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, ObjectFacts, Studio, falloff_left_out, seen_by_surfaces
 
-# Lights of one data block that have to be looked at where they stand: the others get what the first has.
+# MOST_LOOKS: how many lights of one data block are rendered where they stand; others get the result of the first.
 MOST_LOOKS = 100
 
 
 @dataclass(frozen=True)
 class UnseenLight:
-    """A light whose node tree has a say in its radiance."""
+    """A light whose node tree affects its radiance, which must be rendered to be known."""
 
     data: object  # the original light data block
     matrix: np.ndarray  # (4, 4) in the world
     varies: bool  # over the light's surface or by direction, as far as its nodes tell
     falloff: Falloff = Falloff()
-    is_placed: bool = False  # it has to be looked at where it stands
-    # Of points and spots: what it emits goes with the direction, as from its middle; it is to be looked at from within,
-    # or as a spot; it also goes with the place on the light.
-    by_ray: bool = False
-    within: bool = False
-    by_spot: bool = False
-    is_mixed: bool = False
+    is_placed: bool = False  # it must be rendered where it stands
+    # For points and spots:
+    by_ray: bool = False  # its emission depends on the direction of the light; see `Pattern.by_ray`
+    within: bool = False  # it must be rendered from its inside
+    by_spot: bool = False  # it must be rendered as a spot
+    is_mixed: bool = False  # its emission depends on the place on the light, too
     facts: ObjectFacts = ObjectFacts()
-    instance: tuple = ()  # tells instances of the data apart, whatever changes of them
+    instance: tuple = ()  # names the instance, whatever changes about it
 
     @property
     def flags(self) -> dict:
@@ -43,23 +42,23 @@ class UnseenLight:
 
     @property
     def key(self) -> tuple:
-        """Tells what is to be looked at apart: data, or instances of them."""
+        """A key that lights share if one render is enough for them: the data block, and the instance if `is_placed`."""
         return self.data.session_uid, *(self.instance if self.is_placed else ())
 
     @property
     def place(self) -> np.ndarray:
-        """Where it is looked at, (4, 4)."""
+        """The matrix (4, 4) at which it is rendered."""
         return self.matrix if self.is_placed else np.eye(4)
 
     @property
     def axes(self) -> np.ndarray:
-        """Axes (3, 3) of patterns of points and spots."""
+        """`Pattern.axes` (3, 3) for points and spots."""
         linear = self.matrix[:3, :3]
         return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
 
 
 def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
-    """`lights` with those at the positions `unseen` replaced by what they look like; dark ones go."""
+    """`lights` with the rendered emission of those at the positions in `unseen`; dark ones of these are left out."""
     result, seen = [], {}
     for position, light in enumerate(lights):
         if position not in unseen:
@@ -85,16 +84,17 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
 
 @dataclass(frozen=True)
 class SeenNodes:
-    """What the node tree of a light multiplies its radiance by."""
+    """The factor by which the node tree of a light multiplies its radiance."""
 
-    # (H, W, 3): of area lights columns run along half_u, row 0 is at +half_v; of points and spots by direction, as of a
-    # `Pattern`; (1, 1, 3): it is the same everywhere, as that of suns.
+    # (H, W, 3), or (1, 1, 3) where it is constant and for suns. Area lights: columns run along half_u, row 0 is at
+    # +half_v. Points and spots: rows and columns are directions, as in a `Pattern`.
     factor: np.ndarray
-    lost: float = 0.0  # how far off that is, as a share, where it goes with direction and place, or varies over a sun
+    # Relative error of the factor of emission that depends on both direction and place, or that varies over a sun.
+    lost: float = 0.0
 
 
 def seen_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
-    """What Cycles sees of the nodes of a light."""
+    """The factor of the nodes of a light, rendered by Cycles."""
     return {"AREA": _area_factor, "SUN": _sun_factor}.get(source.data.type, _point_factor)(source, studio)
 
 
@@ -110,18 +110,20 @@ def _area_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     return SeenNodes(image / (_WHITE["energy"] / np.pi))
 
 
-# Of the map of directions of a point or spot light: rows, and points along each side of the six views it is made of.
+# PATTERN_ROWS: rows of the map of directions of a point or spot light. VIEW_PIXELS: along each side of the six views
+# that the map is made from.
 PATTERN_ROWS, VIEW_PIXELS = 64, 192
-# In place of none: m, and of the distance from the origin.
+# The least radius of a point or spot light in a render. SMALL_RADIUS: in m. SMALL_SHARE: of its largest coordinate.
 SMALL_RADIUS, SMALL_SHARE = 1e-3, 1e-4
-# Colors of a pattern that differ by more, as a share of the light, are said to be lost, and whatever else is lost.
+# Relative errors above which there is a warning. PATTERN_COLORS: where a pattern has one color for all directions.
+# MOST_LOST: of `SeenNodes.lost`.
 PATTERN_COLORS = MOST_LOST = 0.05
-# Of a sun: pixels along each side, and the angles in rad that it is looked at with.
+# SUN_PIXELS: along each side of the picture of a sun. LEAST_SUN, WIDEST_SUN: limits of the angle in rad of that sun.
 SUN_PIXELS, LEAST_SUN, WIDEST_SUN = 32, 1e-3, 2.9
 
 
 def _sun_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
-    """The mean over the disk of a sun."""
+    """The mean factor over the disk of a sun."""
     angle = min(max(source.data.angle, LEAST_SUN), WIDEST_SUN)
     toward = source.matrix[:3, 2] / np.linalg.norm(source.matrix[:3, 2])
     right = np.cross(toward, np.eye(3)[np.argmin(np.abs(toward))])
@@ -135,7 +137,7 @@ def _sun_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
 
 
 def _apart(values: np.ndarray, expected: np.ndarray) -> float:
-    """How far apart two arrays are, on average, as a share of the second."""
+    """The mean absolute difference of two arrays, relative to the mean of `expected`."""
     return float(np.abs(values - expected).mean() / max(np.abs(expected).mean(), 1e-30))
 
 
@@ -145,7 +147,7 @@ def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     radius = max(data.shadow_soft_size, small)
 
     def views(within: bool, radius: float) -> list[np.ndarray]:
-        """Pictures of the six sides."""
+        """The factor (N, N, 3) on each of the six sides of a light of this `radius`, seen from outside or within."""
         kind = "SPOT" if data.type == "SPOT" and source.by_spot else "POINT"
         settings = {"shadow_soft_size": radius, "use_soft_falloff": False}
         with _standing(source, studio, settings, kind):
@@ -162,11 +164,11 @@ def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     if not source.is_mixed or radius == small:
         return SeenNodes(factor)
     if data.use_soft_falloff or source.by_spot:
-        # The mean over a disk is free of what changes its sign across the middle.
+        # Differences of opposite sign on opposite sides cancel in the mean over a disk.
         beside = _unfolded(views(within, radius), within) - factor
         across = np.roll(beside[::-1], PATTERN_ROWS, axis=1)
         return SeenNodes(factor, _apart(factor + 0.5 * (beside + across), factor))
-    # Of a ball that is seen as a whole, the mean stands for its middle.
+    # Points see a ball as a whole disk: scale the factor from the mean in the middle of that to the mean over it.
     step = (np.arange(VIEW_PIXELS) + 0.5) * (2.0 / VIEW_PIXELS) - 1.0
     disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
     whole = np.array([image[disk] for image in views(False, radius)])
@@ -182,12 +184,15 @@ _WHITE = {"color": (1.0, 1.0, 1.0), "energy": 100.0, "exposure": 0.0, "normalize
 
 @contextmanager
 def _standing(source: UnseenLight, studio: Studio, settings: dict, kind: str = ""):
-    """Meanwhile the light, or one of another `kind` with its nodes, stands at its place, white and without falloff."""
+    """Within this context a white copy of the light stands at its place, without falloff and with these `settings`.
+
+    A `kind` replaces the type of the light.
+    """
     data = source.data.copy()
     try:
         if kind and kind != data.type:
             name, data.type = data.name, kind
-            # Another type is another class.
+            # Each type of light is a class of its own in Python: fetch the data block again.
             data = bpy.data.lights[name]
         data.animation_data_clear()
         if data.type == "SPOT":
@@ -204,23 +209,22 @@ def _standing(source: UnseenLight, studio: Studio, settings: dict, kind: str = "
 
 
 def _side_axes(number: int) -> tuple[np.ndarray, np.ndarray]:
-    """The axis out of a side of a cube, and one to its right."""
+    """The outward axis of side `number` of a cube, and the axis to its right."""
     return _AXES[number // 2] * (-1.0) ** number, _AXES[(number // 2 + 1) % 3]
 
 
 def _side(studio: Studio, center, number: int, radius: float, within: bool) -> np.ndarray:
-    """A picture (N, N, 3) of a side of a ball, or from within of the one across."""
+    """A picture (N, N, 3) of side `number` of a ball from outside; `within`: of the opposite side from the inside."""
     out, right = _side_axes(number)
     if not within:
         return studio.look(center, radius * right, radius * np.cross(out, right), out, VIEW_PIXELS, 1.0)[0]
-    # Spots are not met by rays from their middle.
+    # Rays from the exact center of a spot do not hit it.
     place = center + 0.02 * radius * out
     return studio.look_around(place, (-out, right), 0.5 * np.pi, 2.0 * radius, VIEW_PIXELS)
 
 
 def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
-    """The map (H, W, 3) of directions, of pictures of the six sides; those from within show it by rays that go
-    against its normals."""
+    """The map (H, W, 3) of directions, made from pictures of the six sides; `within`: taken from the inside."""
     rows, columns = PATTERN_ROWS, 2 * PATTERN_ROWS
     polar = (np.arange(rows) + 0.5)[:, None] * (np.pi / rows)
     around = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
@@ -231,7 +235,7 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
         out, right = _side_axes(number)
         facing = normal @ out
         better = facing > highest
-        # Light that goes out along the normal is met by a ray that goes the other way.
+        # From within, light that leaves along the normal is seen by a ray in the opposite direction.
         up, depth = (np.cross(right, -out), -facing) if within else (np.cross(out, right), np.ones_like(facing))
         depth = np.where(better & (depth != 0.0), depth, 1.0)
         row, column = (
@@ -243,7 +247,7 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
 
 
 def with_pattern(light: AreaLight, found: SeenNodes, source: UnseenLight, warn) -> list[AreaLight]:
-    """A point, spot or sun with what was `found` of its nodes."""
+    """A point, spot or sun times the factor `found` of its nodes: one light, or [] if it is dark."""
     factor = found.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
     mean = (factor * weights).sum(axis=(0, 1)) / (weights.sum() * factor.shape[1])
@@ -263,7 +267,8 @@ def with_pattern(light: AreaLight, found: SeenNodes, source: UnseenLight, warn) 
 
 
 def _covered(light: AreaLight, rows: int, columns: int) -> np.ndarray:
-    """The pixels (rows, columns) on the light; those that the edge of a round one goes through are partly dark."""
+    """The mask (rows, columns) of pixels on the light; pixels on the edge of a round one are left out, being partly
+    dark."""
     if not light.is_round:
         return np.ones((rows, columns), bool)
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
@@ -280,41 +285,44 @@ def _with_factor(light: AreaLight, factor: np.ndarray, warn) -> list[AreaLight]:
     return split_light(light, patches)
 
 
-# Of one light: each costs as much as a light.
+# MOST_PATCHES: of one light in the viewport, where each patch costs as much as a light.
 MOST_PATCHES = 64
-# Points along each side at which an image is read, each the mean of SUB x SUB.
+# POINTS: along each side of the grid on which an image is read. SUB: each point is the mean of SUB x SUB.
 POINTS, SUB = 128, 2
 
 
-# Lights with nodes of which the patches are kept.
+# MOST_SEEN: how many lights with nodes have their patches kept.
 MOST_SEEN = 256
 
 
 class ShownTextures:
-    """Patches of the images and nodes of lights, kept for as long as these do not change."""
+    """A cache of the patches of lights with images or nodes, which holds as long as these do not change."""
 
     def __init__(self):
         self._patches: dict[tuple, Patches | None] = {}
         self._seen: dict[tuple, tuple[SeenNodes, Patches]] = {}
 
     def clear(self) -> None:
-        """Read all images again."""
+        """Forget the patches of images, so that the images are read again."""
         self._patches.clear()
 
     def split(self, light: AreaLight, factor: Value, notes: list[str]) -> list[AreaLight] | None:
-        """`light` times `factor` as patches, named in `notes` where they are coarse; None: not resolved."""
+        """`light` times the image `factor` as patches; None where only Cycles knows the colors of the image.
+
+        Coarse patches are reported in `notes`.
+        """
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
     def split_seen(self, light: AreaLight, found: SeenNodes, notes: list[str]) -> list[AreaLight]:
-        """As `split`, of what was `found` of its nodes."""
+        """As `split`, for the factor `found` of the nodes of the light."""
         key = id(found), light.is_round
         if key not in self._seen:
             if len(self._seen) >= MOST_SEEN:
                 self._seen.clear()
             rows, columns = found.factor.shape[:2]
             patches = cut_into_patches(found.factor, _covered(light, rows, columns), MOST_PATCHES)
-            # With what it was made of, whose number no other one gets meanwhile.
+            # `found` is kept alive, so that no other object gets its id().
             self._seen[key] = found, patches
         return _shown_patches(light, self._seen[key][1], notes)
 

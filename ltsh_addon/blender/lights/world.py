@@ -1,4 +1,4 @@
-"""The light of the world: Cycles' own pictures of it, as distant lights (runs in the child)."""
+"""The light of the world as distant lights, made from pictures of it by Cycles (runs in the child)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,16 @@ from ...scene import AreaLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
-# Pixels along each side of a picture: of a world without images, and of one with, at least and at most.
+# Pixels along each side of a picture of a world. PLAIN: a world of one color. PROCEDURAL: one without images. LEAST,
+# MOST: limits for one with images. SPOT_PIXELS: a close picture of a small, bright spot.
 PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
 SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
-# What patches differ by, on average, that is worth a warning.
+# COARSE: mean relative error of patches above which there is a warning.
 COARSE = 0.05
 MOST_RADIANCE = 1e15  # W m^-2 sr^-1
-SAMPLING_METHODS = ("NONE", "AUTOMATIC", "MANUAL")  # of a world, by their numbers
+SAMPLING_METHODS = ("NONE", "AUTOMATIC", "MANUAL")  # of a world, in the order of their numbers
 NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1
-# What Light Path nodes say of the light that surfaces see, as where Cycles samples the world.
+# Outputs of Light Path nodes where Cycles samples the world for surfaces; all others are taken as 0.
 SEEN_BY_SURFACES = {"Is Camera Ray": 0.0, "Ray Depth": 1.0}
 EVERYWHERE_THE_SAME = (
     CONSTANT_NODES
@@ -33,14 +34,14 @@ EVERYWHERE_THE_SAME = (
 
 
 def take_world(scene, view_layer, warnings: list[str]):
-    """The world that Cycles renders, or None, which `scene` has no more from then on."""
+    """The world that Cycles renders, without its volume, or None; it is removed from `scene`."""
     world = view_layer.world_override or scene.world
     view_layer.world_override = scene.world = None
     if world is None:
         return None
     if _without_volume(world):
         warnings.append(f"world {world.name!r}: its volume is not shaded; left out of the Cycles reference as well")
-    # What the file says here only changes how well Cycles samples the world.
+    # The setting in the file only affects how well Cycles samples the world.
     if world.cycles.sampling_method == "NONE":
         _store(world.cycles, "sampling_method", SAMPLED_BY_ITSELF)
     return world
@@ -48,7 +49,7 @@ def take_world(scene, view_layer, warnings: list[str]):
 
 @contextmanager
 def world_behind(scene, world):
-    """Meanwhile `scene` has the `world`, which Cycles prepares for no light."""
+    """Within this context `scene` has the `world`, which Cycles does not sample as a light."""
     if world is None:
         yield
         return
@@ -63,20 +64,20 @@ def world_behind(scene, world):
 
 
 def _store(settings, name: str, value) -> None:
-    """Set a property of Cycles past its update function, which wants the world to be that of a scene."""
+    """Set a property of Cycles without its update function, which expects the world to be that of a scene."""
     stored = settings.bl_system_properties_get(do_create=True) if bpy.app.version >= (5, 0, 0) else settings
     stored[name] = value
 
 
 def blocks_nothing(occluders, world):
-    """`occluders`, which let the light of `world` through where the file says so."""
+    """`occluders`, but blocking nothing of the light of `world` if the world's shadows are switched off."""
     if world is None or getattr(world.cycles, "use_shadows", True):
         return occluders
     return replace(occluders, light_masks={**occluders.light_masks, world.name: 0})
 
 
 def light_of_world(world) -> AreaLight | None:
-    """A side of the cube with the name and the traits of the light of `world`; None where it gives no light."""
+    """A distant light on one side of a cube with the name and traits of `world`; None if the world gives no light."""
     if not may_shine(world):
         return None
     sees = world.cycles_visibility
@@ -98,7 +99,7 @@ def light_of_world(world) -> AreaLight | None:
 
 
 def world_lights(scene, world, warn) -> list[AreaLight]:
-    """The light of `world`, which is that of `scene`, as distant lights that have its name; [] of a dark one."""
+    """The light of the `world` of `scene` as distant lights that have its name; [] if it is dark."""
     like = light_of_world(world)
     if like is None:
         return []
@@ -114,7 +115,8 @@ def world_lights(scene, world, warn) -> list[AreaLight]:
 
 
 def light_pictures(scene, world, like: AreaLight, warn) -> tuple[list[SkyPicture], list[AreaLight]]:
-    """A cube of what surfaces see of `world`, without what is small and bright; that as lights like `like`."""
+    """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
+    these."""
     with _observatory(scene, world, warn) as look:
         pixels = _pixels(world)
         pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
@@ -127,7 +129,7 @@ def light_pictures(scene, world, like: AreaLight, warn) -> tuple[list[SkyPicture
 
 
 def background_pictures(scene, world, warn) -> list[SkyPicture]:
-    """A cube of pictures of `world` as cameras see it; it is the world of `scene`."""
+    """Six pictures (a cube) of the `world` of `scene` as cameras see it."""
     with _observatory(scene, world, warn, by_cameras=True) as look:
         pixels = _pixels(world)
         pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)
@@ -135,7 +137,7 @@ def background_pictures(scene, world, warn) -> list[SkyPicture]:
 
 
 def may_shine(world) -> bool:
-    """True unless it is plain that `world`, which may be None, is dark."""
+    """False if `world` is None or plainly dark."""
     if world is None:
         return False
     if tree_in_use(world) is None:
@@ -151,7 +153,7 @@ def may_shine(world) -> bool:
 
 
 def _pixels(world) -> int:
-    """How many pixels along each side a picture of a quarter of the horizon needs."""
+    """Pixels along each side of a picture of `world` that spans a quarter of the horizon."""
     if all(is_group(node) or node.bl_idname in EVERYWHERE_THE_SAME for node in _nodes(world)):
         return PLAIN
     widths = [node.image.size[0] for node in _nodes(world) if getattr(node, "image", None) is not None]
@@ -167,7 +169,10 @@ def _nodes(world) -> list:
 
 @contextmanager
 def _observatory(scene, world, warn, by_cameras: bool = False):
-    """look(ahead, right, up, pixels, samples): a `SkyPicture` of what surfaces see of `world`, or cameras."""
+    """Yields look(ahead, right, up, pixels, samples), which returns a `SkyPicture` of `world`.
+
+    It shows the world as surfaces see it, or with `by_cameras` as cameras do.
+    """
     own = world.copy()
     groups = []
     try:
@@ -208,7 +213,7 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
 
 
 def _without_volume(world) -> bool:
-    """Take the volume out of `world`; True where there was one."""
+    """Remove the volume of `world`; True if there was one."""
     tree = tree_in_use(world)
     outputs = () if tree is None else [node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputWorld"]
     links = [link for node in outputs for link in node.inputs["Volume"].links]
@@ -218,7 +223,7 @@ def _without_volume(world) -> bool:
 
 
 def _own_groups(tree) -> list:
-    """Give `tree`, and the groups in it, copies of their groups, which are returned."""
+    """Replace all node groups in `tree`, nested ones too, by copies; returns the copies."""
     made = []
     for node in tree.nodes:
         if is_group(node) and node.node_tree is not None:
@@ -228,7 +233,7 @@ def _own_groups(tree) -> list:
 
 
 def _note_cameras(world, name: str, warn) -> None:
-    """Warn of nodes that say where a direction is in the picture."""
+    """Warn of nodes whose values depend on the camera."""
     found = set()
     for node in _nodes(world):
         outputs = OF_CAMERA.get(node.bl_idname)
@@ -243,7 +248,7 @@ def _note_cameras(world, name: str, warn) -> None:
 
 
 def _as_surfaces_see(world, name: str, warn) -> None:
-    """Let the Light Path nodes of `world` say what they say where Cycles samples the world for a surface."""
+    """Give the Light Path nodes of `world` the values that they have where Cycles samples the world for a surface."""
     unclear = set()
     for node in _nodes(world):
         if node.bl_idname != LIGHT_PATH:

@@ -1,7 +1,7 @@
-"""Materials as Cycles is made to tell what shading needs of them (in the child).
+"""Materials changed so that Cycles outputs what shading needs of them (in the child).
 
-Their trees are changed: groups get trees of their own, transparency and volumes are cut, and nodes compute the weights
-of lobes. Pictures write all quantities into AOVs, bakes show them as `maps`.
+Each node group gets a tree of its own, transparency and volumes are cut, and new nodes compute the weights of lobes.
+Pictures write all quantities into AOVs, bakes show them as `maps`.
 """
 
 from __future__ import annotations
@@ -41,42 +41,43 @@ from .graph import (
     value_of,
 )
 
-# Nodes of values that are not what Cycles makes of them, and what is said of them.
+# Nodes whose values differ from those in the Cycles reference, and the note about each.
 NOTED_NODES = {
     "ShaderNodeAmbientOcclusion": "looks once at its surroundings, which the Cycles reference leaves out",
     "ShaderNodeBevel": "is sampled once per hit, in Cycles many times",
     SCRIPT: "is Open Shading Language, which is not read: what it feeds keeps the value of its own socket",
 }
 LEFT_OUT = "left out of the Cycles reference as well"
-# Custom property of objects that tells which lights reach them: a value of `AreaLight.receivers`.
+# RECEIVER_PROPERTY: custom property of objects, a value of `AreaLight.receivers` that tells which lights reach them.
 RECEIVER_PROPERTY = "ltsh_receiver"
 
 
 @dataclass(frozen=True)
 class MaterialLobes:
-    """The lobes of one material: the leaves that have one, what each writes, and what is not as in Cycles."""
+    """The lobes of one material: the leaves that have one, the values of each, and the differences from Cycles."""
 
     leaves: tuple[Leaf, ...]
-    values: tuple[dict, ...]  # of `bsdfs.lobe_values`, and the weight
+    values: tuple[dict, ...]  # per leaf those of `bsdfs.lobe_values`, and the weight unless that is 1
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
     unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
-    # Input sockets, the socket or number that was there, and the number that makes them opaque.
+    # Of each input that was changed: its socket, the socket or number that was there, and the number that makes the
+    # surface opaque.
     made_opaque: tuple[tuple, ...] = ()
     kept: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
-    is_displaced: bool = False  # its faces are moved, but not where they cast shadows
+    is_displaced: bool = False  # its faces are displaced, but their shadows are not
 
 
 @dataclass
 class KeptByCycles:
-    """What finished pictures leave to Cycles: of materials some passes, with the reason, or all direct light."""
+    """What finished pictures leave to Cycles, and why."""
 
-    materials: list[str] = field(default_factory=list)
-    everything: list[str] = field(default_factory=list)
+    materials: list[str] = field(default_factory=list)  # materials, and their passes, with direct light by Cycles
+    everything: list[str] = field(default_factory=list)  # reasons why all direct light is left to Cycles
 
     def note(self, material, lobes: MaterialLobes) -> None:
-        """Take over what is said of the `lobes` of a material."""
+        """Add what the `lobes` of `material` leave to Cycles."""
         if lobes.has_volume:
             self.everything.append(f"the volume of material {material.name!r}")
         if lobes.kept:
@@ -87,7 +88,7 @@ class KeptByCycles:
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
-    """The lobes of `material`, at most MAX_LOBES; of the emission of an `emitter` nothing is said."""
+    """The lobes of `material`, at most MAX_LOBES; its tree is changed. An `emitter` gets no note about its emission."""
     tree = material.node_tree
     output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
     surface = output.inputs["Surface"]
@@ -112,7 +113,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
             made_opaque.append((surface, live_link(surface).from_socket, 1.0))
         _show(surface, CLEAR, 1.0)
     elif not shaders.leaves:
-        # Cycles counts AOVs twice where there is no shader; a black BSDF looks the same.
+        # Without a shader Cycles counts AOVs twice; a black BSDF looks the same.
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
@@ -122,7 +123,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
             made_opaque.append(_fixed(leaf.node.inputs["Alpha"], 1.0))
     leaves, _ = shaded_leaves(shaders)
     weight_of = _Weights().of
-    # Every weight before any value: sockets of groups that values come from stay where they are.
+    # Compute all weights before any value: the group sockets that values come from must stay where they are.
     weights = [weight_of(leaf) for leaf in leaves]
     shares = [{} if is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
     values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
@@ -145,9 +146,9 @@ def _kept_by_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
 
 
 def _fixed(target, level: float) -> tuple:
-    """Fix the number at the input `target` to `level`, 0 or 1; its entry of `MaterialLobes.made_opaque`.
+    """Fix the number at the input `target` to `level`, 0 or 1; returns its entry of `MaterialLobes.made_opaque`.
 
-    What fed it goes on doing so: Cycles reads an image otherwise where its alpha feeds nothing.
+    Its old source stays linked: Cycles reads an image differently if its alpha feeds nothing.
     """
     before = value_of(target)
     if is_socket(before):
@@ -160,7 +161,7 @@ def _fixed(target, level: float) -> tuple:
 
 
 def let_shadow_rays_through(made_opaque) -> None:
-    """Give materials their transparency back (see `MaterialLobes`), but for the rays of the camera."""
+    """Give materials their transparency back for all but camera rays; see `MaterialLobes.made_opaque`."""
     for target, before, level in made_opaque:
         tree = target.id_data
         is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
@@ -187,7 +188,7 @@ def _show(surface, node_type: str, level: float) -> None:
 
 
 def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
-    """What of a material is not shaded as Cycles does; `emitter`: it is a light. Nothing is changed."""
+    """Notes about what of a material is not shaded as in Cycles; `emitter`: it is a light. Changes nothing."""
     notes, leaves = [], shaders.leaves
     if live_link(output.inputs["Volume"]) is not None:
         notes.append(f"its volume is not shaded{'' if leaves else ', it is seen through'}; {LEFT_OUT}")
@@ -217,14 +218,14 @@ def _tinted(leaves) -> list[str]:
 
 
 def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
-    """The MAX_LOBES leaves with a lobe that have the largest weights, as far as constants tell, and those beyond."""
+    """The leaves with a lobe: the MAX_LOBES with the largest upper bounds on their weights, and the others."""
     leaves = [leaf for leaf in shaders.leaves if bsdf_of(leaf.node) is not None]
     order = sorted(range(len(leaves)), key=lambda index: -leaves[index].bound)
     return [leaves[index] for index in sorted(order[:MAX_LOBES])], [leaves[index] for index in order[MAX_LOBES:]]
 
 
 def _noted_nodes(tree) -> list:
-    """Nodes of NOTED_NODES in `tree` and its groups that feed something."""
+    """Nodes in `tree` and its groups that are in NOTED_NODES and feed something."""
     found = []
     for node in tree.nodes:
         if is_group(node) and node.node_tree is not None:
@@ -235,14 +236,14 @@ def _noted_nodes(tree) -> list:
 
 
 def _own_tree(group):
-    """The node tree of a group node, which gets one without other users."""
+    """A copy of the node tree of a `group` node, which gets it as its own; None if it has no tree."""
     if group.node_tree is not None:
         group.node_tree = group.node_tree.copy()
     return group.node_tree
 
 
 class _Weights:
-    """Computes the weights of leaves by nodes; the trees of groups must have one user each."""
+    """Computes the weights of leaves with new nodes; each group tree must have one user."""
 
     def __init__(self):
         self._known: dict = {}
@@ -283,11 +284,11 @@ def inject_aovs(
     made_opaque: list[tuple] | None = None,
     kept: KeptByCycles | None = None,
 ) -> list[str]:
-    """Make every material write its lobes into AOVs; warnings.
+    """Make every material write its lobes into AOVs; returns warnings.
 
-    Materials light nothing, but for those with a full name in `emitters`. A material that is not shaded at all writes
-    -n as the kind of its first lobe, and `unshaded` gets the reason as its n-th entry; `made_opaque` gets what
-    `let_shadow_rays_through` takes, and `kept` what a finished picture leaves to Cycles.
+    Only materials with a full name in `emitters` give light. A material that is not shaded at all writes -n as the
+    kind of its first lobe, and the n-th entry of `unshaded` is the reason. `made_opaque` gets the entries that
+    `let_shadow_rays_through` takes, and `kept` gets what a finished picture leaves to Cycles.
     """
     unshaded = [] if unshaded is None else unshaded
     made_opaque = [] if made_opaque is None else made_opaque
@@ -310,7 +311,7 @@ def inject_aovs(
             if lobes.unshaded:
                 unshaded.append(lobes.unshaded)
                 _write_aov(material.node_tree, lobe_aov("kind", 0), -len(unshaded))
-    # A slot has the same AOVs in all materials.
+    # All materials must write the same AOVs for a slot.
     for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
         users = [lobes for lobes in found if len(lobes.leaves) > slot]
         names = sorted({name for lobes in users for name in lobes.values[slot]})
@@ -322,11 +323,11 @@ def inject_aovs(
 
 
 def _write_hit(material) -> None:
-    """AOVs that a hit has once, however many lobes it has."""
+    """Write the AOVs that do not depend on the lobe."""
     tree = material.node_tree
     geometry = tree.nodes.new("ShaderNodeNewGeometry")
     receiver = tree.nodes.new("ShaderNodeAttribute")
-    # An instance belongs to its instancer's set where that has one, as in Cycles; else this reads the object's own.
+    # As in Cycles, this reads the property of the instancer if it has one, else that of the object itself.
     receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
     _write_aov(tree, "hit", 1.0)
     _write_aov(tree, "receiver", receiver.outputs["Fac"])
@@ -338,12 +339,12 @@ def _write_hit(material) -> None:
 
 
 def _bends_normals(tree):
-    """A socket of `tree` that is 1, and 0 on hair, where Cycles never bends specular normals."""
+    """A socket of `tree` that is 1, except on hair, where it is 0: Cycles bends no specular normals there."""
     return computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
 
 
 def _write_aov(tree, name: str, value) -> None:
-    """A node in `tree` that writes `value`, a socket of it, a number or a color, into the AOV `name`."""
+    """Add a node to `tree` that writes `value`, a socket of the tree, a number or a color, into the AOV `name`."""
     node = tree.nodes.new("ShaderNodeOutputAOV")
     node.aov_name = AOV_PREFIX + name
     target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
@@ -356,7 +357,7 @@ def _write_aov(tree, name: str, value) -> None:
 
 
 def declare_aovs(view_layer) -> None:
-    """Add a pass to `view_layer` for every AOV that some material writes, and all that belong to a hit."""
+    """Add a pass to `view_layer` for every AOV that some material writes, and for all of HIT_AOVS."""
     trees = [material.node_tree for material in bpy.data.materials if material.node_tree] + list(bpy.data.node_groups)
     written = {
         node.aov_name.removeprefix(AOV_PREFIX)
@@ -371,13 +372,13 @@ def declare_aovs(view_layer) -> None:
 
 
 def remove_aovs(view_layer) -> None:
-    """Take the passes of `declare_aovs` out again."""
+    """Remove the passes of `declare_aovs`."""
     for aov in [aov for aov in view_layer.aovs if aov.name.startswith(AOV_PREFIX)]:
         view_layer.aovs.remove(aov)
 
 
 def materials_in_use(surfaces: list, override=None) -> list:
-    """Original materials of the evaluated objects `surfaces`, each once; only `override` where one is set."""
+    """Original materials of the evaluated objects `surfaces`, each once; only `override` if it is given."""
     if override is not None:
         return [override.original]
     found = {}
@@ -399,7 +400,7 @@ def objects_without_material(surfaces: list) -> list:
 
 
 def give_default_material(objects: list):
-    """Put a material that looks like Cycles' default surface where none is assigned; the material, or None."""
+    """Assign a material that looks like Cycles' default surface to all empty slots; returns it, or None if unused."""
     if not objects:
         return None
     material = bpy.data.materials.new("Default surface")

@@ -1,6 +1,6 @@
-"""The table of BSDF nodes: what each is shaded as and what is said of it, and what nodes emit.
+"""The table of BSDF nodes: how each is shaded and the notes about it; and which nodes emit.
 
-Whatever reads materials asks `bsdf_of` for the row of a node; a node without a row has no lobe.
+All readers of materials get the row of a node from `bsdf_of`; a node without a row has no lobe.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 SUBSURFACE = "ShaderNodeSubsurfaceScattering"
-# Without a row: it reflects nothing, and pictures show no light that goes through.
+# REFRACTION_NODE has no row: it reflects nothing, and pictures do not show transmitted light.
 REFRACTION_NODE = "ShaderNodeBsdfRefraction"
 NOT_SUPPORTED = "is not supported, it is not shaded"
-# Node -> the property that chooses among its rows.
+# Node -> the property that selects one of its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}
 
 
 @dataclass(frozen=True)
 class Bsdf:
-    """What a BSDF node is shaded as."""
+    """How a BSDF node is shaded."""
 
     kind: str  # of cycles.lobes.LOBE_KINDS
-    sockets: dict[str, str]  # names by quantity of LOBE_AOVS
-    nearest: str = ""  # what is said of the node itself where its kind is not quite that
-    # Socket -> (value at which it changes nothing, what is done); sockets absent in a version are skipped.
+    sockets: dict[str, str]  # quantity of LOBE_AOVS -> name of the input socket
+    nearest: str = ""  # the note about a node that is not exactly of this kind
+    # Socket -> (value at which it changes nothing, the note otherwise). A version of Blender may lack some sockets.
     not_shaded: dict[str, tuple[float, str]] = field(default_factory=dict)
-    # By the node's distribution.
-    roughness_factor: float = 1.0  # of the GGX lobe that comes nearest
+    # These two depend on the node's distribution:
+    roughness_factor: float = 1.0  # scales the roughness to that of the nearest GGX lobe
     is_scattered: bool = False  # multiple scattering adds to the lobe
 
 
@@ -80,13 +80,13 @@ BSDFS = {
     (SHEEN, "ASHIKHMIN"): Bsdf(
         "velvet", {**COLOR, **ROUGHNESS}, "is in the diffuse pass, in Cycles its Ashikhmin sheen is specular"
     ),
-    # The other component is a glossy lobe in Cycles' passes, which no diffuse one stands for.
+    # The other component is in Cycles' glossy pass, where no diffuse lobe can replace it.
     (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo, 27 to 72 % off"),
     (SUBSURFACE, ""): Bsdf("diffuse", COLOR, AS_DIFFUSE),
 }
-# Distribution -> alpha of the GGX lobe that comes nearest, in units of its own: half the error of the same alpha.
+# Distribution -> alpha of the nearest GGX lobe, relative to the node's alpha; it has half the error of the same alpha.
 NEAREST_ALPHA = {"BECKMANN": 0.75, "ASHIKHMIN_SHIRLEY": 0.9}
-# What that is off, of the light of a ball and a floor under two area lights (root mean square).
+# The error of that lobe (root mean square), relative to the light of a ball and a floor under two area lights.
 NEAREST_ERROR = {
     "BECKMANN": "5 % off at roughness 0.2, 11 % at 0.5, 28 % at 1",
     "ASHIKHMIN_SHIRLEY": "5 % off at roughness 0.2, 9 % at 0.5, 83 % at 1",
@@ -94,7 +94,7 @@ NEAREST_ERROR = {
 
 
 def bsdf_of(node) -> Bsdf | None:
-    """The row of a shader node, with what its distribution adds; None where it is not shaded."""
+    """The row of a shader node, completed by its distribution; None if the node is not shaded."""
     kind, distribution = node.bl_idname, getattr(node, "distribution", "")
     row = BSDFS.get((kind, getattr(node, VARIANTS[kind]) if kind in VARIANTS else ""))
     if row is None:
@@ -104,9 +104,9 @@ def bsdf_of(node) -> Bsdf | None:
 
 
 def lobe_values(node) -> dict:
-    """What the BSDF `node` writes: AOV of `LOBE_AOVS` -> value of `graph.value_of`; {} without a lobe.
+    """The values of the BSDF `node`: AOV of `LOBE_AOVS` -> constant or socket, as `graph.value_of`; {} without a lobe.
 
-    Quantities that change nothing are left out.
+    Neutral values are left out.
     """
     bsdf = bsdf_of(node)
     if bsdf is None:
@@ -135,7 +135,7 @@ def _is_neutral(name, value) -> bool:
 
 
 def _add_tangent(node, values) -> None:
-    """Add the tangent of an anisotropic node; without anisotropy leave out what belongs to it."""
+    """Add the tangent of an anisotropic node; remove the rotation if the anisotropy is 0."""
     if _is_neutral("anisotropy", values["anisotropy"]):
         del values["rotation"]
         return
@@ -147,7 +147,7 @@ def _add_tangent(node, values) -> None:
 
 
 def _drop_absent_layers(node, values) -> None:
-    """Leave layers out whose weight is 0. An unlinked Coat Normal is the smooth normal, not that of the base."""
+    """Remove layers whose weight is 0. An unlinked Coat Normal is removed, too: it is the smooth normal."""
     for layer in ("coat", "sheen"):
         if _is_neutral(f"{layer}_weight", values[f"{layer}_weight"]):
             for name in [name for name in values if name.startswith(f"{layer}_")]:
@@ -159,13 +159,13 @@ def _drop_absent_layers(node, values) -> None:
 
 
 def emission_sockets(node) -> tuple:
-    """Inputs of color and strength of a node that may shine, () for all others."""
+    """The inputs (color, strength) of the emission of a node; () for nodes that cannot emit."""
     prefix = {EMISSION: "", PRINCIPLED: "Emission "}.get(node.bl_idname)
     return () if prefix is None else (node.inputs[f"{prefix}Color"], node.inputs[f"{prefix}Strength"])
 
 
 def emits(node) -> bool:
-    """True for nodes that may shine into the scene."""
+    """True for nodes that may emit: neither color nor strength is a constant 0."""
     sockets = emission_sockets(node)
     if not sockets:
         return False
@@ -174,12 +174,12 @@ def emits(node) -> bool:
 
 
 def is_emission(node) -> bool:
-    """True for nodes that do nothing but shine, as a color does that is linked to a shader socket."""
+    """True for nodes that only emit: Emission nodes, and nodes without a shader output, such as a color."""
     return node.bl_idname == EMISSION or all(socket.type != "SHADER" for socket in node.outputs)
 
 
 def notes_of(node) -> list[str]:
-    """How the shading of a node differs from that of Cycles: what it is shaded as, and which parts are left out."""
+    """Notes about how the shading of a node differs from Cycles: what replaces it, and which parts are left out."""
     bsdf = bsdf_of(node)
     if bsdf is None:
         return [f"node {node.name!r} {NOT_SUPPORTED}"]
@@ -195,7 +195,7 @@ def notes_of(node) -> list[str]:
     return notes
 
 
-# Where a node is not what Cycles makes of it, its specular reflection is not, unless something else stands here.
+# DIFFERENT_PASSES: node or socket -> the passes that differ from Cycles if it has a note. Others: specular alone.
 BOTH, DIFFUSE_ALONE, NEITHER = frozenset(("specular", "diffuse")), frozenset(("diffuse",)), frozenset()
 DIFFERENT_PASSES = {
     GLASS: NEITHER, SUBSURFACE: DIFFUSE_ALONE, SHEEN: BOTH, TOON: BOTH,
@@ -204,7 +204,7 @@ DIFFERENT_PASSES = {
 
 
 def passes_of_cycles(node) -> frozenset[str]:
-    """The passes in which direct light on the shader `node` is not what Cycles makes of it."""
+    """The passes in which direct light on the shader `node` differs from Cycles."""
     bsdf = bsdf_of(node)
     if bsdf is None or has_alpha(node):
         return BOTH

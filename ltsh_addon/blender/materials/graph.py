@@ -1,7 +1,7 @@
-"""Node trees: the one walk from a surface to its BSDF nodes, what feeds a socket, and edits of trees.
+"""Node trees: the walk from a surface to its BSDF nodes, the sources of sockets, and edits of trees.
 
-All readers of materials use this walk: AOVs and bakes (`aovs`), the viewport (`looks`), the emission of lights, and
-the overview in the panels. It changes nothing.
+All readers of materials share this walk, which changes nothing: AOVs and bakes (`aovs`), the viewport (`looks`), the
+emission of lights, and the overview in the panels.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GROUP_SOCKET_NAME = "ltsh"
 
 
 def live_link(socket):
-    """The link that feeds the input `socket`, or None. No values are read from Open Shading Language."""
+    """The link that feeds the input `socket`, or None. Values from Open Shading Language do not count."""
     for link in socket.links:
         is_script = link.from_node.bl_idname == SCRIPT and not link.from_node.mute and socket.type != "SHADER"
         if not link.is_muted and link.is_valid and not is_script:
@@ -31,7 +31,7 @@ def live_link(socket):
 
 
 def value_of(socket):
-    """The socket that feeds the input `socket`, or its own value: a number or a tuple."""
+    """The socket that feeds the input `socket`; the input's own value, a number or a tuple, if it is not linked."""
     link = live_link(socket)
     if link is not None:
         return link.from_socket
@@ -40,12 +40,12 @@ def value_of(socket):
 
 
 def is_socket(value) -> bool:
-    """True for what nodes compute, False for constants."""
+    """True for a socket, whose value nodes compute; False for a constant."""
     return isinstance(value, bpy.types.NodeSocket)
 
 
 def is_constant(value, expected) -> bool:
-    """True where `value` (of `value_of`) is the constant `expected`, a number or the first components of a tuple."""
+    """True if `value` (of `value_of`) is the constant `expected`: a number, or the first components of a tuple."""
     if is_socket(value):
         return False
     found = value if isinstance(value, tuple) else (value,)
@@ -59,12 +59,12 @@ def material_output(tree):
 
 
 def tree_in_use(data):
-    """The node tree of a material, world or light, None where its own settings count."""
+    """The node tree of a material, world or light; None if it does not use nodes."""
     return data.node_tree if bpy.app.version >= (5, 0, 0) or data.use_nodes else None
 
 
 def surface_of(data):
-    """The input Surface of the output of a material, world or light, None without nodes or output."""
+    """The Surface socket of the output node of a material, world or light; None without nodes or output."""
     tree = tree_in_use(data)
     output = material_output(tree) if tree is not None else None
     return None if output is None else output.inputs["Surface"]
@@ -84,25 +84,25 @@ def socket_named(sockets, identifier: str):
 
 
 def passed_through(node, output):
-    """The input socket that a muted `node` hands on to its `output`, or None."""
+    """The input socket that a muted `node` passes on to its `output`, or None."""
     return next((link.from_socket for link in node.internal_links if link.to_socket == output), None)
 
 
 def is_group(node) -> bool:
-    """True for nodes that hold a node tree, or could: groups of Blender and of add-ons."""
+    """True for group nodes, of Blender or of add-ons, even if they have no tree."""
     return node.bl_idname == "ShaderNodeGroup" or hasattr(node, "node_tree")
 
 
 @dataclass(frozen=True)
 class Source:
-    """An output of a node, or an unlinked input (`node` None) whose own value counts."""
+    """Where a value comes from: an output of a node, or an unlinked input (`node` is None)."""
 
     socket: Any
     node: Any
-    groups: tuple = ()  # the group nodes that it is in, from the material inwards
+    groups: tuple = ()  # the group nodes around it, outermost first
 
     def input(self, name) -> Source | None:
-        """What feeds the input `name` (or position) of the node."""
+        """The source of the input `name` (or position) of the node."""
         return source_of(self.node.inputs[name], self.groups)
 
 
@@ -110,15 +110,15 @@ NODE_TREE = operator.attrgetter("node_tree")
 
 
 def source_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> Source | None:
-    """What feeds the input `socket` inside of `groups`; None where a group has no inside or no outside."""
+    """The source of the input `socket`, which is inside `groups`; None where a group lacks its tree or its outside."""
     link = live_link(socket)
     return Source(socket, None, groups) if link is None else source_behind(link.from_socket, groups, tree_of)
 
 
 def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> Source | None:
-    """What the `output` of a node comes from, past groups, reroutes and muted nodes; None as in `source_of`.
+    """The source of the `output` of a node, past groups, reroutes and muted nodes; None as in `source_of`.
 
-    `tree_of(group node)` is the node tree of a group that is entered.
+    `tree_of(group node)` returns the node tree of a group.
     """
     node, entry = output.node, None
     if node.mute:
@@ -141,7 +141,7 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
 
 
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:
-    """The number at the input `socket` inside of `groups`; None where nodes compute it. `tree_of` as there."""
+    """The constant at the input `socket` inside `groups`; None if nodes compute it. `tree_of`: see `source_behind`."""
     source = source_of(socket, groups, tree_of)
     if source is None or (source.node is not None and source.node.bl_idname != "ShaderNodeValue"):
         return None
@@ -151,21 +151,21 @@ def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> fl
 
 @dataclass(frozen=True)
 class Factor:
-    """What a Mix Shader node multiplies one of its shaders by: its factor, clamped to [0, 1], or 1 minus that."""
+    """The weight that a Mix Shader node gives to one of its shaders: its factor, clamped to [0, 1], or 1 minus that."""
 
     node: Any
     groups: tuple
     is_complement: bool
-    beside_transparency: bool  # the other shader is transparency, which is cut: only emission is less by this factor
+    beside_transparency: bool  # the other shader is transparency, which is cut: the factor scales only emission
 
     @property
     def source(self) -> Source | None:
-        """What feeds the factor of the node."""
+        """The source of the factor of the node."""
         return source_of(self.node.inputs[0], self.groups)
 
     @property
     def constant(self) -> float | None:
-        """Its value, None where nodes compute it."""
+        """The constant value of the weight; None if nodes compute it."""
         value = value_of(self.node.inputs[0])
         if is_socket(value):
             return None
@@ -175,7 +175,7 @@ class Factor:
 
 @dataclass(frozen=True)
 class Leaf:
-    """A shader node that is neither mix nor sum; its weight is the sum over `terms` of the products of factors."""
+    """A shader node that is neither mix nor sum. Its weight is the sum over `terms` of the product of their factors."""
 
     source: Source
     terms: tuple[tuple[Factor, ...], ...]  # outermost factor first
@@ -187,7 +187,7 @@ class Leaf:
 
     @property
     def groups(self) -> tuple:
-        """The group nodes that it is in."""
+        """The group nodes around it, outermost first."""
         return self.source.groups
 
     @property
@@ -200,32 +200,32 @@ class Leaf:
 
     @property
     def lobe_terms(self) -> tuple[tuple[Factor, ...], ...]:
-        """The terms of its lobes, for which transparency is cut."""
+        """The terms of the weight of its lobes, without the factors beside transparency."""
         return tuple(tuple(factor for factor in term if not factor.beside_transparency) for term in self.terms)
 
     @property
     def bound(self) -> float:
-        """No weight of its lobes is larger, as far as constants tell."""
+        """An upper bound on the weight of its lobes, from the constant factors."""
         terms = ([factor.constant for factor in term] for term in self.lobe_terms)
         return sum(math.prod(value for value in term if value is not None) for term in terms)
 
 
 @dataclass(frozen=True)
 class Cut:
-    """A mix or sum of which one shader is nothing but transparency; surfaces are opaque, so it is left out."""
+    """A mix or sum with one shader that is only transparency, which is left out to make the surface opaque."""
 
     node: Any
     clear: Any  # the input socket of the transparency
-    other: Any  # the other one
+    other: Any  # the other input socket
 
 
 @dataclass
 class SurfaceShaders:
-    """The shader nodes behind a socket, in the order in which they are linked, and the transparency that is cut."""
+    """The shader nodes behind a socket, in the order of the links, and the transparency that is cut."""
 
     leaves: list[Leaf] = field(default_factory=list)
     cuts: list[Cut] = field(default_factory=list)
-    is_transparent: bool = False  # there is nothing but transparency
+    is_transparent: bool = False  # all of it is transparency
 
     def _add(self, other: SurfaceShaders, *factors: Factor) -> None:
         places = {(leaf.node, leaf.groups): place for place, leaf in enumerate(self.leaves)}
@@ -242,8 +242,9 @@ class SurfaceShaders:
 def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> SurfaceShaders:
     """The shader nodes behind the input `socket`, with their weights.
 
-    A node that is reached twice is one leaf. A mix by a constant 0 or 1 is the one shader, a sum with an open input the
-    other. Transparency beside another shader is cut. `tree_of` as in `source_behind`.
+    A node that is reached twice is one leaf. A mix by a constant 0 or 1 counts as the shader that it shows, and a sum
+    with one linked input as the shader at that input. Transparency beside another shader is cut. `tree_of`: see
+    `source_behind`.
     """
     source = source_of(socket, groups, tree_of)
     if source is None or source.node is None:
@@ -278,20 +279,20 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
 
 
 def is_seen_through(output, shaders: SurfaceShaders) -> bool:
-    """True for materials whose surface does nothing; `shaders` are those at the Surface of the material's `output`."""
+    """True if rays pass through the surface; `shaders` are those at the Surface of the material's `output`."""
     if shaders.leaves:
         return all(leaf.is_transparent and leaf.node.bl_idname != HOLDOUT for leaf in shaders.leaves)
     return live_link(output.inputs["Volume"]) is not None
 
 
 def cut(socket) -> None:
-    """Take away what feeds the input `socket`."""
+    """Remove all links to the input `socket`."""
     for link in list(socket.links):
         socket.id_data.links.remove(link)
 
 
 def computed(operation: str, *values, clamp: bool = False):
-    """The result of a new Math node for numbers and sockets, at least one, of the same tree."""
+    """The output of a new Math node; `values` are numbers and at least one socket, all of one tree."""
     tree = next(value for value in values if is_socket(value)).id_data
     node = tree.nodes.new("ShaderNodeMath")
     node.operation, node.use_clamp = operation, clamp
@@ -304,7 +305,7 @@ def computed(operation: str, *values, clamp: bool = False):
 
 
 def product(first, second):
-    """first * second, of numbers and sockets of the same tree."""
+    """first * second, for numbers or sockets of the same tree."""
     if not is_socket(first) and not is_socket(second):
         return first * second
     for constant, other in ((first, second), (second, first)):
@@ -314,20 +315,20 @@ def product(first, second):
 
 
 def total(first, second):
-    """first + second, of numbers and sockets of the same tree."""
+    """first + second, for numbers or sockets of the same tree."""
     if not is_socket(first) and not is_socket(second):
         return first + second
     return computed("ADD", first, second)
 
 
 def mix_weights(node):
-    """Weights of both shaders of a Mix Shader `node` whose factor nodes compute; Cycles clamps it."""
+    """Sockets with the weights of both shaders of a Mix Shader `node` with a linked factor, clamped as in Cycles."""
     clamped = computed("ADD", value_of(node.inputs[0]), 0.0, clamp=True)
     return computed("SUBTRACT", 1.0, clamped), clamped
 
 
 def carry_into_group(group, value):
-    """The same number inside the node `group`, whose node tree has no other user."""
+    """`value`, from outside the node `group`, as a number or socket inside it; its tree must have no other user."""
     if not is_socket(value):
         return value
     inner = group.node_tree
@@ -337,7 +338,7 @@ def carry_into_group(group, value):
 
 
 def carry_out_of_group(group, value):
-    """The same value outside the node `group`, computed in its node tree, which has no other user."""
+    """`value`, from inside the node `group`, as a constant or socket outside it; its tree must have no other user."""
     if not is_socket(value):
         return value
     inner, end = group.node_tree, group_output(group.node_tree)
@@ -351,7 +352,7 @@ def carry_out_of_group(group, value):
 
 
 def ensure_nodes(material) -> None:
-    """Give a material without nodes (possible up to 4.5) the tree that Cycles renders in its place."""
+    """Give a material without nodes (possible up to 4.5) the tree that Cycles renders for it."""
     if bpy.app.version >= (5, 0, 0) or (material.use_nodes and material.node_tree):
         return
     color = tuple(material.diffuse_color)

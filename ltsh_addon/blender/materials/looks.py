@@ -26,34 +26,35 @@ from .values import ImageUse, Value, constant, constant_inputs, input_value, val
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
+# NEUTRAL: the value of each quantity of a `Look` that is left out.
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
            "transmission": 0.0, "weight": 1.0, "diffuse_roughness": 0.0}  # fmt: skip
-# Those whose diffuse part may be rough.
+# ROUGH_KINDS: kinds whose diffuse part may be rough.
 ROUGH_KINDS = ("principled", "diffuse")
-# The kind of a lobe that is the coat of another one; all others are those of `cycles.lobes.LOBE_KINDS`.
+# Two kinds beside those of `cycles.lobes.LOBE_KINDS`. COAT: the coat of another lobe. REFRACTION: lobes that only let
+# light through.
 COAT = "coat"
-# The kind of nodes that only let light through.
 REFRACTION = "refraction"
 
 
 @dataclass(frozen=True)
 class Coat:
-    """What covers the lobe of a Principled BSDF: all constants."""
+    """The coat over the lobe of a Principled BSDF; all values are constant."""
 
     weight: float
     roughness: float
     ior: float
     tint: np.ndarray  # (3,)
-    follows_normal: bool  # has the normal map of the lobe; else no one
+    follows_normal: bool  # it has the normal map of the lobe; otherwise none
 
 
 @dataclass(frozen=True)
 class ViewFactor:
-    """What the nodes Fresnel and Layer Weight say of the cosine c between the view and the smooth normal."""
+    """The output of a Fresnel or Layer Weight node, by the cosine c between the view and the smooth normal."""
 
-    kind: str  # "fresnel": of a dielectric; "facing": 1 - c^parameter
-    parameter: float  # "fresnel": the index of refraction
-    is_complement: bool = False  # 1 minus that
+    kind: str  # "fresnel": reflectance of a dielectric; "facing": 1 - c^parameter
+    parameter: float  # of "fresnel": the index of refraction
+    is_complement: bool = False  # the factor is 1 minus the output
 
     @classmethod
     def of(cls, kind: str, parameter: float, is_blend: bool = False) -> ViewFactor:
@@ -72,7 +73,7 @@ class ViewFactor:
 
 @dataclass(frozen=True)
 class Brush:
-    """How an anisotropic lobe lies."""
+    """The shape and direction of an anisotropic lobe."""
 
     aspect: float  # see `cycles.lobes.aspect_of`
     rotation: float  # of the tangent, in turns
@@ -82,7 +83,7 @@ class Brush:
 
 @dataclass(frozen=True)
 class Look:
-    """One lobe of a material in the viewport; the first one has all that is not a lobe, and the others."""
+    """One lobe of a material in the viewport. The first lobe also holds the other lobes, emission and notes."""
 
     kind: str  # of `cycles.lobes.LOBE_KINDS`, COAT or REFRACTION
     values: dict[str, Value]  # by the names of NEUTRAL
@@ -91,16 +92,17 @@ class Look:
     scattered: bool = False  # Multiscatter GGX
     corrected: bool = True  # Cycles bends specular normals toward the eye
     weight: float = 1.0
-    view_factor: ViewFactor | None = None  # times the weight
-    coat: Coat | None = None  # over it; of the kind COAT itself
+    view_factor: ViewFactor | None = None  # multiplies the weight
+    coat: Coat | None = None  # the coat over this lobe; for the kind COAT the coat that it is
     brush: Brush | None = None  # None: isotropic
-    sheen: tuple[float, float] | None = None  # over it and its coat: the largest weight of a color, and its roughness
+    # Sheen over the lobe and its coat: its largest weight over the colors, and its roughness.
+    sheen: tuple[float, float] | None = None
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    glow: float = 0.0  # strength of a material that only shines, with the image of its color
+    glow: float = 0.0  # strength of a material that only emits, by the image of its color
     notes: tuple[str, ...] = ()
     further: tuple[Look, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
-    is_stand_in: bool = False  # of a node that is not shaded
+    is_stand_in: bool = False  # it stands for a node that is not shaded
 
     @property
     def lobes(self) -> tuple[Look, ...]:
@@ -108,30 +110,30 @@ class Look:
         return (self, *self.further)
 
     def value(self, name: str) -> Value:
-        """The quantity `name`, or what changes nothing."""
+        """The quantity `name`, or its neutral value."""
         return self.values.get(name) or constant(NEUTRAL[name])
 
     @property
     def through(self) -> float:
-        """The share of the lobe, metal left out, through which one sees what is behind it."""
+        """The share of the lobe, apart from metal, that lets the view through."""
         if self.kind in ("glass", REFRACTION):
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
 
     @property
     def is_bent(self) -> bool:
-        """May its index of refraction be below 1, where light is totally reflected?"""
+        """True if its index of refraction may be below 1, which allows total reflection."""
         ior = self.value("ior")
         return self.kind == "glass" or not (ior.is_constant and ior.offset[0] >= 1.0)
 
     @property
     def is_rough(self) -> bool:
-        """Is its diffuse part rough?"""
+        """True if its diffuse part is rough."""
         return self.kind in ROUGH_KINDS and self.value("diffuse_roughness").offset[0] > 0.0
 
     @property
     def images(self) -> dict[str, ImageUse]:
-        """Images by slot of IMAGE_SLOTS."""
+        """Its images, by slot of IMAGE_SLOTS."""
         found = {name: value.image for name, value in self.values.items() if name in IMAGE_SLOTS and value.image}
         return {**found, "normal": self.normal.image} if self.normal is not None else found
 
@@ -142,12 +144,12 @@ class Look:
 
     @property
     def has_uv_tangent(self) -> bool:
-        """Does it need tangents along its UV map?"""
+        """True if it needs tangents along its UV map."""
         return self.normal is not None or (self.brush is not None and not self.brush.direction)
 
 
 def is_missing(image) -> bool:
-    """True for images without pixels: their file is not there, or cannot be read."""
+    """True for images without pixels: their file is missing or unreadable."""
     return not all(image.size)
 
 
@@ -157,17 +159,17 @@ def plain_look(color) -> Look:
 
 
 def default_look() -> Look:
-    """What Cycles shows where no material is assigned: gray, with a Principled BSDF's defaults from 5.0 on."""
+    """The look of a surface without material in Cycles: gray, from 5.0 on with the defaults of a Principled BSDF."""
     if bpy.app.version < (5, 0, 0):
         return plain_look(0.8)
     return Look("principled", {"color": constant(0.8), "roughness": constant(0.5)})
 
 
-# Quantity of `cycles.lobes.LOBE_AOVS` -> viewport setting of the material that stands in for it.
+# Quantity of `cycles.lobes.LOBE_AOVS` -> viewport setting of the material that replaces an unknown value.
 STAND_INS = {"color": "diffuse_color", "roughness": "roughness", "metallic": "metallic"}
-# Nodes whose value depends on the view; the outputs of the second have the names of kinds of `ViewFactor`.
+# Nodes whose value depends on the view. The outputs of Layer Weight have the names of the kinds of `ViewFactor`.
 VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
-# Each costs as much as the first.
+# MOST_LOBES: of one material; each costs the same.
 MOST_LOBES = 8
 
 
@@ -189,25 +191,25 @@ def look_of(material) -> Look:
 
 @dataclass(frozen=True)
 class Share:
-    """The share of a node in a material: a product of which one factor may come from an image, one from the view."""
+    """The share of a node in a material: a constant, perhaps times an image, perhaps times a function of the view."""
 
     constant: float = 1.0
     image: Value | None = None
     curve: ViewFactor | None = None
-    shining: float = 1.0  # about which share of its emission is seen, on average and behind transparency
+    shining: float = 1.0  # the approximate mean share of its emission, which transparency reduces, too
 
     @property
     def estimate(self) -> float:
-        """About how much it is on average."""
+        """A rough estimate of its mean: images and functions of the view count as one half."""
         return self.constant * 0.5 ** ((self.image is not None) + (self.curve is not None))
 
     @property
     def values(self) -> dict[str, Value]:
-        """What of it is a quantity of a `Look`."""
+        """Its image as the quantity "weight" of a `Look`; {} without one."""
         return {} if self.image is None else {"weight": self.image}
 
     def times(self, factor: Value | ViewFactor | None) -> Share | None:
-        """This times a factor; None where that cannot be said."""
+        """This share times `factor`; None if the product cannot be expressed."""
         if isinstance(factor, ViewFactor) and self.curve is None:
             return replace(self, curve=factor, shining=0.5 * self.shining)
         if not isinstance(factor, Value):
@@ -231,7 +233,7 @@ def _value_of_factor(factor: Factor) -> Value | ViewFactor | None:
 
 
 def _view_factor(source: Source | None) -> ViewFactor | None:
-    """What a Fresnel or Layer Weight node with a constant number and the smooth normal says."""
+    """The output of a Fresnel or Layer Weight node with a constant number and the smooth normal; None for others."""
     if source is None or source.node is None or source.node.bl_idname not in VIEW_FACTORS:
         return None
     normal, parameter = source.input("Normal"), constant_inputs(source, 0)
@@ -243,7 +245,7 @@ def _view_factor(source: Source | None) -> ViewFactor | None:
 
 
 class _Reader:
-    """From the leaves of a material to its look."""
+    """Makes the look of a material from its leaves."""
 
     def __init__(self, material, shaders: SurfaceShaders):
         self.material, self.notes = material, []
@@ -258,11 +260,14 @@ class _Reader:
         self.notes += guesses
 
     def note(self, message: str) -> None:
-        """Name something that the viewport does not show as it is."""
+        """Note a difference between the material and what the viewport shows."""
         self.notes.append(f"{self.material.name}: {message}")
 
     def _shares(self, leaf: Leaf) -> list[Share]:
-        """The share of each of the terms of `leaf` that is not 0, constants in one; of unknown factors half."""
+        """The shares of `leaf` that are not 0: one per term, but terms that differ only in their constants are added.
+
+        Unknown factors count as one half.
+        """
         shares = []
         for term in leaf.terms:
             share = Share()
@@ -284,7 +289,7 @@ class _Reader:
         return replace(share, shining=whole.shining) if factor.beside_transparency else whole
 
     def look(self) -> Look:
-        """The heaviest lobe with the others behind it."""
+        """The look: the lobe with the largest estimated share, with the others in `further`."""
         glow = self._glow()
         if glow is not None:
             return glow
@@ -303,7 +308,7 @@ class _Reader:
         return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
 
     def _glow(self) -> Look | None:
-        """What shows an image by its emission alone, as baked textures do; None where it is something else."""
+        """The look of a material that only emits an image, like a baked texture; None for other materials."""
         if self.leaves or len(self.emitters) != 1:
             return None
         source, share = self.emitters[0]
@@ -341,7 +346,7 @@ class _Reader:
             return [look, *fuzz]
         look = replace(look, coat=coat)
         values = {"roughness": constant(coat.roughness), "ior": constant(coat.ior), "weight": look.value("weight")}
-        # Its multiple scattering is always there.
+        # A coat always has multiple scattering.
         shine = replace(look, kind=COAT, values=values, scattered=True, brush=None)
         return [look, shine if coat.follows_normal else replace(shine, normal=None), *fuzz]
 
@@ -361,7 +366,7 @@ class _Reader:
         return look
 
     def _brush(self, source: Source, bsdf: Bsdf, look: Look) -> Brush | None:
-        """How the lobe of `look`, of the node at `source`, is stretched."""
+        """The `Brush` of the lobe `look` of the node at `source`; None if it is isotropic."""
         if "anisotropy" not in bsdf.sockets or bsdf.kind not in BRUSHED_KINDS:
             return None
         anisotropy = constant_inputs(source, bsdf.sockets["anisotropy"])
@@ -377,7 +382,7 @@ class _Reader:
         return Brush(aspect, float(rotation[0][0]), direction, uv_map)
 
     def _sheen(self, source: Source, look: Look) -> list[Look]:
-        """The lobe of the fuzz on a Principled BSDF, if there is any."""
+        """The sheen lobe of a Principled BSDF; [] without sheen."""
         weight, roughness, tint = (
             np.maximum(self._value(source, "", f"Sheen {name}").offset, 0.0) for name in ("Weight", "Roughness", "Tint")
         )
@@ -389,7 +394,7 @@ class _Reader:
         return [replace(look, kind="sheen", values=values, scattered=False, brush=None)]
 
     def _coat(self, source: Source, look: Look) -> Coat | None:
-        """What covers a Principled BSDF, None where nothing does."""
+        """The coat of a Principled BSDF, or None."""
         weight = float(self._value(source, "", "Coat Weight").offset[0])
         if weight <= SMALLEST_WEIGHT:
             return None
@@ -415,7 +420,7 @@ class _Reader:
         return constant(default if value is None else value.offset)
 
     def _on_one_uv_map(self, values: dict[str, Value]) -> dict[str, Value]:
-        """`values` with stand-ins for the images on other UV maps than the first."""
+        """`values`, where images on other UV maps than the first image are replaced by constants."""
         first, result = None, {}
         for name, value in values.items():
             if value.image is not None:
@@ -427,7 +432,7 @@ class _Reader:
         return result
 
     def _normal(self, source: Source, values: dict[str, Value]) -> tuple[Value | None, float]:
-        """The normal map at the Normal socket and its strength."""
+        """The normal map at the Normal socket, or None, and its strength."""
         normal = source.input("Normal") if "Normal" in source.node.inputs else None
         if normal is None or normal.node is None:
             return None, 1.0
@@ -455,7 +460,7 @@ class _Reader:
 
 
 def _direction_of(node) -> tuple[str | None, str]:
-    """`direction` and `uv_map` of a Brush whose tangent comes from `node`, (None, "") where that cannot be said."""
+    """`direction` and `uv_map` of a `Brush` whose tangent comes from `node`; (None, "") for unknown tangents."""
     if node is None or node.bl_idname == "ShaderNodeNewGeometry":
         return "Z", ""
     if node.bl_idname != "ShaderNodeTangent":
@@ -464,9 +469,9 @@ def _direction_of(node) -> tuple[str | None, str]:
 
 
 def world_radiance(world) -> tuple[np.ndarray, bool]:
-    """Radiance (3,) of the background, and whether that is all that there is to it.
+    """Radiance (3,) of the background in W m^-2 sr^-1, and whether it is exact.
 
-    Where the world's nodes are more than one Background node of constants its viewport color stands in.
+    It is exact for a world of one constant Background node or without nodes. For others it is the viewport color.
     """
     if world is None:
         return np.zeros(3), True

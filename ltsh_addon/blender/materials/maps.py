@@ -1,6 +1,6 @@
-"""What varies over a material: images that are looked up, and maps that a bake of its emission writes (in the child).
+"""The varying values of a material: images that are read directly, and maps that Cycles bakes (in the child).
 
-A color or normal takes a map of its own, three numbers share one.
+For a bake the material emits the values of a map. A color or normal takes a map of its own; three numbers share one.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from ..render_settings import working_space
 from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
 from .values import is_srgb, opaque_pixels
 
-# Number of the map of the places on the UV map that is baked into.
+# UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
-# Of the entries of the matrix to Rec.709.
+# SAME_SPACE: the working space is Rec.709 if its matrix to Rec.709 differs less from the identity.
 SAME_SPACE = 1e-4
 
 
 class SavedImages:
-    """Pixels of images as .npy in a folder, row 0 below, each image once."""
+    """Images saved as .npy files in a folder, each once, with row 0 at the bottom."""
 
     def __init__(self, folder: Path):
         self.folder, self._names = folder, {}
 
     def file_of(self, image) -> str | None:
-        """File name of the pixels (H, W, 3) of `image`, uint8 or float32; None where it has an alpha."""
+        """File name of the pixels (H, W, 3) of `image`, uint8 or float32; None if the image is not opaque."""
         if image.name_full not in self._names:
             self._names[image.name_full] = self._save(image)
         return self._names[image.name_full]
@@ -45,11 +45,10 @@ class SavedImages:
 
 
 def plain_texture(output, groups):
-    """The image texture node that alone makes the `output` of a node, where it is looked up, and which part of it is
-    taken; None where anything else has a say.
+    """(image texture node, how it is read, its part) if the `output` of a node shows a texture unchanged, else None.
 
-    `groups` leads to the node (see `graph.Source`). The place is a dictionary as `cycles.texels.BakeMaterial` reads it,
-    the part "color", or a channel "0", "1" or "2".
+    `groups` are those around the node (see `graph.Source`). How it is read is a dictionary for
+    `cycles.texels.BakeMaterial`. The part is "color", or a channel "0", "1" or "2".
     """
     found, part = source_behind(output, groups), "color"
     if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
@@ -69,12 +68,12 @@ def _is_node(source, kind: str) -> bool:
 
 
 def _uv_map(texture) -> str | None:
-    """Name of the UV map that an image texture is looked up at, "" for the default, None for anything else."""
+    """Name of the UV map at which an image texture is read, "" for the default one; None for other coordinates."""
     found = texture.input("Vector")
     if found is None:
         return None
     if found.node is None:
-        # Only the texture's own open input means a UV map; that of a group is a constant.
+        # The texture's own unlinked input means the default UV map; the unlinked input of a group is a constant.
         return "" if found.socket == texture.node.inputs["Vector"] else None
     if getattr(found.node, "from_instancer", False):
         return None
@@ -98,7 +97,7 @@ def _is_plain(node) -> bool:
 
 
 def _known_encoding(image) -> bool | None:
-    """Whether an image of one file has sRGB values; None where it cannot be told, or is of another kind."""
+    """Whether an image from a single file has sRGB values; None if that is unknown, or for other kinds of images."""
     scene = bpy.context.scene
     if image.source != "FILE" or (scene.render.use_simplify and scene.cycles.texture_limit_render != "OFF"):
         return None
@@ -107,9 +106,9 @@ def _known_encoding(image) -> bool | None:
 
 
 def _alphas_in_use(tree, paths):
-    """Sockets of `tree` with the alphas of images that feed something: where they do not, Cycles shows other colors.
+    """Sockets of the material's `tree` with the linked alphas of images, in the tree and in the groups of `paths`.
 
-    Those of the material and of the groups that `paths` lead through.
+    They must stay linked: Cycles reads other colors from an image if its alpha feeds nothing.
     """
     places = dict.fromkeys(groups[:depth] for groups in ((), *paths) for depth in range(len(groups) + 1))
     for path in places:
@@ -122,27 +121,27 @@ def _alphas_in_use(tree, paths):
 
 
 class MaterialPlan:
-    """The maps of one material and the nodes that show them in its place.
+    """The maps of one material, and the nodes that make the material emit them.
 
-    `lobes` are dictionaries of `bsdfs.lobe_values` and `paths` the groups (see `graph.Source`) that lead to each;
-    textures at one of the UV maps `uv_names` are saved as `images`, where these are not None, and need no map.
+    `lobes` are dictionaries of `bsdfs.lobe_values`, and `paths` the groups around each (see `graph.Source`). Textures
+    on the UV maps `uv_names` need no map: they are saved to `images`, unless that is None.
     """
 
     def __init__(self, material, lobes: tuple[dict, ...], paths: tuple, images: SavedImages | None, uv_names=()):
         self.material, self.tree = material, material.node_tree
         self.textures: list[dict] = []  # as `cycles.texels.BakeMaterial` reads them
         self._images, self._uv_names = images, {"", *uv_names}
-        # Of each map its sockets in the tree of the material: one color, or up to three numbers.
+        # The sockets of each map in the tree of the material: one color, or up to three numbers.
         self._maps: list[list] = []
-        self._colors: set[int] = set()  # maps of one color
-        self._numbers: int | None = None  # the map that takes further numbers
+        self._colors: set[int] = set()  # numbers of the maps of one color
+        self._numbers: int | None = None  # number of the map that takes the next number
         self.lobes = tuple(
             {name: self._recorded(name, value, groups) for name, value in lobe.items()}
             for lobe, groups in zip(lobes, paths, strict=True)
         )
         self._alphas = list(_alphas_in_use(self.tree, paths))
         self._output, self._surface, self._image_node, self._places = None, None, None, None
-        self._emissions: dict[int, object] = {}  # nodes, by the map that they show
+        self._emissions: dict[int, object] = {}  # number of a map -> the node that emits it
 
     @property
     def count(self) -> int:
@@ -150,7 +149,7 @@ class MaterialPlan:
         return len(self._maps)
 
     def record(self) -> dict:
-        """What `cycles.texels.BakeMaterial.of` reads."""
+        """The record of the material for `cycles.texels.BakeMaterial.of`."""
         corrected = bool(self.material.cycles.use_bump_map_correction)
         return {"corrected": corrected, "lobes": list(self.lobes), "textures": self.textures}
 
@@ -174,7 +173,7 @@ class MaterialPlan:
         return {"map": self._numbers, "channel": len(self._maps[self._numbers]) - 1}
 
     def _looked_up(self, name, socket, groups):
-        """The record of a socket behind which is nothing but an image, or None."""
+        """The record of a socket that shows an image unchanged, or None."""
         found = plain_texture(socket, groups)
         if found is None or found[1]["uv"] not in self._uv_names:
             return None
@@ -191,7 +190,7 @@ class MaterialPlan:
         return {"texture": self.textures.index(record), "part": "gray" if part == "color" and not is_color else part}
 
     def prepare(self, uv_name: str) -> None:
-        """Add the nodes; `uv_name` is the UV map that UV_MAP shows."""
+        """Add the nodes that `show` and `target` need; `uv_name` is the UV map that UV_MAP shows."""
         self._output = material_output(self.tree)
         if self._output is None:
             self._output = self.tree.nodes.new("ShaderNodeOutputMaterial")
@@ -212,7 +211,7 @@ class MaterialPlan:
         if number in self._colors:
             self.tree.links.new(sockets[0], emission.inputs["Color"])
             return emission
-        # A number may come from a color or vector socket: linking to another number converts it as the shader would.
+        # A number may come from a color or vector socket; a link to a number socket converts it as the shader would.
         combined = self.tree.nodes.new("ShaderNodeCombineXYZ")
         for socket, target in zip(sockets, combined.inputs, strict=False):
             self.tree.links.new(socket, target)
@@ -220,7 +219,7 @@ class MaterialPlan:
         return emission
 
     def show(self, number: int | None) -> None:
-        """Make the material emit map `number` (black where there is none), or look as it does (None)."""
+        """Make the material emit map `number`, black if there is no such map; None restores its surface."""
         surface = self._output.inputs["Surface"]
         cut(surface)
         if number is None:
@@ -230,12 +229,12 @@ class MaterialPlan:
             self.tree.links.new(self._emissions[number].outputs[0], surface)
 
     def target(self, image) -> None:
-        """Bake into `image`."""
+        """Make `image` the target of bakes."""
         self._image_node.image = image
         self.tree.nodes.active = self._image_node
 
     def remove(self) -> None:
-        """Take the nodes out again."""
+        """Remove the nodes of `prepare` and restore the surface."""
         self.show(None)
         for node in (self._image_node, self._places, *self._emissions.values()):
             self.tree.nodes.remove(node)

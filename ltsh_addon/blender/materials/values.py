@@ -1,4 +1,4 @@
-"""Values behind sockets: constants, image textures, and what nodes make of them."""
+"""Values behind sockets: constants, image textures, and these after simple nodes."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ import numpy as np
 from ...cycles.images import EXTENSIONS, INTERPOLATIONS
 from .graph import Source, source_of
 
-LUMA = np.array([0.2126, 0.7152, 0.0722])  # of Rec.709, by which Blender makes numbers of colors
+LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec.709 luminance, by which Blender converts colors to numbers
 
 
 @dataclass(frozen=True)
 class ImageUse:
-    """A flat image on a UV map ("": the active one); `mapping` (2, 3) takes (u, v, 1) to image coordinates."""
+    """A flat image on a UV map ("": the active one); `mapping` (2, 3) maps (u, v, 1) to image coordinates."""
 
     image: Any
     uv_map: str
     mapping: tuple[tuple[float, float, float], tuple[float, float, float]]
     closest: bool
     extension: str  # one of EXTENSIONS
-    by_alpha: bool = False  # Cycles multiplies its colors by alpha, as the node's Alpha feeds nothing
+    by_alpha: bool = False  # Cycles multiplies its colors by alpha because the node's Alpha feeds nothing
 
 
 @dataclass(frozen=True)
 class Value:
-    """offset + matrix (R, G, B, A), or offset alone where there is no image."""
+    """A value: offset + matrix (R, G, B, A) of an image, or only offset without an image."""
 
     offset: np.ndarray  # (3,)
     matrix: np.ndarray | None = None  # (3, 4)
@@ -40,28 +40,28 @@ class Value:
         return self.image is None
 
     def mapped(self, matrix: np.ndarray, offset=0.0) -> Value:
-        """`matrix` (3, 3) times this plus `offset`."""
+        """`matrix` (3, 3) times this value, plus `offset`."""
         image_matrix = None if self.matrix is None else matrix @ self.matrix
         return Value(matrix @ self.offset + offset, image_matrix, self.image)
 
     def as_number(self) -> Value:
-        """The color as a number."""
+        """The luminance of the color, in all three components."""
         return self.mapped(np.broadcast_to(LUMA, (3, 3)))
 
 
 def is_gray(value: Value) -> bool:
-    """True where all components are the same."""
+    """True if all three components are always equal."""
     rows = value.offset[:, None] if value.matrix is None else np.column_stack([value.matrix, value.offset])
     return bool(np.all(rows == rows[:1]))
 
 
 def constant(number) -> Value:
-    """A number or the first three components of a color."""
+    """The value of a number, or of the first three components of a color."""
     return Value(np.array(np.broadcast_to(np.ravel(number)[:3], (3,)), np.float64))
 
 
 def combined(first: Value | None, second: Value | None, first_share, second_share) -> Value | None:
-    """The sum of both under constant shares; None unless at most one has an image."""
+    """first_share * first + second_share * second; None if one is unknown or they have different images."""
     if first is None or second is None:
         return None
     if not first.is_constant and not second.is_constant:
@@ -76,7 +76,7 @@ def combined(first: Value | None, second: Value | None, first_share, second_shar
 
 
 def product(first: Value | None, second: Value | None) -> Value | None:
-    """The product; None unless at most one has an image."""
+    """The product; None if one is unknown or both have images."""
     if first is None or second is None:
         return None
     if not first.is_constant:
@@ -85,7 +85,7 @@ def product(first: Value | None, second: Value | None) -> Value | None:
 
 
 def value_at(socket, groups: tuple = ()) -> Value | None:
-    """The value at the input `socket` inside of `groups`, as the kind of value that it takes; None: unknown."""
+    """The value at the input `socket` inside `groups`, converted to a number for a number socket; None: unknown."""
     value = value_of_source(source_of(socket, groups))
     if value is not None and socket.type == "VALUE":
         return value if is_gray(value) else value.as_number()
@@ -93,7 +93,7 @@ def value_at(socket, groups: tuple = ()) -> Value | None:
 
 
 def value_of_source(source: Source | None) -> Value | None:
-    """The value that `source` gives; None: unknown."""
+    """The value of `source`; None: unknown."""
     if source is None:
         return None
     if source.node is None:
@@ -108,26 +108,26 @@ def input_value(source: Source, name) -> Value | None:
 
 
 def constant_inputs(source: Source, *names) -> list[np.ndarray] | None:
-    """The constants (3,) at inputs of the node of `source`; None where one of them is no constant."""
+    """The constants (3,) at the inputs `names` of the node of `source`; None if one of them is not constant."""
     values = [input_value(source, name) for name in names]
     return [value.offset for value in values] if all(value and value.is_constant for value in values) else None
 
 
 @dataclass(frozen=True)
 class Curved:
-    """A number that hangs on `value`, a gray one, by lines between `numbers` at `places`, none of which turn back."""
+    """A number that is a piecewise linear, monotonic function of the gray `value`: `numbers` at `places`."""
 
     value: Value
     places: tuple[float, ...]
     numbers: tuple[float, ...]
 
     def mapped(self, factor: float, offset: float) -> Curved:
-        """`factor` times this plus `offset`."""
+        """`factor` times this number, plus `offset`."""
         return Curved(self.value, self.places, tuple(factor * number + offset for number in self.numbers))
 
 
 def curved_at(socket, groups: tuple = ()) -> Value | Curved | None:
-    """As `value_at`, also where a threshold or a color ramp follows, which is looked up after interpolation."""
+    """As `value_at`, but also through a threshold or a color ramp, which applies after the image is interpolated."""
     value, source = value_at(socket, groups), source_of(socket, groups)
     if value is not None or source is None or source.node is None:
         return value
@@ -140,7 +140,7 @@ def _curved_math(source: Source) -> Curved | None:
     node = source.node
     first, second = (curved_at(node.inputs[number], source.groups) for number in (0, 1))
     if not isinstance(second, Value) or not second.is_constant:
-        # 1 - x and the like.
+        # A constant comes first, as in 1 - x.
         if isinstance(second, Curved) and isinstance(first, Value) and first.is_constant:
             number = float(first.offset[0])
             found = {"SUBTRACT": (-1.0, number), "ADD": (1.0, number), "MULTIPLY": (number, 0.0)}.get(node.operation)
@@ -160,7 +160,7 @@ def _curved_math(source: Source) -> Curved | None:
     return None
 
 
-# Entries of the table that Cycles makes of a color ramp.
+# RAMP_ENTRIES: of the table into which Cycles converts a color ramp.
 RAMP_ENTRIES = 256
 
 
@@ -175,7 +175,7 @@ def _curved_ramp(source: Source) -> Curved | None:
     if not ((steps >= 0.0).all() or (steps <= 0.0).all()):
         return None
     if ramp.interpolation == "CONSTANT":
-        # Cycles takes the entry below.
+        # Between two entries Cycles takes the lower one.
         below = np.nextafter(places[1:], np.float32(0.0))
         places = np.append(places[0], np.stack([below, places[1:]], axis=1))
         numbers = np.append(numbers[0], np.stack([numbers[:-1], numbers[1:]], axis=1))
@@ -210,12 +210,12 @@ IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
 def coordinates(source: Source | None):
-    """(UV map, mapping) of a texture's vector; None for all but UV maps under Mapping nodes of constants."""
+    """(UV map, mapping) of a texture's vector, a UV map through any constant Mapping nodes; None for other vectors."""
     if source is None:
         return None
     node = source.node
     if node is None:
-        # A texture without a vector takes the active UV map.
+        # A texture whose vector is not linked takes the active UV map.
         return ("", IDENTITY) if source.socket.hide_value else None
     if node.bl_idname == "ShaderNodeUVMap" and not node.from_instancer:
         return node.uv_map, IDENTITY
@@ -231,7 +231,7 @@ def coordinates(source: Source | None):
 
 
 def _mapping(kind: str, location, rotation, scale, inner):
-    """The affine map (2, 3) of a Mapping node that stays in the plane, after `inner`."""
+    """The affine map (2, 3) `inner` followed by that of a Mapping node that stays in the plane."""
     cosine, sine = math.cos(rotation[2]), math.sin(rotation[2])
     turned = [[cosine * scale[0], -sine * scale[1]], [sine * scale[0], cosine * scale[1]]]
     own = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
@@ -373,22 +373,22 @@ READERS: dict[str, Callable[[Source], Value | None]] = {
     "ShaderNodeClamp": _clamp,
 }
 
-# Color space of the image -> whether values are sRGB. Of others, and of floats in sRGB, Cycles knows more than we do.
+# Color space of the image -> whether its values are sRGB. Only Cycles can decode other spaces, and floats in sRGB.
 BYTE_SPACES = {"sRGB": True, "Non-Color": False, "Linear Rec.709": False}
 FLOAT_SPACES = {"Non-Color": False, "Linear Rec.709": False}
-# Blender hands out pixels as four floats each: half a gigabyte.
+# MOST_PIXELS: of an image that is read; Blender returns four floats per pixel, half a gigabyte for so many.
 MOST_PIXELS = 1 << 25
 
 
 def is_srgb(image) -> bool | None:
-    """Whether an image has sRGB values; None where it has no pixels, too many, or only Cycles knows its colors."""
+    """Whether an image has sRGB values; None if it has no pixels, too many, or a space that only Cycles can decode."""
     if not 0 < image.size[0] * image.size[1] <= MOST_PIXELS:
         return None
     return (FLOAT_SPACES if image.is_float else BYTE_SPACES).get(image.colorspace_settings.name)
 
 
 def opaque_pixels(image) -> np.ndarray | None:
-    """Pixels (H, W, 3) float32, row 0 below; None where some have an alpha."""
+    """Pixels (H, W, 3) float32, row 0 at the bottom; None if not all are opaque."""
     width, height = image.size
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)

@@ -1,8 +1,8 @@
-"""The second Blender as a process: how it is started, what both say to each other, how it ends. Imports no bpy.
+"""The second Blender as a process: its start, its messages, and its end. Imports no bpy.
 
 The parent writes a job to a file, whose path is the last argument of the command; paths of further jobs go to stdin.
-The child answers with messages, lines of stdout that begin with LTSH and go on with JSON; the last of its other lines
-are kept for error texts. The end of stdin tells the child that the parent is gone.
+The child answers with messages: lines of stdout that consist of LTSH and JSON. The last of its other lines are kept
+for error texts. The end of stdin tells the child that the parent is gone.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ MESSAGE = "LTSH "
 LISTENER = "ltsh-parent"
 OUTPUT_LINES_KEPT = 12
 NICENESS = 10
-DELETIONS, DELETION_SECONDS = 40, 60.0  # tries, and what they may take
+# How a child deletes its folders. DELETIONS: tries. DELETION_SECONDS: how long the process waits for them at most.
+DELETIONS, DELETION_SECONDS = 40, 60.0
 
 
 def tell(message: dict, stream=None) -> None:
-    """Send a message to the parent. Where it is gone, `listen_to_parent` ends this process, here at the latest."""
+    """Send a message to the parent. If the parent is gone, this waits until `listen_to_parent` ends this process."""
     stream = stream or sys.stdout
     try:
         stream.write(MESSAGE + json.dumps(message) + "\n")
         stream.flush()
     except OSError:
-        # Ended by this error, the process would leave what the listener has not deleted yet.
+        # If this error ended the process now, folders that the listener is deleting would remain.
         for thread in threading.enumerate():
             if thread.name == LISTENER:
                 thread.join(DELETION_SECONDS)
@@ -49,7 +50,7 @@ def tell(message: dict, stream=None) -> None:
 
 
 def messages(lines: Iterable[str], others: deque[str]) -> Iterator[dict]:
-    """The messages among the `lines` that a child prints; all other lines go to `others`."""
+    """The messages in the `lines` that a child prints; all other lines are added to `others`."""
     for line in lines:
         message = None
         if line.startswith(MESSAGE):
@@ -67,16 +68,18 @@ def ended(code: int, others: Iterable[str]) -> str:
 
 
 def listen_to_parent(temporary: list[Path], take: Callable[[str], None] = lambda line: None) -> None:
-    """In a child: `take` the lines of stdin in a thread. When the parent is gone, delete the `temporary` folders, which
-    it can no longer delete, and end this process."""
+    """In a child: start a thread that calls `take` for each line of stdin.
+
+    When the parent is gone and cannot do it, the thread deletes the `temporary` folders and ends this process.
+    """
 
     def listen():
         for line in iter(sys.stdin.buffer.readline, b""):
             take(line.decode("utf-8", "surrogateescape").removesuffix("\n"))
-        # A Blender that is just starting would make the folders again.
+        # A Blender that is just starting would create the folders again.
         for child in list(_started):
             _kill(child)
-        for _ in range(DELETIONS):  # what still writes there can keep a folder from being empty
+        for _ in range(DELETIONS):  # a process that still writes there can make a try fail
             for folder in temporary:
                 shutil.rmtree(folder, ignore_errors=True)
             if not any(folder.exists() for folder in temporary):
@@ -91,7 +94,7 @@ _started: weakref.WeakSet[subprocess.Popen] = weakref.WeakSet()
 
 
 def _kill(child: subprocess.Popen) -> None:
-    """End `child` and what it has started, and wait for it."""
+    """End `child` and the processes that it has started, and wait for it."""
     if child.poll() is None:
         if hasattr(os, "killpg"):
             with contextlib.suppress(ProcessLookupError):
@@ -118,17 +121,17 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
     return [sys.executable, str(script), str(job)]
 
 
-# Where Blender and pip's bpy have libraries: on Linux, Windows, macOS; beside the binary or the module.
+# Where Blender and pip's bpy keep libraries on Linux, Windows and macOS, relative to the binary or the module.
 LIBRARY_PLACES = ("lib/lib{}*", "blender.shared/{}*.dll", "{}*.dll", "../Resources/lib/lib{}*")
 
 
 def embree_libraries() -> list[Path]:
-    """Files of Embree 4 that this Blender, or pip's bpy, has brought along; none where the system has it."""
+    """Files of the Embree 4 that comes with this Blender or pip's bpy; [] if they use that of the system."""
     return _brought_along("embree4")
 
 
 def denoiser_libraries() -> list[Path]:
-    """The same for Open Image Denoise 2. The library to call comes first: the names of its parts are longer."""
+    """As `embree_libraries`, for Open Image Denoise 2. The library to call is first: it sorts before its parts."""
     return _brought_along("OpenImageDenoise")
 
 
@@ -143,9 +146,9 @@ def _brought_along(name: str) -> list[Path]:
 
 
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
-    """`command` as a process whose own files go to `folder`.
+    """Start `command` as a process whose own files go to `folder`.
 
-    One in the `background` gets the processor after this process, as does all that it starts.
+    In the `background` it has a lower priority than this process, and so have the processes that it starts.
     """
     process = subprocess.Popen(
         command,
@@ -156,16 +159,16 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
         encoding="utf-8",
         errors="replace",
         cwd=folder,
-        # The user's preferences and start-up files have no say in the result.
-        # Blender leaves its own temporary folder behind when it is killed: that one goes with ours.
+        # The user's preferences and start-up files must not affect the result. Blender leaves its temporary folder
+        # behind when it is killed, so that folder is put into ours.
         env={
             **os.environ,
             **dict.fromkeys(("TMPDIR", "TEMP", "TMP"), str(folder)),
             "BLENDER_USER_RESOURCES": str(folder / "user"),
             "PYTHONUNBUFFERED": "1",
         },
-        # Ctrl-C goes to the parent alone, which ends the child. Not a session: Linux shares the processor between
-        # sessions first, and niceness counts only within one.
+        # Ctrl-C goes only to the parent, which ends the child. A group, not a session: Linux shares the processor
+        # between sessions first, and niceness counts only within a session.
         process_group=0,
         creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0) if background else 0,
     )
@@ -176,14 +179,14 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
 
 
 class BlenderProcess:
-    """A Blender that runs worker.py, from the first job on; `folder` takes all that Blender writes on its own."""
+    """A Blender that runs worker.py, started by the first job; `folder` takes the files that Blender itself writes."""
 
     def __init__(self, folder: Path):
-        self.temporary = [folder]  # what it deletes where this process is gone, first the folder that it writes to
+        self.temporary = [folder]  # folders that it deletes if this process is gone; it writes to the first
         self._child: subprocess.Popen | None = None
 
     def do(self, job: dict, folder: Path, progress: Progress | None) -> dict:
-        """Do `job` in `folder` and report its progress; the manifest that was written. After an error Blender ends."""
+        """Do `job` in `folder` and report its progress; returns the manifest. An error ends this Blender."""
         job_path = folder / "job.json"
         temporary = [str(path) for path in (*self.temporary, folder)]
         job_path.write_text(json.dumps({**job, "temporary": temporary}), encoding="utf-8")
@@ -196,7 +199,7 @@ class BlenderProcess:
             raise
 
     def _hand_over(self, job_path: Path) -> None:
-        """Give the job to the Blender that waits, or to a new one."""
+        """Give the job to the waiting Blender, or to a new one."""
         if self._child is not None:
             try:
                 self._child.stdin.write(f"{job_path}\n")
@@ -207,7 +210,7 @@ class BlenderProcess:
         self._child = start(child_command(job_path), self.temporary[0])
 
     def _follow(self, progress) -> None:
-        """Report progress until the job is done. Raises SceneError, and Cancelled where `progress` returns False."""
+        """Report progress until the job is done. Raises SceneError, and Cancelled if `progress` returns False."""
         others: deque[str] = deque(maxlen=OUTPUT_LINES_KEPT)
         for message in messages(self._child.stdout, others):
             if "done" in message:
@@ -224,7 +227,7 @@ class BlenderProcess:
         if child is None:
             return
         _kill(child)
-        with contextlib.suppress(OSError):  # what was not handed over yet
+        with contextlib.suppress(OSError):  # unsent input cannot be delivered
             child.stdin.close()
         child.stdout.close()
 
@@ -234,9 +237,9 @@ _kept: ContextVar[BlenderProcess | None] = ContextVar("kept Blender", default=No
 
 @contextlib.contextmanager
 def kept_blender(folder: Path):
-    """Meanwhile one Blender does all jobs of this thread, which saves starting others; `folder` is its temporary one.
+    """Within this context one Blender does all jobs of this thread; `folder` is its temporary folder.
 
-    Within another `kept_blender` the Blender of that one does them.
+    This saves starting more of them. Within another `kept_blender` its Blender does the jobs.
     """
     if (kept := _kept.get()) is not None:
         kept.temporary.append(folder)
@@ -255,9 +258,9 @@ def kept_blender(folder: Path):
 
 
 def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
-    """Do `job` in `folder` in the kept Blender, or in one of its own; its manifest.
+    """Do `job` in `folder`, in the kept Blender or in a new one; returns its manifest.
 
-    Raises SceneError with what was wrong in one line, Cancelled when `progress(stage, fraction)` returned False.
+    Raises SceneError with a message of one line, and Cancelled if `progress(stage, fraction)` returned False.
     """
     kept = _kept.get()
     if kept is not None:

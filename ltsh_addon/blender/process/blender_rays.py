@@ -1,4 +1,4 @@
-"""Rays that Blender itself casts, where no Embree is at hand: some ten times slower, and on one core.
+"""Rays cast by Blender itself if Embree is not available: some ten times slower, and on one core.
 
 The first half runs in the parent and imports no bpy. The second half runs in the second Blender.
 """
@@ -21,7 +21,7 @@ RAYS = ("origins", "directions", "near", "far", "masks")
 
 
 def open_rays(occluders: Occluders, folder: Path, warn: Callable[[str], None]) -> Tracer:
-    """A tracer by Embree or else by a second Blender, whose files go to `folder`, after a warning."""
+    """A tracer with Embree, or, after a warning, with a second Blender whose files go to `folder`."""
     try:
         return open_tracer(occluders, embree_libraries())
     except SceneError as error:
@@ -43,18 +43,18 @@ class BlenderCaster:
         self.has = tuple(len(index) > 0 for index in occluders.split())
 
     def close(self) -> None:
-        """End that Blender."""
+        """End the second Blender."""
         self._process.end()
 
     def blocked(self, origins, directions, distances, masks) -> np.ndarray:
-        """Mask (R,) of the rays that something blocks."""
+        """Mask (R,) of the rays that are blocked."""
         found = np.zeros(len(origins), bool)
         hits = self.closest(False, origins, directions, np.zeros(len(origins), np.float32), distances, masks)
         found[hits.ray] = True
         return found
 
     def closest(self, is_clear: bool, *rays: np.ndarray) -> Hits:
-        """First hits of rays (origins, directions, near, far, masks): on transparent surfaces, or on what blocks."""
+        """First hits of rays (origins, directions, near, far, masks) on blocking surfaces; `is_clear`: on others."""
         for name, values in zip(RAYS, rays, strict=True):
             save_array(self._folder / f"{name}.npy", values)
         job = {"task": "rays", "occluders": str(self._occluders), "is_clear": is_clear}
@@ -64,14 +64,15 @@ class BlenderCaster:
 
 # In the second Blender:
 
-# Blender takes places and distances in single precision.
+# Blender takes positions and distances in single precision. FARTHEST_RAY: the longest distance in m. ROUNDING: how far
+# the start of a ray may be off, as a share of its largest coordinate.
 FARTHEST_RAY = 1e18
 ROUNDING = 2.0**-21
 
 
 @dataclass(frozen=True)
 class _Tree:
-    """Triangles of instances that have the same mask."""
+    """The triangles of all instances with the same mask."""
 
     mask: int
     tree: object
@@ -80,11 +81,11 @@ class _Tree:
     triangle: np.ndarray  # (T,)
 
 
-_trees: dict[str, tuple[list[_Tree], list[_Tree]]] = {}  # of the file that was asked for last
+_trees: dict[str, tuple[list[_Tree], list[_Tree]]] = {}  # of the last file of occluders, by its path
 
 
 def cast(job: dict, folder: Path) -> dict:
-    """Write what the rays in `folder` meet."""
+    """Write the first hits of the rays in `folder`; returns an empty manifest."""
     path = job["occluders"]
     if path not in _trees:
         _trees.clear()
@@ -118,7 +119,7 @@ def _grown(occluders: Occluders, index) -> list[_Tree]:
 def _closest(trees: list[_Tree], origins, directions, near, far, masks) -> dict[str, np.ndarray]:
     """The values of `Hits` by name."""
     count = len(origins)
-    # A ray goes on from what it has met: Blender's would meet it again, for its start is rounded.
+    # A ray that goes on from a hit would hit the same surface again because its start is rounded: move the start.
     near = near + (near > 0.0) * ROUNDING * (np.abs(origins).max(axis=1, initial=0.0) + near)
     starts = (origins + near[:, None] * directions).tolist()
     ways, reach = directions.tolist(), np.minimum(far - near, FARTHEST_RAY)
@@ -142,7 +143,7 @@ def _closest(trees: list[_Tree], origins, directions, near, far, masks) -> dict[
 
 
 def _place(corners, origins, directions):
-    """u and v (H,) on triangles (H, 3, 3) that rays meet; Moeller and Trumbore 1997."""
+    """Barycentric u and v (H,) of the hits on triangles (H, 3, 3); Moeller and Trumbore 1997."""
     first, second, start = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origins - corners[:, 0]
     p, q = np.cross(directions, second), np.cross(start, first)
     determinant = (first * p).sum(axis=1)

@@ -1,4 +1,4 @@
-"""What is asked of the second Blender, and how its files become samples, lights and pictures. Imports no bpy."""
+"""The jobs of the second Blender, and how its files become samples, lights and pictures. Imports no bpy."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from .blender_process import run_child
 
 @dataclass(frozen=True)
 class ExtractOptions:
-    """What to take from which file. `cycles_samples` 0 means no Cycles reference; None means as in the file."""
+    """What to extract from which file. `cycles_samples` 0 means no Cycles reference; None means as in the file."""
 
     scene: Path
     width: int | None = None
@@ -48,37 +48,37 @@ class ExtractOptions:
     camera: str | None = None
     scene_name: str | None = None
     view_layer: str | None = None
-    scripts: bool = False  # run those of the file
+    scripts: bool = False  # run the scripts in the file
     rest: bool = False  # also the parts of the picture that are not reflected light
-    indices: tuple[str, ...] = ()  # of passes as "object_index", see `render_settings.pass_names`
-    shadows: str = "off"  # "on": also what stands in the way of light, which then does so in the Cycles reference
-    for_finished: bool = False  # also tell what a finished picture leaves to Cycles; there need be no light
-    edge_points: int = 0  # of a pixel of a finished picture that an edge runs through
-    seconds: float | None = None  # of processor time for the whole picture, which limits its sub-samples
+    indices: tuple[str, ...] = ()  # keys of index passes, such as "object_index"; see `render_settings.pass_names`
+    shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
+    for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
+    edge_points: int = 0  # points of a pixel of a finished picture that has an edge
+    seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
 
 
 @dataclass(frozen=True)
 class KeptByCycles:
-    """Of a finished picture: where direct light is Cycles' own, and why."""
+    """Where a finished picture takes direct light from Cycles, and why."""
 
-    by_pass: dict[str, np.ndarray]  # (H, W) bool
-    materials: tuple[str, ...]
-    everything: tuple[str, ...]  # why all of it is
-    warnings: tuple[str, ...]  # about what is shaded in place of it
+    by_pass: dict[str, np.ndarray]  # masks (H, W)
+    materials: tuple[str, ...]  # materials for which it does
+    everything: tuple[str, ...]  # reasons why it does everywhere
+    warnings: tuple[str, ...]  # about direct light that is shaded here
 
 
 def too_small(budget: float) -> str:
-    """Why a finished picture leaves everything to Cycles."""
+    """The reason why a `budget` in seconds leaves all direct light to Cycles."""
     return f"the budget is too small for it, {budget:g} s"
 
 
 TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
 
-# Materials, or other reasons, that an error names.
+# REASONS: how many materials, or other reasons, an error names.
 REASONS = 5
-# Smoother surfaces show the patches of a world.
+# SHARP_REFLECTION: surfaces of a smaller roughness show the patches of a world.
 SHARP_REFLECTION = 0.2
-# Fields of `Extraction` that are those of the manifest.
+# UNCHANGED: fields of `Extraction` that are copied from the manifest.
 UNCHANGED = (
     "blender_version", "frame", "camera", "seconds", "exposure", "pixel_aspect", "pixel_filter", "light_settings",
     "has_lens",
@@ -89,16 +89,19 @@ UNCHANGED = (
 class Extraction:
     """What the child found and rendered.
 
-    `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32, the halves A and B, row 0 on top, in W m^-2
-    sr^-1 times `exposure`, the film exposure of the scene, by which all radiance of a render is multiplied;
-    `seconds` has "start", "samples" and "cycles". `border` is None where the whole picture was rendered; pixels are
-    `pixel_aspect` times as wide as high. Sub-samples are drawn from the scene's `pixel_filter`. All colors, those
-    of the lights included, are in `color_space`. `emission` (H, W, 3) is what surfaces and lights in sight emit, and
-    `background` (H, W, 4) what of the world is seen behind them, with the alpha of the picture, both without the
-    exposure; None where they were not asked for. `indices` (H, W) are passes of what the first sub-samples see, by
-    Cycles' names. `problems` say why most of the picture is not shaded. `occluders` are what stands in the way of
-    light, around `origin` (3,) in m; None without shadows. `light_settings` are power, exposure, red, green and blue
-    of light objects as Blender has them.
+    - `exposure` is the film exposure of the scene, by which all radiance of a render is multiplied.
+    - `reference` maps "specular" and "diffuse" to (2, H, W, 3) float32: the halves A and B, row 0 on top, in
+      W m^-2 sr^-1 times `exposure`.
+    - `seconds` has "start", "samples" and "cycles".
+    - `border` is None if the whole picture was rendered. Pixels are `pixel_aspect` times as wide as high.
+    - Sub-samples are drawn from the scene's `pixel_filter`.
+    - All colors, those of the lights included, are in `color_space`.
+    - `emission` (H, W, 3) is the emission of surfaces and lights in sight. `background` (H, W, 4) is the world seen
+      behind them, with the alpha of the picture. Both are without the exposure, and None if not asked for.
+    - `indices` are passes (H, W) of the first sub-sample, by Cycles' names.
+    - `problems` say why most of the picture is not shaded.
+    - `occluders` block light; their positions are relative to `origin` (3,) in m. None without shadows.
+    - `light_settings` are power, exposure, red, green and blue of light objects in Blender.
     """
 
     lights: tuple[AreaLight, ...]
@@ -124,19 +127,19 @@ class Extraction:
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     light_settings: dict[str, list[float]] = field(default_factory=dict)
     processor_seconds: float = 0.0  # of the child
-    direct_seconds: float = 0.0  # of these what came after the file was open
+    direct_seconds: float = 0.0  # the part of them after the file was opened
     has_lens: bool = False  # depth of field: samples are seen through different points of the lens
-    # Of a finished picture, for `with_points`: which point of its pixel each sample (P,) is, and of points the weights
-    # (N, D, D) as of `Film.shared`.
-    point: np.ndarray | None = None
-    weights: np.ndarray | None = None
-    finer: gbuffer.FinerPoints | None = None  # of pixels at edges, around `origin`
+    # The next two are for `with_points` of a finished picture.
+    point: np.ndarray | None = None  # (P,) the number of each sample's point in its pixel
+    weights: np.ndarray | None = None  # (N, D, D) of the points, as in `Film.shared`
+    finer: gbuffer.FinerPoints | None = None  # for pixels at edges, relative to `origin`
 
     @property
     def rest(self) -> np.ndarray | None:
-        """The part of the picture (H, W, 4) that is not reflected light (emission, lights in sight, world), exposed.
+        """The part of the picture (H, W, 4) that is not reflected light: emission, lights in sight and world.
 
-        With all reflected light it is the picture that Cycles makes of the file. None where it was not asked for.
+        It includes the exposure. Together with all reflected light it is Cycles' picture of the file. None if it was
+        not asked for.
         """
         if self.background is None:
             return None
@@ -145,9 +148,9 @@ class Extraction:
 
 
 def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Extraction:
-    """Lights, samples and (if asked for) the Cycles reference of a .blend.
+    """The lights, samples and (if asked for) the Cycles reference of a .blend.
 
-    Raises SceneError when the scene or file is not fit, Cancelled when `progress(stage, fraction)` returned False.
+    Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
     if options.sub_samples < 1 or options.cycles_samples < 0:
         raise ValueError(
@@ -173,7 +176,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
         kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
-        # In the file, where double precision tells positions apart.
+        # Back to positions in the file, in double precision.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
         found = Extraction(
@@ -202,13 +205,16 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
 
 
 def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Build the example scene and save it as the .blend `path`, at once or not at all. Raises SceneError, OSError."""
+    """Save the example scene as the .blend `path`, completely or not at all. Raises SceneError, OSError."""
     with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
         run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
 def with_points(extraction: Extraction, count: int) -> Extraction:
-    """The first `count` points of each pixel of a finished picture, of which one stands for all on a smooth surface."""
+    """`extraction` with the first `count` points of each pixel of a finished picture.
+
+    One sample stands for all points of a pixel on the same smooth surface, but not with depth of field.
+    """
     samples, film = extraction.samples, extraction.film
     if count < film.sub_samples:
         kept = extraction.point < count
@@ -216,7 +222,7 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
         if extraction.weights is not None:
             seen = np.isfinite(film.whole)
             film = film.unspread().shared(extraction.weights[:count], extraction.point[kept], seen)
-    # Points of a blurred pixel may be far from each other.
+    # With depth of field the points of a pixel may be far from each other.
     if not extraction.has_lens and len(samples):
         samples, film = gbuffer.merged(samples, film)
     finer = extraction.finer
@@ -226,7 +232,7 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
 
 
 def ended(extraction: Extraction) -> Extraction:
-    """The same with samples ended at the horizons of Cycles."""
+    """`extraction` with samples that end at the horizons of Cycles."""
     samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
     is_quick = extraction.kept is not None
@@ -240,8 +246,11 @@ def ended(extraction: Extraction) -> Extraction:
 def _read_samples(
     manifest: dict, folder: Path, look: Callable[[dict[str, np.ndarray]], None]
 ) -> tuple[SurfaceSamples, Film, np.ndarray, list[str], list[str]]:
-    """Samples and film of all sample renders, the number of the render of each sample, warnings, and the problem where
-    most of what is seen is not shaded; `look` gets the channels of each render."""
+    """Samples and film of all sample renders, the number (P,) of each sample's render, warnings and problems.
+
+    There is one problem if most of what the camera sees is not shaded. `look` is called with the channels of each
+    render.
+    """
     width, height = manifest["width"], manifest["height"]
     materials = manifest["unshaded"]
     renders, unusable, unnamed, unshaded = [], 0, 0, np.zeros(len(materials), dtype=int)
@@ -280,7 +289,7 @@ def _read_samples(
 
 
 def _rendered_pixels(manifest: dict) -> np.ndarray:
-    """Mask (H, W)."""
+    """Mask (H, W) of the pixels that were rendered."""
     seen, border = np.ones((manifest["height"], manifest["width"]), bool), manifest["border"]
     if border is not None and not border["cropped"]:
         rows, columns = (slice(border[a], border[a] + border[b]) for a, b in (("top", "height"), ("left", "width")))
@@ -290,7 +299,7 @@ def _rendered_pixels(manifest: dict) -> np.ndarray:
 
 
 def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -> list[str]:
-    """The warning about lights that reach nothing of what the camera sees."""
+    """The warning about lights that reach nothing that the camera sees; [] if there are none."""
     if not has_lobe(samples).any():
         return [f"nothing that camera {camera!r} sees reflects light: the picture is black"] if len(samples) else []
     unseen = lights_that_reach_nothing(samples, lights)
@@ -300,7 +309,7 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
 
 
 def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
-    """The warning about reflections so sharp that they show how coarse a world is shaded."""
+    """The warning about reflections so sharp that they show the patches of a world; [] if there are none."""
     sharp = shows_patches(samples, lights)
     if not sharp.any():
         return []
@@ -312,14 +321,14 @@ def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]
 
 
 def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.ndarray:
-    """Mask (P,) of the samples with reflections so sharp that they show the patches of a world."""
+    """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world."""
     if not any(light.is_distant and light.detail and light.affects_specular for light in lights):
         return np.zeros(len(samples), bool)
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 
 
 class _Mean:
-    """The mean of arrays of which one is there at a time."""
+    """The mean of arrays that are added one at a time."""
 
     def __init__(self):
         self._sum, self._count = 0.0, 0
@@ -333,7 +342,7 @@ class _Mean:
 
 
 def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[str, np.ndarray]:
-    """Passes (H, W) of the first sample render, which sees the centers of pixels, by their names."""
+    """Index passes (H, W), by name, of the first sample render, which shows the centers of the pixels."""
     if not keys:
         return {}
     channels = _rendered(folder / manifest["samples"][0])
@@ -342,7 +351,7 @@ def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[s
 
 
 def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> KeptByCycles:
-    """Where finished pictures leave direct light to Cycles: where some point of a pixel is not shaded as there."""
+    """Where a finished picture leaves direct light to Cycles: where a point of a pixel is not shaded as in Cycles."""
     found = manifest["kept"]
     by_pass = {
         name: film.reached(sum((number & bit for number in bits), np.zeros((film.height, film.width), int)) > 0)
@@ -354,7 +363,7 @@ def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.nda
 
 
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:
-    """The two halves, each the mean of its chunks weighted by their samples, times the exposure."""
+    """`Extraction.reference`: each half is the mean of its chunks, weighted by their samples; None without one."""
     if manifest["reference"] is None:
         return None
     passes = manifest["passes"]
@@ -371,7 +380,7 @@ def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None
 
 
 def _rendered(path: Path) -> dict[str, np.ndarray]:
-    """The channels of a picture that Blender rendered. Raises OSError where it is not whole: Blender is silent then."""
+    """The channels of an EXR by Blender. Raises OSError if it is incomplete, which Blender does not report."""
     try:
         return read_channels(path)
     except ValueError as error:
@@ -380,7 +389,7 @@ def _rendered(path: Path) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class FinishedJob:
-    """What Cycles is to render of which file, untouched; None means as in the file."""
+    """What Cycles should render of an unchanged scene; None means as in the file."""
 
     scene: Path
     frame: int | None
@@ -390,30 +399,30 @@ class FinishedJob:
     width: int | None
     height: int | None
     cycles_samples: int | None
-    seconds: float | None  # of processor time, in place of samples
-    scripts: bool = False  # run those of the file
-    edges: bool = True  # what shines in sight also apart, with few jagged edges
+    seconds: float | None  # processor time, in place of samples
+    scripts: bool = False  # run the scripts in the file
+    edges: bool = True  # also render what emits in sight separately, with smooth edges
 
 
 @dataclass(frozen=True)
 class CyclesPicture:
-    """What Cycles has rendered, row 0 on top: channels (H, W) by name, without the name of the view layer."""
+    """What Cycles rendered, row 0 on top."""
 
-    channels: dict[str, np.ndarray]
-    guides: dict[str, np.ndarray]  # for the denoiser
-    names: dict[str, str]  # of passes, as `pass_names` has them
+    channels: dict[str, np.ndarray]  # (H, W) each, by name without that of the view layer
+    guides: dict[str, np.ndarray]  # the channels for the denoiser
+    names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
-    shining: dict[str, np.ndarray]  # (H, W, 3) what shines in sight, by the key of its pass, with few jagged edges
-    everything: tuple[str, ...]  # why all direct light is to be that of Cycles
+    shining: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
+    everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
     warnings: tuple[str, ...]
     camera: str
     frame: int
     processor_seconds: float
-    least_seconds: float  # of these what no picture of the scene takes less than
+    least_seconds: float  # the part of them that every picture of the scene takes
 
 
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
-    """The scene as Cycles renders it. Raises as `extract` does."""
+    """The unchanged scene as Cycles renders it. Raises as `extract` does."""
     scene = Path(job.scene).absolute()
     check_readable(scene)
     manifest = run_child({"task": "finished", **asdict(job), "scene": str(scene)}, folder, progress)
@@ -437,7 +446,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
 
 
 def _shining(manifest: dict, folder: Path, channels: dict[str, np.ndarray], samples: int) -> dict[str, np.ndarray]:
-    """The means of the samples of the whole scene and of those that show nothing else, {} without the latter."""
+    """`CyclesPicture.shining`: means over the samples of both the whole scene and EDGES; {} without the latter."""
     if manifest["edges"] is None:
         return {}
     name, most = manifest["edges"]
@@ -452,7 +461,7 @@ def _shining(manifest: dict, folder: Path, channels: dict[str, np.ndarray], samp
 
 
 def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:
-    """The channels: of light the mean over all chunks, of all else those of the largest one."""
+    """The channels: those of light are means over all chunks, all others come from the largest chunk."""
     files = sorted(manifest["files"], key=lambda item: -item[1])
     total, prefix, channels = sum(count for _, count in files), f"{manifest['layer']}.", {}
     for name, count in files:
@@ -472,15 +481,17 @@ PICTURE = "picture.npy"
 
 
 def show_finished(scene: Path, where: tuple, folder: Path, name: str, *, progress: Progress | None = None) -> None:
-    """Write `PICTURE` of `folder` (H, W, 4) as the PNG `name` there, through the view transform of a scene of the file
-    at a frame, `where` (None: those of the file)."""
+    """Write `PICTURE` (H, W, 4) in `folder` as the PNG `name` beside it, through the view transform of the scene.
+
+    `where` is (name of the scene, frame) in the file; None in it stands for the file's own.
+    """
     job = {"task": "show", "scene": str(Path(scene).absolute()), "pixels": str(folder / PICTURE), "name": name}
     run_child({**job, "scene_name": where[0], "frame": where[1]}, folder, progress)
 
 
 @dataclass(frozen=True)
 class BakeJob:
-    """What to take from which file for a bake; None means as in the file."""
+    """What to extract from which file for a bake; None means as in the file."""
 
     scene: Path
     objects: tuple[str, ...] | str  # names, "selected" or "all"
@@ -493,17 +504,17 @@ class BakeJob:
     frame: int | None
     cycles_samples: int
     passes: tuple[str, ...]  # of Cycles
-    finished: tuple[tuple[str, int], ...] = ()  # (object, tile): of these no maps are needed
+    finished: tuple[tuple[str, int], ...] = ()  # (object, tile) that need no maps
     look_up_images: bool = True  # False: everything that varies is a map
-    following: tuple[str, ...] = ()  # objects that jobs after this one will want of the same file
-    scripts: bool = False  # run those of the file
-    tile: int | None = None  # the UDIM tile that is wanted, None for all
-    sub_samples: int = 1  # points of a texel that the maps are wanted for
-    shadows: str = "off"  # as of `ExtractOptions`
+    following: tuple[str, ...] = ()  # objects of the same file that later jobs need
+    scripts: bool = False  # run the scripts in the file
+    tile: int | None = None  # the only UDIM tile to extract; None: all
+    sub_samples: int = 1  # points of a texel that need maps
+    shadows: str = "off"  # see `ExtractOptions`
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
-    """Meshes, materials, maps and Cycles' bake of a .blend as files in `folder`; the manifest.
+    """Write meshes, materials, maps and Cycles' bake of a .blend as files into `folder`; returns the manifest.
 
     Raises as `extract` does.
     """
@@ -512,8 +523,8 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
     return run_child({"task": "bake", **asdict(job), "scene": str(scene)}, folder, progress)
 
 
-# What a view is drawn as, the file of the first, and what the child says before it asks for a graphics card: a machine
-# without one may end it.
+# VIEW_PASSES: the pictures that are drawn of a view. VIEW_PNG: the file of the first. GRAPHICS: the stage that the
+# child reports before it asks for a graphics card; on a machine without one it may crash there.
 VIEW_PASSES = ("combined", "specular", "diffuse")
 VIEW_PNG = "view.png"
 GRAPHICS = "graphics"
@@ -525,7 +536,7 @@ NO_GRAPHICS = (
 
 @dataclass(frozen=True)
 class ViewJob:
-    """What to draw as the viewport does; None means as in the file."""
+    """What to draw as the viewport draws it; None means as in the file."""
 
     scene: Path
     techniques: tuple[str, ...]  # names or absolute paths of tables
@@ -535,14 +546,14 @@ class ViewJob:
     frame: int | None
     camera: str | None
     shadows: str  # "on" or "off"
-    shadow_rays: int  # of a light and a pixel
-    scripts: bool = False  # run those of the file
+    shadow_rays: int  # per light and pixel
+    scripts: bool = False  # run the scripts in the file
 
 
 def draw_view(job: ViewJob, folder: Path, *, progress: Progress | None = None) -> dict:
-    """Pictures of a .blend as files in `folder`: "<number of the technique>_<pass>.npy", RGBA with row 0 on top, times
-    the exposure, and `VIEW_PNG`; the manifest.
+    """Write pictures of a .blend into `folder`; returns the manifest.
 
+    The files are `VIEW_PNG` and "<number of the technique>_<pass>.npy", RGBA with row 0 on top, times the exposure.
     Raises as `extract` does.
     """
     scene, stages = Path(job.scene).absolute(), [""]
@@ -564,25 +575,25 @@ def draw_view(job: ViewJob, folder: Path, *, progress: Progress | None = None) -
 class SeenWorld:
     """A world as Cycles renders it."""
 
-    light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty where it gives none
-    lights: tuple[AreaLight, ...]  # what is small and bright in it
+    light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty if it gives no light
+    lights: tuple[AreaLight, ...]  # its small, bright spots
     background: np.ndarray  # (M, M, 3), see `viewport.sky`
     warnings: list[str]
 
 
 def look_at_world(path: Path, world: str, frame: int, folder: Path, progress: Progress | None = None) -> SeenWorld:
-    """The `world` of this name in the .blend `path`, at a frame; files go to `folder`. Raises as `extract` does."""
+    """The world named `world` in the .blend `path` at a frame; files go to `folder`. Raises as `extract` does."""
     found = run_child({"task": "world", "path": str(path), "world": world, "frame": frame}, folder, progress)
     light, background = (np.load(folder / f"{name}.npy") for name in ("light", "background"))
     return SeenWorld(light, tuple(AreaLight(**one) for one in found["lights"]), background, found["warnings"])
 
 
-LAMPS = "look at lights"  # a stage, whose fraction says of how many there are files
+LAMPS = "look at lights"  # a stage; its fraction is the share of the lights that have files
 
 
 @dataclass(frozen=True)
 class UnseenLamp:
-    """The data of a light in a .blend at whose nodes Cycles is to look, and fields of its `UnseenLight`."""
+    """A light's data block in a .blend, whose nodes Cycles should render, and fields of its `UnseenLight`."""
 
     path: str
     name: str
@@ -592,8 +603,11 @@ class UnseenLamp:
 
 
 def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Callable[..., bool]) -> None:
-    """What Cycles sees of the nodes of `lamps` at a frame, as `lights.textures.SeenNodes` has it:
-    `take(number, factor, lost)` one after another, until it says no. Files go to `folder`. Raises as `extract` does."""
+    """Let Cycles render the nodes of `lamps` at a frame, one after another.
+
+    Calls `take(number, factor, lost)` for each, with the values of a `lights.textures.SeenNodes`, until it returns
+    False. Files go to `folder`. Raises as `extract` does.
+    """
 
     def watched(stage: str, fraction: float) -> bool | None:
         number = round(fraction * len(lamps)) - 1
@@ -605,7 +619,7 @@ def look_at_lamps(lamps: list[UnseenLamp], frame: int, folder: Path, take: Calla
 
 
 def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progress | None = None) -> list[str]:
-    """Save a copy of `scene` as the .blend `path` in which objects show baked textures; the warnings.
+    """Save a copy of `scene` as the .blend `path`, in which objects show baked textures; returns warnings.
 
     Each of `textures` has "object", "uv", "name" and "files", a list of {"path", "tile"}. The copy appears complete or
     not at all. Raises as `extract` does.
@@ -618,11 +632,11 @@ def apply_bake(scene: Path, path: Path, textures: list[dict], *, progress: Progr
 def scene_facts(
     scene: Path, frames, objects, uv=None, *, scripts: bool = False, progress: Progress | None = None
 ) -> list[dict]:
-    """For each of `frames` (None: the file's own) "frame", "camera" (name or None), names of "objects" to bake, and
-    "tiles", the UDIM tiles by name of those of which each can be a task of its own.
+    """What there is to bake in each of `frames` (None: the file's own).
 
-    `objects` are names, "selected", "all", or None for none; `uv` is a UV map, None for the active ones;
-    `scripts` of the file run only if asked for. Raises as `extract` does.
+    Each entry has "frame", "camera" (name or None), "objects" (names of objects to bake) and "tiles" (the UDIM tiles
+    by object, for objects with several). `objects` are names, "selected", "all", or None for none. `uv` is a UV map;
+    None: the active ones. `scripts`: run those in the file. Raises as `extract` does.
     """
     scene = Path(scene).absolute()
     check_readable(scene)
@@ -632,9 +646,9 @@ def scene_facts(
         return run_child(job, folder, progress)["facts"]
 
 
-# What a .blend starts with: as it is, or compressed by Blender since 3.0 and before.
+# The first bytes of a .blend: uncompressed, compressed by Blender since 3.0, and compressed before.
 STARTS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
-# Pointers, byte order and version, since 5.0 with the size of the header and the version of the format before.
+# The header: pointer size, byte order and version; since 5.0 also the size of the header and the version of the format.
 _HEADER = re.compile(rb"BLENDER(?:[-_][vV](\d{3})|\d\d-\d\dv(\d{4}))")
 _HEADER_BYTES = 17
 
@@ -642,7 +656,7 @@ Version = tuple[int, int]
 
 
 def check_readable(scene: Path) -> None:
-    """Raise SceneError where a look at the file says enough, so that Blender need not start."""
+    """Raise SceneError if a look at the file is enough to tell that it cannot be opened; Blender need not start."""
     try:
         check_name(scene)
         if not scene.exists():
@@ -666,13 +680,13 @@ def check_readable(scene: Path) -> None:
 
 
 def saved_with(start: bytes) -> Version | None:
-    """Major and minor version of the Blender that saved a file with this start; None where it is compressed."""
+    """Major and minor version of the Blender that saved a file with this `start`; None if it is compressed."""
     match = _HEADER.match(start)
     return divmod(int(match[1] or match[2]), 100) if match else None
 
 
 def running() -> Version | None:
-    """Major and minor version of the Blender that will open files; None where there is none."""
+    """Major and minor version of the Blender that will open files; None if there is none."""
     bpy = sys.modules.get("bpy")
     if bpy is not None:
         return tuple(bpy.app.version[:2])

@@ -1,6 +1,6 @@
-"""What the second Blender runs: `worker.py job.json`, with pip's bpy or inside Blender (after `--`).
+"""The script that the second Blender runs: `worker.py job.json`, with pip's bpy or inside Blender (after `--`).
 
-Does this job and then those whose paths come on stdin. The result of a job is manifest.json beside it.
+It does this job, and then the jobs whose paths come on stdin. The result of a job is manifest.json beside it.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ PACKAGE_FOLDER = Path(__file__).resolve().parents[2]
 
 
 def _module(name: str):
-    """A module of the package this file lies in; run as a script, it has no package to import relatively from."""
+    """A module of the package around this file. As a script, this file has no package for relative imports."""
     return importlib.import_module(f"{PACKAGE_FOLDER.name}.{name}")
 
 
 def main() -> None:
-    """Do jobs until the parent ends this process, or is gone."""
-    # Running a script puts its own folder first, where `client` and others would be found as top-level modules.
+    """Do jobs until the parent ends this process or is gone."""
+    # Python puts the folder of a script first, where `client` and others would be found as top-level modules.
     sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
     process = _module("blender.process.blender_process")
     jobs: queue.SimpleQueue = queue.SimpleQueue()
@@ -46,11 +46,11 @@ _told = [0.0]
 
 
 def _answer(job: dict, folder: Path, progress) -> dict:
-    """Do `job` and write the manifest; the message that says so, or what is wrong."""
+    """Do `job` and write its manifest; returns the message for the parent: done, or an error."""
     files = _module("files")
     try:
         manifest = _perform(job, folder, progress)
-        # Since the last manifest: with the start of Blender in the first one.
+        # Counted since the last manifest; the first one includes the start of Blender.
         manifest["processor_seconds"] = time.process_time() - _told[0]
         _told[0] = time.process_time()
         (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
@@ -97,5 +97,5 @@ if __name__ == "__main__":
         traceback.print_exc()
         sys.stdout.flush()
         sys.stderr.flush()
-        # Nothing is left to save, and bpy 4.5 can hang at the end.
+        # There is nothing to save, and bpy 4.5 can hang at exit.
         os._exit(1)

@@ -18,7 +18,18 @@ from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, 
 from ..evaluated import SURFACE_TYPES, is_rendered, normals_at_corners, owner_of, read_values
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
-from ..materials.values import Curved, Value, combined, constant, curved_at, is_gray, is_srgb, product, value_at
+from ..materials.values import (
+    Curved,
+    Value,
+    combined,
+    constant,
+    curved_at,
+    is_gray,
+    is_srgb,
+    limited,
+    product,
+    value_at,
+)
 from ..render_settings import cycles_setting
 
 # AS_IT_IS: the places of occluders that are not points.
@@ -298,23 +309,23 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
     if node.bl_idname == CLEAR:
         return value_at(node.inputs["Color"], groups)
     if node.bl_idname == PRINCIPLED:
-        return _sum(constant(1.0), curved_at(node.inputs["Alpha"], groups), 1.0, -1.0)
+        return combined(constant(1.0), limited(curved_at(node.inputs["Alpha"], groups)), 1.0, -1.0)
     if node.bl_idname not in (MIX, ADD):
         return constant(0.0)
     parts = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == ADD:
-        return _sum(*parts, 1.0, 1.0)
+        return combined(*parts, 1.0, 1.0)
     if all(_is_constant(part) and not part.offset.any() for part in parts):
         return parts[0]  # whatever the factor is
     factor = _factor_at(node.inputs[0], groups)
     if factor is None:
         return None
     if _is_constant(factor):
-        share = float(np.clip(factor.offset[0], 0.0, 1.0))
+        share = float(factor.offset[0])
         # The other shader does not contribute and may be unknown.
         if share in (0.0, 1.0):
             return parts[int(share)]
-        return _sum(*parts, 1.0 - share, share)
+        return combined(*parts, 1.0 - share, share)
     first, second = parts
     if not (_is_constant(first) and _is_constant(second)):
         return None
@@ -328,22 +339,13 @@ def _is_constant(value: Value | Curved | None) -> bool:
     return isinstance(value, Value) and value.is_constant
 
 
-def _sum(first, second, first_share: float, second_share: float) -> Value | Curved | None:
-    """As `combined`, also for one `Curved` and one constant; None for other pairs with a `Curved`."""
-    pairs = (first, first_share, second, second_share), (second, second_share, first, first_share)
-    for one, share, other, other_share in pairs:
-        if isinstance(one, Curved):
-            return one.mapped(share, other_share * float(other.offset.mean())) if _is_constant(other) else None
-    return combined(first, second, first_share, second_share)
-
-
 def _factor_at(socket, groups) -> Value | Curved | None:
     """The factor of a Mix Shader node for shadow rays, which are of no other type; None: unknown."""
     source = source_of(socket, groups)
     if source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeLightPath":
         name = source.socket.name
         return constant(float(name == "Is Shadow Ray")) if name.startswith("Is ") else None
-    return curved_at(socket, groups)
+    return limited(curved_at(socket, groups))
 
 
 def _values_of_image(value: Value) -> np.ndarray | None:

@@ -143,9 +143,11 @@ def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
     source = source_of(socket, groups)
     if not _has_falloff(source):
         return [(socket, groups)], Falloff()
-    node, groups = source.node, source.groups
+    node, groups, kinds = source.node, source.groups, {socket.type, *source.passed}
+    if kinds - {"VALUE", "RGBA", "VECTOR"}:
+        return None  # whole numbers
     if node.bl_idname != LIGHT_FALLOFF:
-        entries = _multiplied(node, socket.type == "VALUE")
+        entries = _multiplied(node, "VALUE" in kinds)
         return None if entries is None else _joined([_factors(entry, groups) for entry in entries])
     smooth = value_at(node.inputs["Smooth"], groups)
     if smooth is None or not smooth.is_constant or source.socket.name not in POWERS:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import bpy
@@ -25,9 +25,21 @@ def live_link(socket):
     """The link that feeds the input `socket`, or None. Values from Open Shading Language do not count."""
     for link in socket.links:
         is_script = link.from_node.bl_idname == SCRIPT and not link.from_node.mute and socket.type != "SHADER"
-        if not link.is_muted and link.is_valid and not is_script:
+        if not link.is_muted and link.is_valid and not is_script and not _is_dead(link.from_socket):
             return link
     return None
+
+
+def _is_dead(output) -> bool:
+    """True if Cycles ignores links from `output`: those of muted nodes that pass nothing on to it.
+
+    From 5.0 on also those of muted nodes and reroutes that pass on an input which is not linked.
+    """
+    node = output.node
+    if not node.mute and node.bl_idname != "NodeReroute":
+        return False
+    entry = passed_through(node, output) if node.mute else node.inputs[0]
+    return entry is None or (bpy.app.version >= (5, 0, 0) and live_link(entry) is None)
 
 
 def value_of(socket):
@@ -100,10 +112,19 @@ class Source:
     socket: Any
     node: Any
     groups: tuple = ()  # the group nodes around it, outermost first
+    passed: tuple[str, ...] = ()  # types of the sockets of groups and muted nodes between it and what it feeds
 
     def input(self, name) -> Source | None:
         """The source of the input `name` (or position) of the node."""
         return source_of(self.node.inputs[name], self.groups)
+
+    def arrives_whole(self, kind: str) -> bool:
+        """True if nothing on the way to a socket of type `kind` converts the value, but for a number if one is wanted.
+
+        Versions of Blender differ in other conversions.
+        """
+        others = {*self.passed, kind} - {self.socket.type}
+        return others <= ({"VALUE"} if kind == "VALUE" else {"RGBA", "VECTOR"})
 
 
 NODE_TREE = operator.attrgetter("node_tree")
@@ -123,6 +144,8 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
     node, entry = output.node, None
     if node.mute:
         entry = passed_through(node, output)
+        if entry is not None and live_link(entry) is None:
+            return None  # in 4.5 Cycles takes 0
     elif node.bl_idname == "NodeReroute":
         entry = node.inputs[0]
     elif is_group(node):
@@ -137,13 +160,18 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
             groups = groups[:-1]
     else:
         return Source(output, node, groups)
-    return None if entry is None else source_of(entry, groups, tree_of)
+    found = None if entry is None else source_of(entry, groups, tree_of)
+    if found is None or node.bl_idname == "NodeReroute":
+        return found
+    return replace(found, passed=(*found.passed, entry.type, output.type))
 
 
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:
     """The constant at the input `socket` inside `groups`; None if nodes compute it. `tree_of`: see `source_behind`."""
     source = source_of(socket, groups, tree_of)
-    if source is None or (source.node is not None and source.node.bl_idname != "ShaderNodeValue"):
+    if source is None or not source.arrives_whole(socket.type):
+        return None
+    if source.node is not None and source.node.bl_idname != "ShaderNodeValue":
         return None
     value = getattr(source.socket, "default_value", None)
     return float(value) if isinstance(value, (int, float)) else None

@@ -15,7 +15,7 @@ from ...cycles.lobes import LOBE_AOVS
 from ...files import save_array
 from ..render_settings import working_space
 from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
-from .values import is_srgb, opaque_pixels
+from .values import has_plain_mapping, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
@@ -44,16 +44,20 @@ class SavedImages:
         return name
 
 
-def plain_texture(output, groups):
+def plain_texture(output, groups, kind: str):
     """(image texture node, how it is read, its part) if the `output` of a node shows a texture unchanged, else None.
 
-    `groups` are those around the node (see `graph.Source`). How it is read is a dictionary for
-    `cycles.texels.BakeMaterial`. The part is "color", or a channel "0", "1" or "2".
+    `groups` are those around the node (see `graph.Source`), `kind` is the type of the socket that shows it. How it is
+    read is a dictionary for `cycles.texels.BakeMaterial`. The part is "color", or a channel "0", "1" or "2".
     """
     found, part = source_behind(output, groups), "color"
+    if found is not None and not found.arrives_whole(kind):
+        return None
     if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
         part = str(list(found.node.outputs).index(found.socket))
         found = found.input(0)
+        if found is not None and not found.arrives_whole("RGBA"):
+            return None
     if not _is_node(found, "ShaderNodeTexImage") or found.socket.name != "Color" or found.node.image is None:
         return None
     node = found.node
@@ -70,7 +74,7 @@ def _is_node(source, kind: str) -> bool:
 def _uv_map(texture) -> str | None:
     """Name of the UV map at which an image texture is read, "" for the default one; None for other coordinates."""
     found = texture.input("Vector")
-    if found is None:
+    if found is None or not found.arrives_whole("VECTOR"):
         return None
     if found.node is None:
         # The texture's own unlinked input means the default UV map; the unlinked input of a group is a constant.
@@ -83,16 +87,11 @@ def _uv_map(texture) -> str | None:
 
 
 def _is_plain(node) -> bool:
-    mapping = node.texture_mapping
     return (
         node.projection == "FLAT"
         and node.extension in EXTENSIONS
         and node.interpolation in INTERPOLATIONS
-        and not any((*mapping.translation, *mapping.rotation))
-        and tuple(mapping.scale) == (1.0, 1.0, 1.0)
-        and (mapping.mapping_x, mapping.mapping_y, mapping.mapping_z) == ("X", "Y", "Z")
-        and mapping.vector_type == "POINT"
-        and not (mapping.use_min or mapping.use_max)
+        and has_plain_mapping(node)
     )
 
 
@@ -174,11 +173,11 @@ class MaterialPlan:
 
     def _looked_up(self, name, socket, groups):
         """The record of a socket that shows an image unchanged, or None."""
-        found = plain_texture(socket, groups)
+        is_color = LOBE_AOVS[name][0] == "COLOR"
+        found = plain_texture(socket, groups, "RGBA" if is_color else "VALUE")
         if found is None or found[1]["uv"] not in self._uv_names:
             return None
         node, place, part = found
-        is_color = LOBE_AOVS[name][0] == "COLOR"
         if is_color and part != "color":
             return None
         file = self._images.file_of(node.image)

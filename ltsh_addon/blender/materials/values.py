@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import bpy
 import numpy as np
 
-from ...cycles.images import EXTENSIONS, INTERPOLATIONS
+from ...cycles.images import EXTENSIONS, GRAY, INTERPOLATIONS
 from .graph import Source, source_of
 
-LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec.709 luminance, by which Blender converts colors to numbers
+# How Blender converts colors and vectors to numbers.
+TO_NUMBER = {"RGBA": GRAY, "VECTOR": np.full(3, 1.0 / 3.0)}
+# ROUNDED: by so much the range of an image may exceed a limit: weights of `GRAY` add up to 1 so nearly.
+ROUNDED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,18 @@ class Value:
         image_matrix = None if self.matrix is None else matrix @ self.matrix
         return Value(matrix @ self.offset + offset, image_matrix, self.image)
 
-    def as_number(self) -> Value:
-        """The luminance of the color, in all three components."""
-        return self.mapped(np.broadcast_to(LUMA, (3, 3)))
+    def as_number(self, kind: str = "RGBA") -> Value:
+        """What a number socket makes of this color, or of this vector (`kind` VECTOR), in all three components."""
+        return self if is_gray(self) else self.mapped(np.broadcast_to(TO_NUMBER[kind], (3, 3)))
+
+    @property
+    def range(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the largest value (3,) that each component may have."""
+        if self.is_constant:
+            return self.offset, self.offset
+        if not _is_from_0_to_1(self.image.image):
+            return np.full(3, -np.inf), np.full(3, np.inf)
+        return tuple(self.offset + limit(self.matrix, 0.0).sum(axis=1) for limit in (np.minimum, np.maximum))
 
 
 def is_gray(value: Value) -> bool:
@@ -55,51 +68,131 @@ def is_gray(value: Value) -> bool:
     return bool(np.all(rows == rows[:1]))
 
 
+def _is_from_0_to_1(image) -> bool:
+    """True if all values that Cycles reads from `image` are known to be in [0, 1]."""
+    space = image.colorspace_settings
+    # Cycles may divide colors by alpha if they are stored as products with it.
+    return not image.is_float and space.name in BYTE_SPACES and (space.is_data or image.alpha_mode != "PREMUL")
+
+
 def constant(number) -> Value:
     """The value of a number, or of the first three components of a color."""
     return Value(np.array(np.broadcast_to(np.ravel(number)[:3], (3,)), np.float64))
 
 
-def combined(first: Value | None, second: Value | None, first_share, second_share) -> Value | None:
-    """first_share * first + second_share * second; None if one is unknown or they have different images."""
+@dataclass(frozen=True)
+class Curved:
+    """A number that is a piecewise linear, monotonic function of the gray `value`: `numbers` at `places`.
+
+    Before the first and behind the last place it stays what it is there.
+    """
+
+    value: Value
+    places: tuple[float, ...]
+    numbers: tuple[float, ...]
+
+    @property
+    def is_constant(self) -> bool:
+        return False
+
+    def mapped(self, factor: float, offset: float) -> Curved:
+        """`factor` times this number, plus `offset`."""
+        return Curved(self.value, self.places, tuple(factor * number + offset for number in self.numbers))
+
+    def limited(self, low: float, high: float) -> Curved:
+        """This number, limited to [low, high]."""
+        places, numbers = np.array(self.places), np.array(self.numbers)
+        for level in (low, high):
+            # Where a piece crosses the level it gets a bend.
+            off = numbers - level
+            (piece,) = np.nonzero(off[:-1] * off[1:] < 0.0)
+            share = off[piece] / (off[piece] - off[piece + 1])
+            bends = places[piece] + share * (places[piece + 1] - places[piece])
+            places, numbers = np.insert(places, piece + 1, bends), np.insert(numbers, piece + 1, level)
+        return Curved(self.value, tuple(places.tolist()), tuple(np.clip(numbers, low, high).tolist()))
+
+
+def limited(value: Value | Curved | None, low: float = 0.0, high: float = 1.0) -> Value | Curved | None:
+    """`value` limited to [low, high], as by Clamp; None if it is unknown or cannot be expressed."""
+    if value is None or isinstance(value, Curved):
+        return None if value is None else value.limited(low, high)
+    if value.is_constant or low > high:
+        return constant(np.clip(value.offset, low, high))
+    least, most = value.range
+    if np.all(least >= low - ROUNDED) and np.all(most <= high + ROUNDED):
+        return value
+    if not is_gray(value):
+        return None
+    return Curved(value, (low, high), (low, high)) if low < high else constant(low)
+
+
+def combined(first, second, first_share, second_share) -> Value | Curved | None:
+    """first_share * first + second_share * second; None if one is unknown or the sum cannot be expressed.
+
+    Both may be images if they are the same one. A `Curved` needs a constant beside it.
+    """
     if first is None or second is None:
         return None
     if not first.is_constant and not second.is_constant:
-        if first.image != second.image:
+        if isinstance(first, Curved) or isinstance(second, Curved) or first.image != second.image:
             return None
         matrix = first_share * first.matrix + second_share * second.matrix
         return Value(first_share * first.offset + second_share * second.offset, matrix, first.image)
     carrier, share, other, other_share = first, first_share, second, second_share
     if first.is_constant:
         carrier, share, other, other_share = second, second_share, first, first_share
+    if isinstance(carrier, Curved):
+        return carrier.mapped(float(share), float(other_share * other.offset.mean()))
     return carrier.mapped(share * np.eye(3), other_share * other.offset)
 
 
-def product(first: Value | None, second: Value | None) -> Value | None:
-    """The product; None if one is unknown or both have images."""
+def product(first, second) -> Value | Curved | None:
+    """The product; None if one is unknown or both vary."""
     if first is None or second is None:
         return None
     if not first.is_constant:
         first, second = second, first
-    return second.mapped(np.diag(first.offset)) if first.is_constant else None
+    if not first.is_constant:
+        return None
+    if isinstance(second, Curved):
+        return second.mapped(float(first.offset.mean()), 0.0)
+    return second.mapped(np.diag(first.offset))
 
 
 def value_at(socket, groups: tuple = ()) -> Value | None:
     """The value at the input `socket` inside `groups`, converted to a number for a number socket; None: unknown."""
-    value = value_of_source(source_of(socket, groups))
-    if value is not None and socket.type == "VALUE":
-        return value if is_gray(value) else value.as_number()
-    return value
+    found = _found_at(socket, groups)
+    return found if isinstance(found, Value) else None
 
 
-def value_of_source(source: Source | None) -> Value | None:
-    """The value of `source`; None: unknown."""
+def curved_at(socket, groups: tuple = ()) -> Value | Curved | None:
+    """As `value_at` for a number socket, but also through limits, a threshold or a color ramp, which apply after the
+    image is interpolated."""
+    found, source = _found_at(socket, groups), source_of(socket, groups)
+    is_ramp = source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeValToRGB"
+    return _curved_ramp(source) if found is None and is_ramp and set(source.passed) <= {"VALUE"} else found
+
+
+def _found_at(socket, groups: tuple) -> Value | Curved | None:
+    source = source_of(socket, groups)
     if source is None:
         return None
     if source.node is None:
-        return constant(source.socket.default_value) if hasattr(source.socket, "default_value") else None
-    reader = READERS.get(source.node.bl_idname)
-    return None if reader is None else reader(source)
+        value = constant(source.socket.default_value) if hasattr(source.socket, "default_value") else None
+    else:
+        reader = READERS.get(source.node.bl_idname)
+        value = None if reader is None else reader(source)
+    return None if value is None else _arriving(value, source, socket.type)
+
+
+def _arriving(value: Value | Curved, source: Source, kind: str) -> Value | Curved | None:
+    """What arrives of the `value` of `source` at a socket of type `kind`; None if it is converted on the way."""
+    if isinstance(value, Curved) or is_gray(value):
+        kinds = {*source.passed, kind} - {source.socket.type}
+        return value if kinds <= {"VALUE", "RGBA", "VECTOR"} else None
+    if not source.arrives_whole(kind):
+        return None
+    return value.as_number(source.socket.type) if kind == "VALUE" else value
 
 
 def input_value(source: Source, name) -> Value | None:
@@ -113,64 +206,18 @@ def constant_inputs(source: Source, *names) -> list[np.ndarray] | None:
     return [value.offset for value in values] if all(value and value.is_constant for value in values) else None
 
 
-@dataclass(frozen=True)
-class Curved:
-    """A number that is a piecewise linear, monotonic function of the gray `value`: `numbers` at `places`."""
-
-    value: Value
-    places: tuple[float, ...]
-    numbers: tuple[float, ...]
-
-    def mapped(self, factor: float, offset: float) -> Curved:
-        """`factor` times this number, plus `offset`."""
-        return Curved(self.value, self.places, tuple(factor * number + offset for number in self.numbers))
-
-
-def curved_at(socket, groups: tuple = ()) -> Value | Curved | None:
-    """As `value_at`, but also through a threshold or a color ramp, which applies after the image is interpolated."""
-    value, source = value_at(socket, groups), source_of(socket, groups)
-    if value is not None or source is None or source.node is None:
-        return value
-    if source.node.bl_idname == "ShaderNodeMath":
-        return _curved_math(source)
-    return _curved_ramp(source) if source.node.bl_idname == "ShaderNodeValToRGB" else None
-
-
-def _curved_math(source: Source) -> Curved | None:
-    node = source.node
-    first, second = (curved_at(node.inputs[number], source.groups) for number in (0, 1))
-    if not isinstance(second, Value) or not second.is_constant:
-        # A constant comes first, as in 1 - x.
-        if isinstance(second, Curved) and isinstance(first, Value) and first.is_constant:
-            number = float(first.offset[0])
-            found = {"SUBTRACT": (-1.0, number), "ADD": (1.0, number), "MULTIPLY": (number, 0.0)}.get(node.operation)
-            return None if found is None else second.mapped(*found)
-        return None
-    number = float(second.offset[0])
-    if isinstance(first, Curved):
-        found = {"SUBTRACT": (1.0, -number), "ADD": (1.0, number), "MULTIPLY": (number, 0.0)}.get(node.operation)
-        return None if found is None else first.mapped(*found)
-    if first is None:
-        return None
-    number = np.float32(number)
-    if node.operation == "GREATER_THAN":
-        return Curved(first, (float(number), float(np.nextafter(number, np.float32(np.inf)))), (0.0, 1.0))
-    if node.operation == "LESS_THAN":
-        return Curved(first, (float(np.nextafter(number, np.float32(-np.inf))), float(number)), (1.0, 0.0))
-    return None
-
-
-# RAMP_ENTRIES: of the table into which Cycles converts a color ramp.
-RAMP_ENTRIES = 256
+# RAMP_STEPS: between the entries of the table into which Cycles converts a color ramp.
+RAMP_STEPS = 256
 
 
 def _curved_ramp(source: Source) -> Curved | None:
+    """The number that a color ramp makes of an image; None if that is unknown or not monotonic."""
     value, ramp = input_value(source, 0), source.node.color_ramp
     if value is None:
         return None
-    places = np.arange(RAMP_ENTRIES, dtype=np.float32) / np.float32(RAMP_ENTRIES - 1)
+    places = np.arange(RAMP_STEPS + 1, dtype=np.float32) / np.float32(RAMP_STEPS)
     colors = np.array([ramp.evaluate(float(place)) for place in places])
-    numbers = colors[:, 3] if source.socket.name == "Alpha" else colors[:, :3] @ LUMA
+    numbers = colors[:, 3] if source.socket.name == "Alpha" else colors[:, :3] @ GRAY
     steps = np.diff(numbers)
     if not ((steps >= 0.0).all() or (steps <= 0.0).all()):
         return None
@@ -190,13 +237,14 @@ def _image(source: Source) -> Value | None:
     node = source.node
     if node.image is None or node.projection != "FLAT" or node.image.source not in ("FILE", "GENERATED"):
         return None
-    if node.interpolation not in INTERPOLATIONS or node.extension not in EXTENSIONS:
+    if node.interpolation not in INTERPOLATIONS or node.extension not in EXTENSIONS or not has_plain_mapping(node):
         return None
     place = coordinates(source.input("Vector"))
     if place is None:
         return None
     uv_map, mapping = place
-    by_alpha = node.image.alpha_mode == "STRAIGHT" and not node.outputs["Alpha"].is_linked
+    is_straight = node.image.alpha_mode == "STRAIGHT" and not node.image.colorspace_settings.is_data
+    by_alpha = is_straight and not node.outputs["Alpha"].is_linked
     use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension, by_alpha)
     matrix = np.zeros((3, 4))
     if source.socket.name == "Alpha":
@@ -209,9 +257,21 @@ def _image(source: Source) -> Value | None:
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 
+def has_plain_mapping(node) -> bool:
+    """True if the mapping inside a texture node, which scripts and old files have, changes nothing."""
+    mapping = node.texture_mapping
+    return (
+        not any((*mapping.translation, *mapping.rotation))
+        and tuple(mapping.scale) == (1.0, 1.0, 1.0)
+        and (mapping.mapping_x, mapping.mapping_y, mapping.mapping_z) == ("X", "Y", "Z")
+        and mapping.vector_type == "POINT"
+        and not (mapping.use_min or mapping.use_max)
+    )
+
+
 def coordinates(source: Source | None):
     """(UV map, mapping) of a texture's vector, a UV map through any constant Mapping nodes; None for other vectors."""
-    if source is None:
+    if source is None or not source.arrives_whole("VECTOR"):
         return None
     node = source.node
     if node is None:
@@ -263,8 +323,15 @@ def _to_number(source: Source) -> Value | None:
     return None if value is None else value.as_number()
 
 
+def _power(base, exponent):
+    # Cycles gives 0 where the power is not a real number.
+    is_known = (base >= 0.0) | (exponent == np.trunc(exponent))
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.power(np.where(is_known, base, 0.0), np.where(is_known, exponent, 1.0))
+
+
 MATH: dict[str, Callable] = {
-    "POWER": lambda a, b: np.power(np.maximum(a, 0.0), b),
+    "POWER": _power,
     "MINIMUM": np.minimum,
     "MAXIMUM": np.maximum,
     "DIVIDE": lambda a, b: np.divide(a, b, out=np.zeros(3), where=b != 0.0),
@@ -275,49 +342,68 @@ MATH: dict[str, Callable] = {
 }
 
 
-def _math(source: Source) -> Value | None:
-    node, first, second = source.node, input_value(source, 0), input_value(source, 1)
+def _math(source: Source) -> Value | Curved | None:
+    node = source.node
+    first, second, third = (curved_at(socket, source.groups) for socket in node.inputs)
     if node.operation == "MULTIPLY_ADD":
-        result = combined(product(first, second), input_value(source, 2), 1.0, 1.0)
+        result = combined(product(first, second), third, 1.0, 1.0)
     else:
         result = _math_of(node.operation, first, second)
-    return _clamped(result) if node.use_clamp else result
+    return limited(result) if node.use_clamp else result
 
 
-def _math_of(operation: str, first: Value | None, second: Value | None) -> Value | None:
+def _math_of(operation: str, first, second) -> Value | Curved | None:
     if operation in ("ADD", "SUBTRACT"):
         return combined(first, second, 1.0, 1.0 if operation == "ADD" else -1.0)
     if operation == "MULTIPLY":
         return product(first, second)
-    if operation == "DIVIDE" and second is not None and second.is_constant and np.all(second.offset != 0.0):
+    if first is None or second is None or not second.is_constant:
+        return None
+    if operation == "DIVIDE" and np.all(second.offset != 0.0):
         return product(first, constant(1.0 / second.offset))
-    if operation in MATH and first is not None and second is not None and first.is_constant and second.is_constant:
-        return constant(MATH[operation](first.offset, second.offset))
+    if first.is_constant:
+        return _if_finite(MATH[operation](first.offset, second.offset)) if operation in MATH else None
+    return _cut(operation, first, float(second.offset[0])) if isinstance(first, Value) else None
+
+
+def _if_finite(numbers) -> Value | None:
+    return constant(numbers) if np.all(np.isfinite(numbers)) else None
+
+
+def _cut(operation: str, value: Value, threshold: float) -> Curved | None:
+    """The `value` of an image, above or below a threshold; None for other operations."""
+    threshold = np.float32(threshold)
+    if operation == "GREATER_THAN":
+        return Curved(value, (float(threshold), float(np.nextafter(threshold, np.float32(np.inf)))), (0.0, 1.0))
+    if operation == "LESS_THAN":
+        return Curved(value, (float(np.nextafter(threshold, np.float32(-np.inf))), float(threshold)), (1.0, 0.0))
     return None
 
 
-def _clamped(value: Value | None) -> Value | None:
-    return constant(np.clip(value.offset, 0.0, 1.0)) if value is not None and value.is_constant else None
-
-
-def _mix(source: Source) -> Value | None:
+def _mix(source: Source) -> Value | Curved | None:
     """Mix and MixRGB by a constant factor."""
     node = source.node
-    factor, first, second = 0, 1, 2
-    if node.bl_idname == "ShaderNodeMix":
-        if node.data_type == "RGBA":
-            factor, first, second = 0, 6, 7
-        elif node.data_type == "FLOAT":
-            factor, first, second = 0, 2, 3
-        else:
-            return None
-    blend = node.blend_type if getattr(node, "data_type", "RGBA") == "RGBA" else "MIX"
-    shares, first, second = constant_inputs(source, factor), input_value(source, first), input_value(source, second)
+    is_number = node.bl_idname == "ShaderNodeMix" and node.data_type == "FLOAT"
+    if is_number:
+        first, second = (curved_at(node.inputs[place], source.groups) for place in (2, 3))
+    elif node.bl_idname == "ShaderNodeMixRGB":
+        first, second = input_value(source, 1), input_value(source, 2)
+    elif node.data_type == "RGBA":
+        first, second = input_value(source, 6), input_value(source, 7)
+    else:
+        return None
+    shares = constant_inputs(source, 0)
     if shares is None:
         return None
     share = float(shares[0][0])
     if getattr(node, "clamp_factor", True):
         share = min(max(share, 0.0), 1.0)
+    result = _blended("MIX" if is_number else node.blend_type, first, second, share)
+    is_limited = not is_number and (node.use_clamp if node.bl_idname == "ShaderNodeMixRGB" else node.clamp_result)
+    return limited(result) if is_limited else result
+
+
+def _blended(blend: str, first, second, share: float) -> Value | Curved | None:
     if blend == "MIX":
         return combined(first, second, 1.0 - share, share)
     if blend in ("ADD", "SUBTRACT"):
@@ -339,23 +425,40 @@ def _gamma(source: Source) -> Value | None:
     power, both = constant_inputs(source, 1), constant_inputs(source, 0, 1)
     if both is None:
         return input_value(source, 0) if power is not None and np.all(power[0] == 1.0) else None
-    return constant(np.power(np.maximum(both[0], 0.0), both[1]))
+    color, gamma = both[0], both[1][0]
+    is_raised = color > 0.0  # Cycles leaves other components as they are
+    if gamma == 0.0 and not is_raised.all():
+        return None  # versions of Blender differ
+    with np.errstate(over="ignore"):
+        return _if_finite(np.where(is_raised, np.power(np.where(is_raised, color, 1.0), gamma), color))
 
 
 def _ramp(source: Source) -> Value | None:
-    factor = constant_inputs(source, 0)
+    factor, ramp = constant_inputs(source, 0), source.node.color_ramp
     if factor is None:
         return None
-    color = source.node.color_ramp.evaluate(float(factor[0][0]))
+    place = min(max(float(factor[0][0]), 0.0), 1.0)
+    color = np.array(ramp.evaluate(place))
+    if bpy.app.version < (5, 0, 0):
+        # Later versions do not take constants from the table.
+        entry = int(RAMP_STEPS * place)
+        share = 0.0 if ramp.interpolation == "CONSTANT" else RAMP_STEPS * place - entry
+        color, after = (np.array(ramp.evaluate(min(number / RAMP_STEPS, 1.0))) for number in (entry, entry + 1))
+        color = (1.0 - share) * color + share * after
     return constant(color[3]) if source.socket.name == "Alpha" else constant(color)
 
 
-def _clamp(source: Source) -> Value | None:
-    parts = constant_inputs(source, 0, 1, 2)
-    return None if parts is None else constant(np.clip(*parts))
+def _clamp(source: Source) -> Value | Curved | None:
+    limits = constant_inputs(source, 1, 2)
+    if limits is None:
+        return None
+    low, high = (float(limit[0]) for limit in limits)
+    if source.node.clamp_type == "RANGE" and low > high:
+        low, high = high, low
+    return limited(curved_at(source.node.inputs[0], source.groups), low, high)
 
 
-READERS: dict[str, Callable[[Source], Value | None]] = {
+READERS: dict[str, Callable[[Source], Value | Curved | None]] = {
     "ShaderNodeValue": _own_value,
     "ShaderNodeRGB": _own_value,
     "ShaderNodeTexImage": _image,

@@ -362,12 +362,52 @@ def ramped(made, steps="CONSTANT", **settings):
     return inside
 
 
+def counted(made, source, *steps):
+    """The output of Math nodes after `source`, each (operation, number, clamp)."""
+    for operation, number, clamp in steps:
+        node = made.tree.nodes.new("ShaderNodeMath")
+        node.operation, node.use_clamp, node.inputs[1].default_value = operation, clamp, number
+        made.tree.links.new(source, node.inputs[0])
+        source = node.outputs[0]
+    return source
+
+
+def clamped_cut(made, **settings):
+    """A threshold of which a clamped difference is taken: alphas of 0.25 and 0.75."""
+    inside = made.shader("BsdfPrincipled")
+    alpha = counted(made, cut_alpha(made, **settings), ("SUBTRACT", 0.5, True), ("ADD", 0.25, False))
+    made.tree.links.new(alpha, inside.node.inputs["Alpha"])
+    return inside
+
+
+def mixed_by_more_than_one(made, **settings):
+    """By an alpha of up to 2, which Cycles clamps."""
+    return made.mix(counted(made, textured(made, "Alpha", **settings), ("MULTIPLY", 2.0, False)),
+                    clear(made, 0.2), clear(made, 0.8))  # fmt: skip
+
+
+def limited(made, **settings):
+    inside, node = made.shader("BsdfPrincipled"), made.tree.nodes.new("ShaderNodeClamp")
+    node.clamp_type, node.inputs["Min"].default_value, node.inputs["Max"].default_value = "RANGE", 0.7, 0.2
+    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
+    made.tree.links.new(node.outputs[0], inside.node.inputs["Alpha"])
+    return inside
+
+
+def more_than_opaque(made):
+    inside = made.shader("BsdfPrincipled")
+    made.tree.links.new(made.value(1.6), inside.node.inputs["Alpha"])
+    return made.mix(made.value(0.5), clear(made), inside)
+
+
 CUT = {"above a threshold": cut_image, "below a threshold": mixed_by_cut, "ramp of steps": ramped,
-       "linear ramp": lambda made, **settings: ramped(made, "LINEAR", **settings)}  # fmt: skip
+       "linear ramp": lambda made, **settings: ramped(made, "LINEAR", **settings),
+       "clamped threshold": clamped_cut, "factor beyond 1": mixed_by_more_than_one, "limited": limited}  # fmt: skip
 
 # What a pane's share is, if it is the same everywhere.
 MATERIALS = {
     "constant": (lambda made: made.mix(made.value(0.3), made.leaf(0.5), clear(made)), 0.3),
+    "alpha beyond 1": (more_than_opaque, 0.5),
     "principled alpha": (lambda made: made.shader("BsdfPrincipled", Alpha=0.35), 0.65),
     "added": (lambda made: made.add(clear(made, 0.25), made.add(clear(made, 0.25), made.leaf(0.5))), 0.5),
     "nested": (stack, 0.375),

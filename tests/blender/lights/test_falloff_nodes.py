@@ -71,13 +71,21 @@ def test_nodes_are_as_before_after_a_look():
     assert links() == before and smooth == [2.0, 0.0]
 
 
-def test_a_falloff_that_is_no_factor_is_named():
+@pytest.mark.parametrize("kind", ["sine", "whole numbers"])
+def test_a_falloff_that_is_no_factor_is_named(kind):
     start()
     tree, emission = light_tree(scene_parts.add_area_light("Odd"))
-    sine = tree.nodes.new("ShaderNodeMath")
-    sine.operation = "SINE"
-    tree.links.new(add_falloff(tree, "Linear", math.pi / 2.0), sine.inputs[0])
-    tree.links.new(sine.outputs[0], emission.inputs["Strength"])
+    if kind == "sine":
+        node = tree.nodes.new("ShaderNodeMath")
+        node.operation = "SINE"
+        tree.links.new(add_falloff(tree, "Linear", math.pi / 2.0), node.inputs[0])
+    else:
+        group = bpy.data.node_groups.new("Cut", "ShaderNodeTree")
+        group.interface.new_socket("Strength", in_out="OUTPUT", socket_type="NodeSocketInt")
+        group.links.new(add_falloff(group, "Linear", 1.0), group.nodes.new("NodeGroupOutput").inputs[0])
+        node = tree.nodes.new("ShaderNodeGroup")
+        node.node_tree = group
+    tree.links.new(node.outputs[0], emission.inputs["Strength"])
     _, _, inventory, warnings = scene_parts.prepare()
     assert sum("'Odd'" in line and "Light Falloff" in line for line in warnings) == 1, warnings
     assert np.allclose(inventory.lights[0].radiance, 100.0 / math.pi / (1.2 * 0.7), rtol=1e-4)

@@ -74,6 +74,22 @@ def test_a_group_is_followed_for_each_of_its_users(tmp_path):
     assert np.allclose(surface.roughness[left], 0.77) and np.allclose(surface.roughness[right], 0.33)
 
 
+@pytest.mark.parametrize("is_rerouted", [False, True])
+def test_a_muted_texture_leaves_the_color_of_the_socket(tmp_path, is_rerouted):
+    """As in Cycles, where it is black behind a reroute before Blender 5.0."""
+    material, node = bsdf_material(GLOSSY, Color=(0.7, 0.4, 0.2, 1.0))
+    tree = material.node_tree
+    texture, reroute = (tree.nodes.new(name) for name in ("ShaderNodeTexImage", "NodeReroute"))
+    texture.mute, output = True, texture.outputs[0]
+    if is_rerouted:
+        tree.links.new(output, reroute.inputs[0])
+        output = reroute.outputs[0]
+    tree.links.new(output, node.inputs["Color"])
+    surface, _, warnings = seen_from_above(tmp_path, material)
+    is_black = is_rerouted and bpy.app.version < (5, 0, 0)
+    assert np.allclose(surface.specular_f0, 0.0 if is_black else (0.7, 0.4, 0.2)) and warnings == []
+
+
 @pytest.mark.parametrize("slots", ["none", "empty"])
 def test_without_material_the_surface_is_cycles_default(tmp_path, slots):
     plane = add_plane()

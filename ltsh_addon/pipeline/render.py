@@ -46,7 +46,7 @@ REST = "rest"
 # Points of a pixel where nothing is said; of a budget those of the first look, and at most.
 SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 2, 17
 # Processor seconds that denoising and writing take at least, for a million pixels, and those of each further denoising.
-START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.5, 12.0, 4.0
+START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.25, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
 # Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
@@ -66,9 +66,10 @@ FEWEST_POINTS, MOST_FINER, FINER_SHARE, MOST_EDGES = 8, 1.0, 0.3, 0.3
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
 # What direct light will take is told from squares of so many pixels on a side that have a share of its samples: with
-# these the time grows to a power, from the first squares at least 0.5, from the second 0.49 to 0.84 in six scenes of
-# two sizes. Of what is left it may take so much.
-SQUARE, PROBES, DIRECT_SHARE = 8, ((0.01, 0.5), (0.04, 0.7)), 0.45
+# these the time grows to a power, from the first squares at least 0.45, from the second 0.49 to 0.7 in six scenes of
+# 32,400 pixels, and to 0.84 with nine times as many. Of what is left it may take so much, and less where a part of it
+# is left to Cycles for its noise.
+SQUARE, PROBES, DIRECT_SHARE = 8, ((0.01, 0.45), (0.04, 0.6)), 0.6
 # Where the two points of a pixel differ from their mean by more than so much of the light of the picture, both as root
 # mean squares, its highlights are thinner than pixels, and time tells more as samples of Cycles. In five scenes at most
 # 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
@@ -251,6 +252,7 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     first = most if options.budget is None or most > MOST_SUB_SAMPLES else min(FIRST_SUB_SAMPLES, most)
     own = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
     size = {"width": width, "height": height, "seconds": options.budget, "sub_samples": first}
+    size |= {"reserve": LAST_SECONDS / 1e6}
     size |= {"cycles_samples": 0, "for_finished": True, "edge_points": EDGE_POINTS}
     job = child_job(client.ExtractOptions, own, **where, **size)
     extraction = client.extract(job, progress=progress)
@@ -309,8 +311,8 @@ class _How:
         whole = client.with_points(look, points)
         if seconds is None or len(whole.samples) == 0:
             return points, ""
-        # Cycles will look at the scene about as long as was done here.
-        allowed, reason = DIRECT_SHARE * (seconds - look.direct_seconds), client.too_small(self.options.budget)
+        # Cycles will look at the scene half as long as was done here.
+        allowed, reason = DIRECT_SHARE * (seconds - 0.5 * look.direct_seconds), client.too_small(self.options.budget)
         if allowed <= 0.0:
             return 0, reason
         one = np.count_nonzero(look.point == 0)
@@ -319,16 +321,20 @@ class _How:
         samples = one + (counts - 1) * (len(whole.samples) - one) / max(points - 1, 1)
         again = np.where(counts > points, 0.5 * looked * (1.0 + counts / points), 0.0)
         counts, samples, again = (each[again <= AGAIN_SHARE * seconds] for each in (counts, samples, again))
-        for share, power in PROBES:
-            number, took, thin = self._probe(whole, share)
-            fits = counts[again + took * (samples / number) ** power <= allowed]
-            if len(fits) == 0:
-                return 0, reason
+        (some, least), (more, power) = PROBES
+        number, took, *_ = self._probe(whole, some)
+        if took * (samples[0] / number) ** least > allowed:
+            return 0, reason
+        number, took, thin, share = self._probe(whole, more)
+        fits = counts[again + took * (samples / number) ** power <= share * allowed]
+        if len(fits) == 0:
+            return 0, reason
         return (0, client.TOO_THIN) if thin > THIN else (int(fits[-1]), "")
 
-    def _probe(self, extraction, share: float) -> tuple[int, float, float]:
-        """Of a few squares of the picture: how many samples there are, the processor seconds that they take, and by how
-        much of their light specular light differs from point to point of a pixel."""
+    def _probe(self, extraction, share: float) -> tuple[int, float, float, float]:
+        """Of a few squares of the picture: how many samples there are, the processor seconds that they take, by how
+        much of their light specular light differs from point to point of a pixel, and the share of their light that is
+        not too noisy."""
         from ..blender.process import client
 
         film, start = extraction.film, time.process_time()
@@ -344,9 +350,13 @@ class _How:
         (technique, result), *_ = results.items()
         variance, _ = _of_points(part.film, _seen(part, result, "specular"))
         variance = variance[~part.kept.by_pass["specular"]].sum()
-        light = np.square(sum(images[technique, name].mean(axis=-1) for name in PASSES)).sum()
-        thin = float(np.sqrt(variance / light)) if light > 0.0 else 0.0
-        return int(np.count_nonzero(there)), time.process_time() - start, thin
+        light = {name: images[technique, name].mean(axis=-1) for name in PASSES}
+        whole, squared = sum(light.values()).sum(), np.square(sum(light.values())).sum()
+        number, took = int(np.count_nonzero(there)), time.process_time() - start
+        if not whole > 0.0:
+            return number, took, 0.0, 1.0
+        certain = sum((_certain(shadows, name) * light[name]).sum() for name in PASSES)
+        return number, took, float(np.sqrt(variance / squared)), float(certain / whole)
 
     def with_fine_edges(self, comparison: picture.Comparison, more: float, progress) -> picture.Comparison:
         """The same with more points of the pixels that edges of diffuse light run through: those of shadows, and of

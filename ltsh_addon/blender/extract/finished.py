@@ -16,11 +16,13 @@ from ..materials.graph import cut, ensure_nodes, is_seen_through, material_outpu
 from ..render_settings import enable_passes, render_exr
 from .pixels import REST_PASSES, open_scene, scene_named
 
-# Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
-# the others.
-FIRST, PROBE, CHUNK_SECONDS, MOST_CHUNKS = 16, 2, 6.0, 6
-# Of a budget: so much of it is left for what comes after the last sample. A last file takes what others have left.
-SPENT, MOST_FILES = 0.97, 4
+# A given number of samples is rendered in files, so that progress can be told: the samples of the first file, the
+# seconds that each further one takes, and the most of these.
+FIRST, CHUNK_SECONDS, MOST_CHUNKS = 16, 6.0, 6
+# A budget is spent in files as well: the samples of the first one, which tells what a sample takes; the most files; the
+# share of the time after which none begins; the processor seconds that a file takes beside its samples, for a million
+# pixels.
+PROBE, MOST_FILES, SPENT, FILE_SECONDS = 2, 4, 0.97, 3.0
 # Passes that a finished picture takes its parts from, those that artists put together, and what the denoiser wants.
 LIGHT_PASSES = tuple(
     f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")
@@ -135,6 +137,7 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
     layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
     cycles.use_sample_subset = True
     chunk = min(FIRST, samples) if end is None else PROBE
+    of_file = 0.0 if end is None else FILE_SECONDS * scene.render.resolution_x * scene.render.resolution_y / 1e6
     while samples is None or done < samples:
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
         clock = time.process_time if end is not None else time.monotonic
@@ -149,10 +152,11 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
         render_exr(scene, folder / files[-1][0])
         first = first or time.process_time()
         done += chunk
-        each = (clock() - started) / chunk
+        took = clock() - started
+        each = max(took - of_file, 0.1 * took) / chunk
         if end is not None:
             # The first time holds the look at the scene, so the next one tells better what a sample takes.
-            left = int((end - time.process_time()) / each)
+            left = int((end - time.process_time() - of_file) / each)
             chunk = left if len(files) > 1 else min(left, 4 * PROBE)
             if chunk < 1 + done // 10 or len(files) == MOST_FILES:
                 break

@@ -39,7 +39,7 @@ from .textures import (
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
-# From one picture to the next the points at which lobes sample the world shift by GOLDEN steps and turn by TURN radians.
+# From one picture to the next, the points at which lobes sample the world shift by GOLDEN steps and turn by TURN rad.
 GOLDEN, TURN = 0.618034, 2.0
 
 
@@ -154,8 +154,8 @@ class LightingPass:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
         `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` None draws into
-        the bound frame buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target, None: (0, 0) and
-        its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
+        the bound frame buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
+        and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
         "ADDITIVE_PREMULT" to add radiance and alpha.
         """
         if passes not in _SHOWN_PASSES:

@@ -146,7 +146,10 @@ class _Layer:
         self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
 
     def choose_horizons(self, mirror, view: View, lights: UploadedLights) -> None:
-        """Choose the horizons of specular lobes as Cycles does. Diffuse lobes keep a second one only if they need it."""
+        """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
+
+        Only bump-mapped and translucent looks need it.
+        """
         self._lit = None
         if self._horizons is None and self._gbuffer.geometric_normal is not None:
             self._horizons = HorizonPass()

@@ -26,7 +26,7 @@ from ..process import client
 SIZE, LEAST_SIZE, IRRADIANCE_SIZE, IRRADIANCE_SOURCE = 256, 4, 32, 64
 LEVELS = (SIZE // LEAST_SIZE).bit_length()
 POINTS = 16  # directions in which a lobe samples the map
-# REST_SECONDS: how long a world must stay unchanged before Cycles looks at it.
+# REST_SECONDS: how long worlds and lights must stay unchanged before Cycles looks at them.
 REST_SECONDS = 0.3
 MOST_PATCHES = 1536  # of all sides together, for shadows
 # CUBE_SIZE: pixels of a side of the cube's pictures, enough for the light. BACKGROUND_SIZE: of the largest background.

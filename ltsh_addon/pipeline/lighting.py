@@ -41,8 +41,8 @@ FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a 
 KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
-# FEWEST_RAYS: a sample gets at least so many rays, however many samples share those of a pixel. Its first eight only
-# tell whether more are needed.
+# FEWEST_RAYS: a sample gets at least so many of the rays of its pixel, or all of them if they are fewer. The first
+# eight only tell whether more are needed.
 FEWEST_RAYS = 32
 
 

@@ -101,7 +101,8 @@ def _coarse(film: Film) -> Film:
 def _blocks(samples: SurfaceSamples, starting: SurfaceSamples, film: Film, place: np.ndarray) -> Iterator[tuple]:
     """Yield the indices of the `samples` of a block, and the block as `Setting` has it.
 
-    Shadow rays start from `starting`, where `place` is the number of the one of each sample.
+    Shadow rays start from the samples `starting` (Q); `place` (P,) is the number of the one whose shares each of the
+    `samples` takes.
     """
     order = np.argsort(place, kind="stable")
     size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))

@@ -462,7 +462,7 @@ class SceneMirror:
         self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
         self._light_textures = ShownTextures()
-        self.has_old_lights = False  # True: `lights` do not show all that is known of them
+        self.has_old_lights = False  # True: there are new results about lights, which are to be read again
         self._world_note: tuple[str, ...] = ()
         self._synced = False
 

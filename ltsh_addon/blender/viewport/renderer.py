@@ -371,7 +371,7 @@ class ViewRenderer:
         return read_texture(self._targets[number][0]) / np.float32(self.samples)
 
     def free(self) -> None:
-        """Let go of everything."""
+        """Free all textures and shaders."""
         for part in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
             part.free()
         self._lighting.clear()

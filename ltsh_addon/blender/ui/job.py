@@ -57,11 +57,10 @@ MOST = 0.99  # the largest share that is shown before the end is reported
 # of the machine.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
-DIRECT_SECONDS = 3.0  # per sample of Cycles' direct light
+CYCLES_SECONDS = 3.0  # per sample of Cycles, of direct light or of all
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
 SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # shadows: with USUAL_RAYS rays
 USUAL_RAYS = 256
-PATHS = 2.0  # cost of a Cycles sample of all light, relative to SAMPLE_SECONDS
 REFERENCE_POINTS = 0.15
 
 
@@ -171,7 +170,7 @@ def steps(runs: list[Run]) -> list[Step]:
 def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     pixels = 1e-6 * math.prod(options.resolution)
     points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
-    half = rendered + DIRECT_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
+    half = rendered + CYCLES_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
     sampling, shading = shading_steps(points, options.sub_samples, _rays(options), options.techniques)
     return [
         *sampling,
@@ -199,7 +198,7 @@ def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
     """The stages in which Cycles adds the rest to a picture of `pixels` million pixels."""
     return [
         Step("open scene", OPEN_SECONDS),
-        Step("Cycles", RENDER_SECONDS + PATHS * SAMPLE_SECONDS * pixels * cycles_samples),
+        Step("Cycles", RENDER_SECONDS + CYCLES_SECONDS * pixels * cycles_samples),
         Step("denoise", DENOISE_SECONDS * pixels),
     ]
 
@@ -216,7 +215,7 @@ def _bake(options: BakeOptions) -> list[Step]:
     for name in options.objects:
         found.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
         found.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
-    return [*found, Step("images", FILE_SECONDS * texels * len(found))]
+    return [*found, Step("images", FILE_SECONDS * texels * len(options.objects))]
 
 
 def _shading(technique: str, points: float) -> float:

@@ -719,7 +719,8 @@ def _selected(values, part, index):
 
 
 class FormFactor:
-    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point, as in `AreaLight.polygon`."""
+    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
+    (`AreaLight.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch

@@ -220,8 +220,8 @@ def multiple_scattering(average: np.ndarray, albedo: np.ndarray, average_albedo:
 def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exact: bool = True) -> np.ndarray:
     """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts.
 
-    `exact` is the formula of Cycles 5 (Born and Wolf, "Principles of optics", section 14.2). Otherwise it is that of
-    Cycles 4.5, the limit for |index + i extinction| much larger than 1.
+    `exact` is the formula of Cycles 5 (Born and Wolf, "Principles of optics", section 14.2). Otherwise it is the
+    formula of Cycles 4.5, the limit for |index + i extinction| much larger than 1.
     """
     index, extinction = np.maximum(index, 1e-6), np.maximum(extinction, 0.0)
     squares, cosine2 = index * index + extinction * extinction, cosine * cosine

@@ -20,8 +20,8 @@ from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, r
 
 # Few enough for the arrays of one block to stay in the cache.
 HITS_PER_BLOCK = 65536
-# A warning is worth it if smooth normals are farther from those of the faces on more than this share of the samples.
-# Measured on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
+# A warning is worth it if smooth and face normals differ by more than COARSE_ANGLE on the share COARSE_SHARE of
+# samples. Measured on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
 COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
 # A position counts as rounded if its rounding error exceeds the share ROUNDED of the distance to the nearest light. A
 # warning is worth it if more than the share ROUNDED_SHARE of the positions are.
@@ -93,7 +93,7 @@ def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
 
 def _shows_surface(channels: dict[str, np.ndarray]) -> np.ndarray:
     """Mask (H, W) of the pixels that show a surface."""
-    # Depth does not tell: it is always that of the first sample of a pixel.
+    # Depth does not tell: it is always the depth of the first sample of a pixel.
     normal = read_layer(channels, "Normal", "XYZ")
     return normal.any(axis=-1) & (read_layer(channels, "Combined", "A") != 0.0)
 

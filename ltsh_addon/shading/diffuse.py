@@ -10,7 +10,7 @@ where A = 1 / (pi + sigma (pi / 2 - 2 / 3)), B = sigma A, and E(z) = pi A + B G(
 sphere d omega = dz dphi. By Green's theorem, the integral of x h(z) is therefore that of y h(z) dz around the polygon.
 The integral of h(z) is that of the normal's z times (integral of h above z) / (1 - z^2) along its arcs. Both are
 integrals over arcs of functions without poles, and Gauss-Legendre nodes do them. The division in t for x > 0 requires a
-cut of the polygon there.
+cut of the polygon at x = 0.
 
 Velvet, Ashikhmin's sheen, has no closed form. It takes Gauss-Legendre nodes in the triangles of the polygon.
 """

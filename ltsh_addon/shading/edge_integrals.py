@@ -200,8 +200,8 @@ def _power_integrals(degree: int) -> np.ndarray:
 
 
 def _in_moment_directions(u: np.ndarray, k: int) -> np.ndarray:
-    """Weights (k + 1,) that combine the first k + 1 moments with K_{k-1} to the one along `u`. It is a form of degree k
-    in u."""
+    """Weights (k + 1,) of the first k + 1 moments with K_{k-1} that give the moment along `u`, a form of degree k in
+    u."""
     exponents = np.arange(k + 1)
     binomials = np.array([comb(k, int(e)) for e in exponents], dtype=float)
 

@@ -95,7 +95,7 @@ def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -
 
 
 def _of(vector, index):
-    """`vector` if it is (3,), the same for all samples; otherwise those of the samples `index`."""
+    """`vector` if it is (3,), the same for all samples; otherwise its rows for the samples `index`."""
     return vector if vector.ndim == 1 else vector[index]
 
 

@@ -35,7 +35,7 @@ SPOT = 0.3
 
 @dataclass(frozen=True)
 class Task:
-    """What to do with every block of samples."""
+    """The lights, table and passes with which to shade every block of samples."""
 
     lights: tuple[AreaLight, ...]
     groups: tuple[str, ...]

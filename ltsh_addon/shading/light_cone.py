@@ -371,7 +371,7 @@ def _cross(a, b):
 # where the lobe peaks. Each is accurate to 0.3 % except at 1 in 100 places, mostly at faint edges.
 EVEN, SPLIT, WHOLE_CONE, GRADED = range(4)
 # SIZES: size of the visible region in units of its distance, in the coordinates in which lobes are a radian wide.
-# POINTS, ROUND_POINTS: points per axis up to each of SIZES and beyond; where they are 0, `layers` must do.
+# POINTS, ROUND_POINTS: points per axis up to each of SIZES and beyond; 0 stands for `layers` instead.
 SIZES = (0.2, 0.4, 0.6)
 POINTS, ROUND_POINTS = np.array([3, 4, 6, 0]), np.array([5, 6, 8, 0])
 # RANGES: half the range of arsinh(place / width of the peak). GRADED_POINTS: points per axis of GRADED for these.

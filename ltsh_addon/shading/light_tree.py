@@ -63,8 +63,8 @@ TURNED = 1e-6
 # the same as a share of the swing of its lights, if some of them may face away.
 CROSSED, SWUNG = 0.1, 0.02
 
-# The points of a node along its axes, (W, P, 3), in W alternative ways. They have the node's variances; those of a
-# square are the Gauss points.
+# The points of a node along its axes, (W, P, 3), in W alternative ways. They have the node's variances; for a square
+# they are the Gauss points.
 CORNERS = np.array([[[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]])
 # For specular lobes two opposite corners of a box are enough. The next node takes another pair.
 PAIRS_OF_CORNERS = np.stack([CORNERS[0], -CORNERS[0]], axis=1)
@@ -286,7 +286,7 @@ class Cubics:
 
     @classmethod
     def of(cls, parts, keys, shape) -> Cubics:
-        """Those of tiles of the samples `parts`. `keys` (D, Q) are as of `_keys`; `shape` (S, Q) is what the lobes
+        """For tiles of the samples `parts`. `keys` (D, Q) come from `_keys`; `shape` (S, Q) is what the lobes
         depend on, in units of the lengths over which they change."""
         count = max(map(len, parts))
         index = np.stack([np.resize(part, count) for part in parts])

@@ -32,8 +32,8 @@ NARROWEST = 1e-3
 FLOAT64_CHUNK = 4096
 # Corners per chunk in float32: a compromise between few calls of numpy and arrays that stay in the cache.
 _FLOAT32_CORNERS = 49216
-# Least integral for F = 1 in shading, as a share of that of a clamped cosine under the same warp. The tail of a fitted
-# lobe may fall below zero, but the true lobe is dark only where that cosine is dark too.
+# Least integral for F = 1 in shading, as a share of the integral of a clamped cosine under the same warp. The tail of a
+# fitted lobe may fall below zero, but the true lobe is dark only where that cosine is dark too.
 LEAST_SHARE = 0.02
 
 
@@ -137,8 +137,8 @@ def tilted(warped: np.ndarray, tilt: np.ndarray) -> np.ndarray:
 
 
 def _tilted_cosine_integral(warped, tilt):
-    """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt), which clips a second
-    time."""
+    """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt). The polygon is clipped again
+    at the horizon of that axis."""
     result = np.zeros_like(tilt)
     for index, polygon in split_at_horizon(tilted(warped, tilt)):
         result[index] = form_factor(polygon)

@@ -21,8 +21,8 @@ from .spherical_harmonics import coefficient_count
 MAX_DEGREE = 4
 # Limits beyond which a polygon needs float64. SHORTEST_SAFE: least 1 + cos(theta) of an edge; an edge of nearly half a
 # circle, here by 8 degrees, has no direction. SMALLEST_SAFE: least sum of the edges' angles in rad, if all are equal;
-# the edges of a tiny polygon cancel. NEAREST_SAFE: least distance of a corner as a share of that of the farthest
-# corner; the rounding of a corner is proportional to that of the farthest.
+# the edges of a tiny polygon cancel. NEAREST_SAFE: least distance of a corner in units of the distance of the farthest
+# corner, to which the rounding of all corners is proportional.
 SHORTEST_SAFE = 0.01
 SMALLEST_SAFE = 0.08
 NEAREST_SAFE = 0.01
@@ -278,7 +278,7 @@ def _bent_moments(unit, normal, bend, scratch, out):
     shifted += np.float32(1e-12)
     phi = _phi(shifted, scratch)
     phi *= scale
-    # The cross product of warped vectors is the cofactor matrix of the warp times that of the vectors.
+    # The cross product of warped vectors is the cofactor matrix of the warp times the cross product of the vectors.
     normal[1] *= xx
     normal[1] -= np.multiply(normal[0], xz, out=scratch("one", shape))
     normal *= phi

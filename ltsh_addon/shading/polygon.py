@@ -66,9 +66,9 @@ def _pattern_kinds(corners: int) -> np.ndarray:
 
 @cache
 def _run_corners(corners: int) -> np.ndarray:
-    """Corners (V + 3, 2^V) of clipped polygons by pattern. First the last and the first corner above; then the run
-    above with its last corner repeated (V - 1 in all); then the corners below next to the last and the first one
-    above."""
+    """Corners (V + 3, 2^V) of clipped polygons by pattern. Their order is: the last corner above, the first corner
+    above, the run of corners above with its last one repeated (V - 1 in all), the corner below after the run, and the
+    corner below before it."""
     table = np.zeros((corners + 3, 2**corners), dtype=np.intp)
     for first in range(corners):
         for count in range(1, corners):

@@ -232,7 +232,7 @@ def _bordered(count: int) -> np.ndarray:
 
 
 def _with_border(radiance):
-    """Radiance (3, 6, n + 2, n + 2) with a border, from that of the texels of a cube (3, 6, n, n)."""
+    """Radiance (3, 6, n + 2, n + 2) with a border, from radiance (3, 6, n, n) of the texels of a cube."""
     return radiance.reshape(3, -1)[:, _bordered(radiance.shape[2])]
 
 

@@ -69,7 +69,8 @@ def all_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def _moments(corners, area):
     """Centroids (L, 3) and covariances (L, 3, 3) of polygons with corners (L, V, 3) and area vectors (L, 3)."""
-    # A fan of triangles. The mean of products over a triangle is a twelfth of those of its corners and of their sum.
+    # A fan of triangles. The mean of products over a triangle is a twelfth of the products at its corners and their
+    # sum.
     first = corners - corners[:, :1]
     second = np.roll(first, -1, axis=1)
     x, y, z = np.moveaxis(first, -1, 0)

@@ -178,7 +178,7 @@ def visible_shares(
 
 @dataclass(frozen=True)
 class ShadowTask:
-    """What to do with every block of samples."""
+    """The emitters and settings with which to find the shares of every block of samples."""
 
     emitters: tuple[Emitter | Cluster, ...]
     passes: tuple[str, ...]

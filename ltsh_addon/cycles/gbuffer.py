@@ -244,10 +244,10 @@ def _means(values: np.ndarray, place: np.ndarray, count: np.ndarray) -> np.ndarr
 
 
 # A finer point takes all values but position and view from a sample, in its pixel or around it, whose flat surface goes
-# through the point. FLAT: largest angle in rad between that sample's normals, and of the point off its plane. ACROSS:
-# weight of the distance across the plane, relative to the distance along it, in the choice of the nearest sample.
-# OFF_CENTER: distance in pixels. A pixel stays as it is if its center is farther than that from where its sample is, or
-# if one of its points lies on no such surface.
+# through the point. FLAT: largest angle in rad between that sample's normals, and between its plane and the direction
+# to the point. ACROSS: weight of the distance across the plane, relative to the distance along it, in the choice of the
+# nearest sample. OFF_CENTER: distance in pixels. A pixel stays as it is if its center is farther than that from where
+# its sample is, or if one of its points lies on no such surface.
 FLAT, ACROSS, OFF_CENTER = 4e-3, 10.0, 0.1
 
 

@@ -282,7 +282,7 @@ class _Shapes:
 
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
-        """The lights of these numbers, which are of one kind; a `share` (numbers of all lights) of each shines."""
+        """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
         own = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)

@@ -232,7 +232,8 @@ def shared_numbers(lights: Sequence[AreaLight], tracer=None) -> tuple[tuple[int,
     """Which of the `lights` share their rays, and so the share of them that is visible, as tuples of numbers.
 
     The sides of a sky do. So do plain lights that have the same color, group and pass and are blocked by the same
-    things, if there are at least `light_tree.FEWEST` of them. Without a tracer, everything blocks all lights.
+    things, if there are at least `light_tree.FEWEST` of them. Without a tracer, all lights count as blocked by the same
+    things.
     """
     shared: dict[tuple, list[int]] = {}
     masks: dict[str, tuple] = {}

@@ -58,6 +58,7 @@ EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 WORTH_POWER = 0.75
 # Rays of a pair as bright as a typical sample, as a share of the most rays of a pair.
 TYPICAL_SHARE = 0.4
+# Numbers of rays that a pair may get, besides the probes and the most rays.
 LEVELS = (16, 32, 64, 128, 256, 512)
 # The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
 # few pixels cause most of the noise of a picture.
@@ -126,7 +127,7 @@ class ShadowSampling:
     # the picture get up to four times as many, but never more than 1024.
     rays: int = 256
     film: Film | None = None  # tells which samples are neighbors; without it, consecutive samples are
-    is_baked: bool = False  # True: each pass is rendered by itself, so Cycles chooses rays by its lobes alone
+    is_baked: bool = False  # True: each pass is baked by itself, so Cycles chooses rays by its lobes alone
 
     def __post_init__(self):
         if not PROBES <= self.rays <= MOST_RAYS:

@@ -189,7 +189,7 @@ class Brdf:
     value: Callable
     # Quadrature: cos_theta_o (P,), alpha (P,), counts -> directions (P, S, 3) with y > 0, weights (P, S)
     samples: Callable
-    # True for GGX: as alpha -> 0, it times cosine becomes a warped clamped cosine with the known limit A = B = C = 1.
+    # True for GGX: as alpha -> 0, BRDF times cosine becomes a warped clamped cosine with the known limit A = B = C = 1.
     cosine_limit: bool = False
 
 

@@ -218,7 +218,7 @@ def _leaves(trees, limit: float) -> tuple[int, float]:
 
 
 def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
-    """The largest error of a square at which the total error is `wanted`, or at which `most` squares are left; and the
+    """The largest error of a square at which the total error is `wanted`, or at which there are `most` squares; and the
     total error."""
     low, high = 0.0, max(float(errors.max()) for tree in trees for errors in tree.errors)
     if high <= wanted * 1e-6 or high == 0.0:

@@ -60,7 +60,7 @@ class Patches:
 
 def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * GRID) -> Patches:
     """Patches of an `image` (H, W, 3), row 0 on top, of which only the pixels `covered` (H, W) count. Dark patches are
-    left out; at most `most` patches are smallest ones."""
+    left out. There are at most `most` uncut patches."""
     pixels = _Pixels(image, covered)
     height, width = covered.shape
     total = np.abs(image[covered]).sum()

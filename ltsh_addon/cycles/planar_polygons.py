@@ -19,7 +19,7 @@ STRAIGHT = 1e-6
 SHEET = 1e-6
 # Products of triangles and vertices in the test for hollows. For larger meshes it tests a share of the triangles.
 HOLLOW_PRODUCTS = 20_000_000
-# Connected parts of a surface in that test.
+# Most connected parts of a surface that this test looks at.
 MOST_ISLANDS = 64
 
 

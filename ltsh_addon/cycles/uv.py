@@ -87,8 +87,8 @@ class UvTriangles:
     def spread(self, texels: Texels, number: int, count: int, width: float) -> Texels:
         """`texels` at point `number` of `count`. With more points, their mean tends to that of Cycles' bake.
 
-        Measured with Cycles 4.5.15 and 5.2.3: the samples of a texel fill a part of the square of `width` texels around
-        its center, namely the part on the triangle of the center. If ATTEMPTS random points of the square in a row miss
+        Measured with Cycles 4.5.15 and 5.2.3: the samples of a texel fill the part of a square of `width` texels around
+        its center that lies on the triangle of the center. If ATTEMPTS random points of the square in a row miss
         the triangle, a sample is at the center.
         """
         if count == 1:

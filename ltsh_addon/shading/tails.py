@@ -18,7 +18,7 @@ from .polygon import dot
 
 # Radius of the sphere that the mirrored view ray must miss, in units of the radius of the sphere around the light.
 NEAR_RADII = 2.0
-# Mean share, over all directions, of the turn toward a corner of a light that is along a given direction.
+# Share of the turn toward a light's corner that lies along a direction, averaged over directions.
 ALONG = 0.9
 _TINY = 1e-12
 

@@ -1,4 +1,4 @@
-"""The exported header in WGSL, translated from its text: WGSL has no preprocessor and other declarations.
+"""The exported header in WGSL, translated from its text: WGSL has no preprocessor, and its declarations differ.
 
 The translation understands only what the texts in `glsl/` use: structures, functions by value, declarations of one
 name, `for`, `while`, `if`, assignments and the conditional operator, which becomes select().

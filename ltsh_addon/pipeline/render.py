@@ -43,8 +43,8 @@ ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 # A pass of Cycles, followed by the name of a light group.
 OF_GROUP = "Combined_"
 REST = "rest"
-# Points of a pixel where nothing is said; of a budget those of the first look, and at most.
-SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 2, 17
+# Points of a pixel: without a budget; of a budget those of the first look, and at most.
+SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 3, 17
 # Processor seconds that denoising and writing take at least, for a million pixels, and those of each further denoising.
 START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.25, 12.0, 4.0
 # Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
@@ -65,17 +65,17 @@ FEW_POINTS, SLOPE = (0.5, 0.75), 1.0 / 6.0
 FEWEST_POINTS, MOST_FINER, FINER_SHARE, MOST_EDGES = 8, 1.0, 0.3, 0.3
 MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
 MOST_OVER = 1.1  # of a budget, before a warning
-# What direct light will take is told from squares of so many pixels on a side that have a share of its samples: with
-# these the time grows to a power, from the first squares at least 0.45, from the second 0.49 to 0.7 in six scenes of
-# 32,400 pixels, and to 0.84 with nine times as many. Of what is left it may take so much, and less where a part of it
-# is left to Cycles for its noise.
-SQUARE, PROBES, DIRECT_SHARE = 8, ((0.01, 0.45), (0.04, 0.6)), 0.6
-# Where the two points of a pixel differ from their mean by more than so much of the light of the picture, both as root
+# How long direct light will take is told from squares of the picture, SQUARE pixels on a side. PROBES: the share of the
+# samples that these have, and the power of the number of samples with which the time grows from there: from the first
+# squares at least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
+SQUARE, PROBES = 8, ((0.01, 0.45), (0.04, 0.6))
+# Of what is left of a budget: the share that direct light may take with the points of the first look, and with more
+# points. More of it is worth less than more samples of Cycles. Light that is left to Cycles for its noise counts less.
+DIRECT_SHARE, MORE_SHARE = 0.5, 0.25
+# Where the points of a pixel differ from their mean by more than this share of the light of the picture, both as root
 # mean squares, its highlights are thinner than pixels, and time tells more as samples of Cycles. In five scenes at most
 # 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
 THIN = 0.35
-# Of what is left of a budget: so much may a second look at the scene take, for more points.
-AGAIN_SHARE = 0.15
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -311,22 +311,23 @@ class _How:
         whole = client.with_points(look, points)
         if seconds is None or len(whole.samples) == 0:
             return points, ""
-        # Cycles will look at the scene half as long as was done here.
-        allowed, reason = DIRECT_SHARE * (seconds - 0.5 * look.direct_seconds), client.too_small(self.options.budget)
-        if allowed <= 0.0:
+        reason = client.too_small(self.options.budget)
+        # Cycles will look at the scene half as long as was done here, and render what shines in sight.
+        seconds -= 0.5 * look.direct_seconds + client.EDGE_SECONDS * look.film.width * look.film.height / 1e6
+        if seconds <= 0.0:
             return 0, reason
         one = np.count_nonzero(look.point == 0)
         # Each point that a pixel gets beside its first makes about as many samples.
         counts = np.arange(1, max(points, most) + 1) if not look.has_lens else np.array([points])
         samples = one + (counts - 1) * (len(whole.samples) - one) / max(points - 1, 1)
-        again = np.where(counts > points, 0.5 * looked * (1.0 + counts / points), 0.0)
-        counts, samples, again = (each[again <= AGAIN_SHARE * seconds] for each in (counts, samples, again))
+        again = np.where(counts > points, looked * (1.0 + counts / points), 0.0)
+        allowed = np.where(counts > points, MORE_SHARE, DIRECT_SHARE) * seconds - again
         (some, least), (more, power) = PROBES
         number, took, *_ = self._probe(whole, some)
-        if took * (samples[0] / number) ** least > allowed:
+        if took * (samples[0] / number) ** least > allowed[0]:
             return 0, reason
         number, took, thin, share = self._probe(whole, more)
-        fits = counts[again + took * (samples / number) ** power <= share * allowed]
+        fits = counts[took * (samples / number) ** power <= share * allowed]
         if len(fits) == 0:
             return 0, reason
         return (0, client.TOO_THIN) if thin > THIN else (int(fits[-1]), "")

@@ -13,6 +13,7 @@ from ..evaluated import SURFACE_TYPES
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
+from ..process.client import EDGE_SECONDS
 from ..render_settings import enable_passes, render_exr
 from .pixels import REST_PASSES, open_scene, scene_named
 
@@ -30,9 +31,9 @@ LIGHT_PASSES = tuple(
 PASSES = (*LIGHT_PASSES, "emit", "environment")
 GUIDES = ("Denoising Albedo", "Denoising Normal")
 NOT_WRITTEN = (*GUIDES, "Denoising Depth", "Denoising Specular Albedo", "Denoising Roughness")
-# What shines in sight is rendered apart: a pixel takes more than the fewest samples where it is at an edge, up to the
-# most, until its noise is below the limit. Processor seconds that it takes for a million pixels.
-EDGES, EDGE_SAMPLES, EDGE_LIMIT, EDGE_SECONDS = "edges.exr", (16, 512), 0.003, 12.0
+# What shines in sight is rendered apart, into the file EDGES. EDGE_SAMPLES: the fewest and the most samples of a pixel;
+# those at edges take more than the fewest, until their noise is below EDGE_LIMIT.
+EDGES, EDGE_SAMPLES, EDGE_LIMIT = "edges.exr", (16, 512), 0.003
 # Inputs of nodes that also shine which make them reflect.
 REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmission Weight", "Subsurface Weight")
 

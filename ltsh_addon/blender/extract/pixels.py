@@ -80,8 +80,8 @@ FINISHED_LENS = 32
 # more points, and by Cycles for these and for its picture. POINT_SECONDS: for a point of a pixel, which grows by
 # LIGHT_SHARE with each light, up to MOST_LIGHTS.
 # Shares of the seconds that are left. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
-START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 0.3, 3, 6e-6, 0.125
-POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.8, 100
+START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 0.5, 3, 6e-6, 0.125
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.5, 100
 
 
 def affordable_points(left: float, pixels: int, lights: int, looked: float = 0.0) -> int:
@@ -289,7 +289,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
     end, pixels = None, picture["width"] * picture["height"]
     if job["seconds"] is not None:
-        end = job["since"] + job["seconds"] - job["reserve"] * pixels
+        end = job["since"] + job["seconds"] - (job["reserve"] + 1e-6 * client.EDGE_SECONDS) * pixels
     inventory, count = LightInventory(), 0
     if end is None or affordable_points(end - opened, pixels, 1):  # otherwise a look at the scene would be wasted
         with_occluders, count = job["shadows"] == "on", job["sub_samples"]

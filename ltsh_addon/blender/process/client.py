@@ -388,6 +388,9 @@ def _rendered(path: Path) -> dict[str, np.ndarray]:
         raise OSError(errno.ENOSPC, "a picture was not written whole") from error
 
 
+EDGE_SECONDS = 12.0  # processor seconds that a million pixels of `FinishedJob.edges` take
+
+
 @dataclass(frozen=True)
 class FinishedJob:
     """What Cycles should render of an unchanged scene; None means as in the file."""

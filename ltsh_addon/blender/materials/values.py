@@ -17,7 +17,7 @@ LUMA = np.array([0.2126, 0.7152, 0.0722])  # of Rec.709, by which Blender makes 
 
 @dataclass(frozen=True)
 class ImageUse:
-    """A flat image on a UV map ("": the active one); `mapping` (2, 3) takes (u, v, 1) to image coordinates."""
+    """A flat image on a UV map ("": the one that renders); `mapping` (2, 3) takes (u, v, 1) to image coordinates."""
 
     image: Any
     uv_map: str
@@ -215,7 +215,7 @@ def coordinates(source: Source | None):
         return None
     node = source.node
     if node is None:
-        # A texture without a vector takes the active UV map.
+        # A texture without a vector takes the UV map that renders.
         return ("", IDENTITY) if source.socket.hide_value else None
     if node.bl_idname == "ShaderNodeUVMap" and not node.from_instancer:
         return node.uv_map, IDENTITY

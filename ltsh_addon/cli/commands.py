@@ -218,8 +218,8 @@ def _merge(arguments, bar, open_file) -> int:
 
 
 RELIGHT = """Write pictures anew with other powers and colors of their lights, without Blender and
-without a ray. OUT is what shade or compare wrote with --keep-visibility. Lights have
-the names that report.json tells."""
+without a ray. OUT is what shade, compare or render wrote with --keep-visibility.
+Lights have the names that report.json tells."""
 RELIGHT_EXAMPLES = """examples:
   %(prog)s out/room --light Key --power x2 --color 1,.8,.6
   %(prog)s out/room --light Fill --exposure -1.5 --mute Rim --mute Lamp
@@ -233,7 +233,7 @@ own, whose brightest channel counts as 1; each step of exposure doubles the powe
 def add_relight(parser) -> None:
     """`ltsh relight`."""
     with_examples(parser, RELIGHT, RELIGHT_EXAMPLES)
-    parser.add_argument("folder", type=Path, metavar="OUT", help="the folder that -o of shade or compare named")
+    parser.add_argument("folder", type=Path, metavar="OUT", help="the folder that -o of shade, compare or render named")
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
     )

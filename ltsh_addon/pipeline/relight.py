@@ -61,7 +61,8 @@ def relight(
     folder, output = Path(folder), Path(output)
     files = sorted(folder.rglob(f"*{KEPT_SUFFIX}"))
     if not files:
-        raise ValueError(f"{folder}: no picture kept its samples there; run shade or compare with --keep-visibility")
+        fix = "run shade, compare or render with --keep-visibility"
+        raise ValueError(f"{folder}: no picture kept its samples there; {fix}")
     reports = [_relit(path, path.relative_to(folder), (changes, solo), output, progress) for path in files]
     report = reports[0] if len(reports) == 1 else {"reports": reports}
     imaging.write_json(output / "report.json", report)

@@ -322,7 +322,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
     bake_uv_map: StringProperty(
         name="UV Map",
-        description="Name of the UV map to bake into; empty for the one that is active for rendering",
+        description="Name of the UV map to bake into; empty for the active one, highlighted in the list UV Maps",
     )
     bake_passes: EnumProperty(
         name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",

@@ -107,7 +107,7 @@ class MeshBatches:
     indices: dict[int, gpu.types.GPUIndexBuf]
     corners: gpu.types.GPUVertBuf | None
     corner_count: int
-    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
+    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the one that renders
     middle: np.ndarray  # (3,) of the bounding box
     is_smooth: bool  # some normals differ from those of their faces
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)

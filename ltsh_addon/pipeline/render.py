@@ -61,8 +61,8 @@ MOST_NOISE, AROUND = 0.06, 4
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
 # FEW_POINTS: Cycles keeps its own specular light where the variance of our points is a larger part of the difference to
 # Cycles than this; it begins to do so at the first number. SLOPE: the variance within a pixel, relative to the squared
-# slope from pixel to pixel; it is twice the true one, to be safe.
-FEW_POINTS, SLOPE = (0.5, 0.75), 1.0 / 6.0
+# slope from pixel to pixel; it is twice the true one, to be safe. SHARED: points that pixels share are worth so many.
+FEW_POINTS, SLOPE, SHARED = (0.5, 0.75), 1.0 / 6.0, 2.25
 # More points for pixels with an edge. FEWEST_POINTS: what such a pixel gets at least. MOST_FINER: how many samples more
 # they may take, relative to all. FINER_SHARE: the share of what is left of a budget that they may take. MOST_EDGES:
 # where a larger share of the pixels has edges, these are the detail of surfaces, and samples of Cycles are worth more.
@@ -75,7 +75,7 @@ MOST_OVER = 1.1  # how many times the budget a picture may take without a warnin
 SQUARE, PROBES = 8, ((0.01, 0.45), (0.04, 0.6))
 # Of what is left of a budget: the share that direct light may take with the points of the first look, and with more
 # points. More of it is worth less than more samples of Cycles. Light that is left to Cycles for its noise counts less.
-DIRECT_SHARE, MORE_SHARE = 0.5, 0.25
+DIRECT_SHARE, MORE_SHARE = 0.5, 0.2
 # Where the points of a pixel differ from their mean by more than this share of the light of the picture, both as root
 # mean squares, its highlights are thinner than pixels, and time tells more as samples of Cycles. In five scenes at most
 # 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
@@ -492,6 +492,7 @@ def _beside_points(film, radiance: np.ndarray, direct: np.ndarray) -> np.ndarray
     whole, (variance, mean) = film.image(radiance), _of_points(film, radiance)
     slope = sum(np.square(one) for one in np.gradient(mean)) if min(mean.shape) > 1 else 0.0
     variance = np.maximum(variance - SLOPE * slope, 0.0) / max(film.sub_samples - 1, 1)
+    variance /= 1.0 if film.spread is None else SHARED
     variance = _around(np.where(film.has_more(), 0.0, variance))
     both = _around(np.square(direct.astype(np.float64) - whole))
     share = np.divide(variance, both, out=np.zeros_like(both), where=both > 0.0)

@@ -12,6 +12,7 @@ import scene_parts as parts
 from material_scenes import Build
 
 from ltsh_addon import imaging
+from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
@@ -616,6 +617,14 @@ def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     }
     # By chance the points of 81 pixels differ less than they should.
     assert weight[1] > 0.95 and weight[64] < 0.1 and weight[1] > weight[4] > weight[64]
+    # The error of shared points is that of SHARED times as many.
+    kind = "BLACKMAN_HARRIS", 1.5
+    shared = film.shared(render_settings.shared_points(*kind, points)[1], np.tile(range(points), size**2), noise < 9.0)
+    own, fewer = (np.square(one.image(thin)[1:-1, 1:-1] - 1.0).mean() for one in (shared, film))
+    assert fewer / own == pytest.approx(render.SHARED, rel=0.1)
+    for samples in (4, 16):
+        direct = 1.0 + np.sqrt(variance / samples) * noise
+        assert render._beside_points(shared, thin, direct).mean() > render._beside_points(film, thin, direct).mean()
     # Each point at the middle of a quarter of its pixel: their mean is the mean of the slope.
     corner = np.tile([0.25, 0.75, 0.25, 0.75], size * size)
     slope = film.pixel % size + corner
